@@ -63,7 +63,7 @@ def rests_of(of: Columns, calibration: Calibration, start_ns: int) -> list[tuple
         return thermal.sample(now_ns), thermal.tracker.memory.remaining_shares(now_ns)
 
     finder = gather.RestFinder(
-        correction.K[:, 0], np.array(correction.noise), calibration.unit.full_scale, state_now
+        correction.K[:, 0], np.array(correction.noise), calibration.unit.full_scale, state_now, 0.0
     )
     readings = sorted(
         (int(t * 1e9), name, float(value))

@@ -174,7 +174,7 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | a temperature that is constant while that of the second thermometer changes | the constant readings are not used: the last used value is held, then the thermometer counts as lost |
 | both temperatures constant over at least 20 readings and 5 s | the temperatures are used with a growing covariance, WARN |
 | a board temperature that leads the case temperature in ramps (swapped topics) | the covariance is increased, ERROR |
-| counts constant for `stuck_timeout`, on all axes or on one axis while the other two change; three zeros | dropped, counted, ERROR |
+| counts constant for `stuck_timeout`, on all axes or on one axis while the others change or show their noise; three zeros | dropped, counted, ERROR |
 | counts that come faster than their conversion cycle | dropped, counted, ERROR |
 | a magnitude of the specific force at rest that differs from gravity by more than `gravity_tolerance` | nothing is published, ERROR |
 | a second publisher of a topic | the topic is not used, ERROR, until one publisher is left or for one second all messages are from one publisher (WARN while the middleware still lists a killed publisher, for 20 s) |

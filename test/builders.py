@@ -6,6 +6,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from thermo_comp.online.batch import process_block
+from thermo_comp.online.compensator import Compensator
+from thermo_comp.online.status import CompensatorConfig
 from thermo_comp.unit.calibration import (
     Axes,
     AxisReference,
@@ -22,6 +25,10 @@ from thermo_comp.unit.rate_bias import Gyroscope, RateCurve, RateSet, RateTerm
 
 GRAVITY = 9.80665
 SECOND_NS = 1_000_000_000
+#: Places of the six different elements in the nine of a covariance.
+UNIQUE = [0, 1, 2, 4, 5, 8]
+#: Settings without checks for stuck samples and for a wrong |f|.
+UNCHECKED = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
 
 
 def axis_set(bias=(0.0,), scale=(1.0,), **keys):
@@ -33,12 +40,16 @@ def regime_set(x=None, y=None, z=None, **keys):
     return RegimeSet(x=x or axis_set(), y=y or axis_set(), z=z or axis_set(), **ranges)
 
 
+def equal_axes(scale_factor, bias=0.0):
+    return Axes(*[AxisReference(scale_factor, bias)] * 3)
+
+
 def calibration(**keys):
     """Make a calibration of 300 counts per m/s^2; defaults: constant scale and bias."""
     values = {
         'format_version': 2, 'unit': Unit('T-1', 'counts', 32767.0, 0.01),
         'reference_temperature_c': 20.0, 'gravity_m_s2': GRAVITY,
-        'axes': Axes(*[AxisReference(300.0, 0.0)] * 3), 'static': regime_set(),
+        'axes': equal_axes(300.0), 'static': regime_set(),
         'dynamic': regime_set(), 'noise_density_m_s2_sqrt_hz': (1e-4, 1e-4, 1e-4), **keys,
     }  # fmt: skip
     return Calibration(**values)
@@ -173,6 +184,45 @@ def stream(compensator, events):
         else:
             compensator.push(kind, stamp, value)
     return np.array(rows).reshape(-1, 15 if compensator.corrects_rate else 9), index
+
+
+def batch(compensator, events):
+    """Process events as one block, with 1e-3 * sample as angular rate."""
+    columns = columns_from_events(events)
+    return process_block(compensator, columns, 1e-3 * columns.accel)
+
+
+def assert_equal_bits(unit, config, events, chunk):
+    """
+    Check that one block of all events, and blocks of `chunk` events, give the bits of single
+    samples; return the rows of the single samples, the whole block and the three compensators.
+    """
+    streamed, whole, cut = (Compensator(unit, config) for _ in range(3))
+    rows, index = stream(streamed, events)
+    block = batch(whole, events)
+    assert block.index.tolist() == index
+    pieces = [batch(cut, events[k : k + chunk]) for k in range(0, len(events), chunk)]
+    for blocks in ([block], pieces):
+        names = ['specific_force', 'covariance', 'stamp_ns']
+        names += ['angular_rate', 'angular_rate_variance'] * streamed.corrects_rate
+        values = (np.concatenate([getattr(part, name) for part in blocks]) for name in names)
+        force, covariance, stamp_ns, *rates = values
+        matrices = covariance.reshape(-1, 3, 3)
+        np.testing.assert_array_equal(matrices, matrices.transpose(0, 2, 1))
+        columns = np.column_stack([force, covariance[:, UNIQUE], *rates])
+        np.testing.assert_array_equal(columns, rows)
+        np.testing.assert_array_equal(stamp_ns, block.stamp_ns)
+    assert streamed.counters == whole.counters == cut.counters
+    assert streamed.take_flags() == whole.take_flags() == cut.take_flags()
+    return rows, block, (streamed, whole, cut)
+
+
+def warm(compensator, celsius=20.0, case=None, *, until_s=1, start_s=0, flicker=0.0):
+    """Push constant readings; with a `flicker` [K] the thermometer does not count as stuck."""
+    for second in range(start_s, until_s):
+        noise = flicker * (-1) ** second
+        compensator.push('board', second * SECOND_NS, celsius + noise)
+        compensator.push('case', second * SECOND_NS, (celsius if case is None else case) + noise)
 
 
 @dataclass(frozen=True)

@@ -53,8 +53,8 @@ settings.register_profile('nightly', max_examples=10_000, deadline=None)
 #: Test files with the longest duration, longest first: `make test` begins with these files.
 _LONG = (
     *('fleet_run', 'faults', 'part_lags', 'priors', 'regime', 'fitting', 'few_positions'),
-    *('cli_help', 'record', 'fault_process', 'drivers', 'degenerate', 'one_attitude', 'gyroscope'),
-    *('report', 'node_defence', 'fitting_selection', 'fleet_unit', 'docs', 'fault_files'),
+    *('cli_help', 'record', 'fault_process', 'drivers', 'degenerate', 'unseen_axes', 'gyroscope'),
+    *('report', 'node_defence', 'fitting_selection', 'fleet_storage', 'docs', 'fault_files'),
     *('real_data', 'field', 'node_parity', 'attacks', 'fitting_regression', 'fit_api', 'replay'),
     *('fitting_windows', 'properties', 'judging', 'report_figures', 'correction', 'middleware'),
     *('judging_history', 'player', 'node_sources', 'fitting_closing', 'api', 'allow'),

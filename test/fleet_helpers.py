@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns small fleets of units that are quick to simulate (10 ms) and to fit (0.5 s)."""
 
-import numpy as np
-
 from thermo_comp.fitting import FitOptions
 from thermo_comp.fleet.work import FleetOptions
 from thermo_comp.recording.writer import BagWriter
@@ -30,12 +28,8 @@ def write_unit(
     names=None,
     is_exchanged=False,
     counts='accel/counts',
-    fault=lambda counts: counts,
 ):
-    """
-    Simulate a thermal test of a unit with one bag per position; `is_exchanged` exchanges the
-    thermometers, and `fault` changes the counts of each bag.
-    """
+    """Simulate a test with one bag per position; `is_exchanged` exchanges the thermometers."""
     unit = unit or preset('mems', seed)
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
@@ -51,8 +45,7 @@ def write_unit(
             board, case = ('case', 'board') if is_exchanged else ('board', 'case')
             bag.write_temperature(f'temperature/{board}', run.board_stamp_ns, run.board)
             bag.write_temperature(f'temperature/{case}', run.case_stamp_ns, run.case)
-            samples = fault(run.counts).astype(np.float64)
-            bag.write_counts(counts, run.accel_stamp_ns, samples, 'imu_link')
+            bag.write_counts(counts, run.accel_stamp_ns, run.counts.astype(float), 'imu_link')
         paths.append(path)
     return paths
 

@@ -22,7 +22,11 @@ STRING = 'std_msgs/msg/String'
 ACCEL, IMU_IN, BOARD, CASE, OTHER = (
     '/accel/counts', '/imu/uncompensated', '/temperature/board', '/temperature/case', '/chatter',
 )  # fmt: skip
-TYPES = {ACCEL: VECTOR, IMU_IN: IMU, BOARD: TEMPERATURE, CASE: TEMPERATURE, OTHER: STRING}
+#: Types of the topics above, and of a driver with other names.
+TYPES = {
+    ACCEL: VECTOR, IMU_IN: IMU, BOARD: TEMPERATURE, CASE: TEMPERATURE, OTHER: STRING,
+    '/mpu/data': IMU, '/mpu/die': TEMPERATURE, '/baro/air': TEMPERATURE,
+}  # fmt: skip
 START_NS = 1_600_000_000_000_000_000
 
 
@@ -50,9 +54,10 @@ def to_ros(message, ros=2):
     header = types['std_msgs/msg/Header'](*sequence, stamp, message.frame_id)
     vector = types['geometry_msgs/msg/Vector3']
     values = message.numbers
-    if message.topic == ACCEL:
+    kind = TYPES[message.topic]
+    if kind == VECTOR:
         return types[VECTOR](header, vector(*values))
-    if message.topic == IMU_IN:
+    if kind == IMU:
         return types[IMU](
             header, types['geometry_msgs/msg/Quaternion'](*values[0:4]), np.array(values[4:13]),
             vector(*values[13:16]), np.array(values[16:25]), vector(*values[25:28]),

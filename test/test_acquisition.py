@@ -54,10 +54,6 @@ def stream(rng):
     return Stream(rng)
 
 
-def reasons(test):
-    return [position.reason for position in test.account().positions]
-
-
 @pytest.mark.parametrize('seconds', [0.7, 25.0, 1e4])
 def test_positions_do_not_depend_on_the_length_of_blocks(stream, seconds):
     begins = []
@@ -127,16 +123,6 @@ def test_faults_of_a_position_are_reported(stream):
     assert account.positions[-1].n_rests == 2
 
 
-def test_a_position_that_repeats_a_direction_is_not_good(stream):
-    for up in ((0, 0, 1), (1, 0, 0), (0, 0.03, 1)):
-        stream.rest(up, 40.0)
-        stream.turn()
-    test = Acquisition(3, 30.0)
-    for block in stream.blocks(0.5):
-        test.add(block)
-    assert reasons(test) == ['', '', 'repeats position 1']
-
-
 def test_a_backward_jump_of_the_clock_begins_a_new_position(stream):
     stream.rest((0, 0, 1), 40.0)
     test = Acquisition(1, 30.0)
@@ -169,11 +155,3 @@ def test_the_zero_of_unsigned_words_is_in_mid_range(stream):
     for position, up in zip(positions, [*UPS, UPS[0]], strict=True):
         assert position.up @ up > np.cos(np.radians(3.0))
     assert [place.reason for place in positions] == [''] * 6 + ['repeats position 1']
-
-
-def test_without_samples_all_positions_are_missing():
-    account = Acquisition(18, 60.0).account()
-    assert not account.is_still
-    assert np.isnan(account.now).all()
-    assert account.findings[0] == 'positions missing: 18 of 18'
-    assert [position.n_rests for position in account.positions] == [0]

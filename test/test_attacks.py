@@ -1,20 +1,23 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Wrong clocks, many clients, replaced links and damaged logs cause no wrong output."""
+"""Wrong clocks, many clients and hostile data cause no wrong output; the policy fits the node."""
 
 import itertools
 import random
 import signal
 import sys
 import threading
+import xml.etree.ElementTree as ET
 
 import numpy as np
 import pytest
-from builders import calibration
-from conftest import ran
+from builders import calibration, equal_axes
+from conftest import ROOT, ran
 
 from thermo_comp.errors import CalibrationError, RecordingError
-from thermo_comp.unit.calibration import Axes, AxisReference, Unit
+from thermo_comp.recording.reader import inspect_recording
+from thermo_comp.recording.writer import BagWriter
+from thermo_comp.unit.calibration import Unit
 from thermo_comp.unit.calibration_file import load_calibration, save_calibration
 
 START_NS = 1_767_225_600_000_000_000
@@ -22,44 +25,36 @@ START_NS = 1_767_225_600_000_000_000
 
 def of_kind(kind, cycle_s, path):
     full_scale, K = (32767.0, 300.0) if kind == 'counts' else (160.0, 1.0)
-    axes = Axes(*[AxisReference(K, 0.0)] * 3)
+    axes = equal_axes(K)
     save_calibration(calibration(unit=Unit('T-1', kind, full_scale, cycle_s), axes=axes), path)
     return path
 
 
 def test_a_clock_topic_that_goes_back_or_pauses_does_not_change_samples(peer, tmp_path):
-    from diagnostic_msgs.msg import DiagnosticArray
-    from ros_helpers import drive, node_in_thread, stamp_of, standing
+    from ros_helpers import Samples, node_arguments, node_in_thread, stamp_of
     from rosgraph_msgs.msg import Clock
-    from sensor_msgs.msg import Imu
 
     path = of_kind('counts', 0.01, tmp_path / 'unit.yaml')
-    arguments = ['-p', f'calibration_file:={path}', '-p', 'diagnostics_period:=0.02']
-    with node_in_thread(*arguments) as node:
-        heard = peer.listen(Imu, 'imu/data_raw')
-        told = peer.listen(DiagnosticArray, '/diagnostics')
-        driver = drive(peer, node)
+    with node_in_thread(*node_arguments(path)) as node:
+        samples = Samples(peer, node)
         assert peer.set_parameters(use_sim_time=True)[0].successful
         clock = peer.publisher(Clock, '/clock')
         # /clock begins, falls by 1 h, is constant for five checks, jumps by a year, and ends.
         hour = 3600 * 10**9
         times = [START_NS, START_NS + hour, START_NS, *[START_NS] * 5, START_NS + 8760 * hour]
-        for n, now_ns in enumerate(times):
+        for now_ns in times:
             message = Clock()
             message.clock.sec, message.clock.nanosec = divmod(now_ns, 10**9)
             clock.publish(message)
-            for k in range(20 * n, 20 * n + 20):
-                if k % 10 == 0:
-                    driver.temperatures(START_NS + k * 10**7, 20.0, 20.0)
-                driver.counts(START_NS + k * 10**7, *standing(k))
-            peer.wait_for(lambda n=n: len(heard) >= 20 * n + 20, 'all samples')
+            samples.go_on()
             peer.wait_for(
-                lambda now_ns=now_ns: told and stamp_of(told[-1]) == now_ns, 'its time in reports'
+                lambda now_ns=now_ns: samples.reports and stamp_of(samples.reports[-1]) == now_ns,
+                'its time in reports',
             )
         assert peer.set_parameters(use_sim_time=False)[0].successful
-        peer.wait_for(lambda: stamp_of(told[-1]) not in times, 'the time of day')
-        stamps = [stamp_of(imu) for imu in heard]
-        assert stamps == [START_NS + k * 10**7 for k in range(20 * len(times))]
+        peer.wait_for(lambda: stamp_of(samples.reports[-1]) not in times, 'the time of day')
+        stamps = [stamp_of(imu) for imu in samples.heard]
+        assert stamps == [START_NS + k * 10**7 for k in range(20 + 20 * len(times))]
         assert node._loop.n_failures == 0
 
 
@@ -249,3 +244,75 @@ def test_damaged_autopilot_logs_are_read_or_refused_with_one_line(kind, tmp_path
             lines.append(str(error))
     assert n_read < 150
     assert not any('\n' in text for text in lines)
+
+
+NODE = 'thermo_comp'
+
+
+def allowed():
+    root = ET.parse(ROOT / 'config' / 'policy.xml').getroot()  # noqa: S314 - our own file
+    (profile,) = root.iter('profile')
+    assert (profile.get('ns'), profile.get('node')) == ('/', NODE)
+    collected = {}
+    for group in profile:
+        ((what, verdict),) = group.attrib.items()
+        assert verdict == 'ALLOW'
+        names = [(entry.text or '').replace('~', f'/{NODE}') for entry in group]
+        collected[what] = {name if name.startswith('/') else f'/{name}' for name in names}
+    return collected
+
+
+def test_the_policy_permits_exactly_the_topics_and_services_of_the_node(tmp_path):
+    pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+    from ros_helpers import node_in_thread
+
+    opened = {'publish': set(), 'subscribe': set(), 'reply': set()}
+    for word in ('counts', 'imu'):
+        path = tmp_path / f'{word}.yaml'
+        unit = Unit('T-1', 'm/s^2', 160.0, 0.01)
+        save_calibration(calibration(unit=unit) if word == 'imu' else calibration(), path)
+        arguments = ['-p', f'calibration_file:={path}', '-p', f'input:={word}']
+        with node_in_thread(*arguments) as node:
+            ros = node.node
+            for what, names in (
+                ('publish', ros.get_publisher_names_and_types_by_node(NODE, '/')),
+                ('subscribe', ros.get_subscriber_names_and_types_by_node(NODE, '/')),
+                ('reply', ros.get_service_names_and_types_by_node(NODE, '/')),
+            ):
+                opened[what] |= {name for name, _ in names}
+            assert ros.get_client_names_and_types_by_node(NODE, '/') == []
+    assert opened == allowed()
+
+
+BOMB = '\n'.join(
+    ['a0: &a0 {k: v}']
+    + [f'a{k}: &a{k} {{<<: [{", ".join([f"*a{k - 1}"] * 9)}]}}' for k in range(1, 30)]
+)
+
+
+def one_reading(path):
+    with BagWriter(path) as writer:
+        writer.write_temperature('temperature/board', [1], [20.0])
+    return path
+
+
+def test_metadata_with_nested_aliases_is_refused(tmp_path):
+    # WHY: each line refers to the line before nine times: 30 lines of YAML give 10^28 entries.
+    bag = one_reading(tmp_path / 'bag')
+    metadata = bag / 'metadata.yaml'
+    metadata.write_text(f'{metadata.read_text()}\n{BOMB}\n')
+    with pytest.raises(RecordingError, match='not valid YAML'):
+        inspect_recording(bag)
+
+
+def test_metadata_of_a_bag_opens_no_file_outside_the_folder_of_the_bag(tmp_path):
+    secret, bag = one_reading(tmp_path / 'secret.mcap'), one_reading(tmp_path / 'bag')
+    metadata = bag / 'metadata.yaml'
+    (name,) = (file.name for file in bag.glob('*.mcap'))
+    for elsewhere in (str(secret), '../secret.mcap'):
+        changed = metadata.read_text().replace(f'- {name}', f'- {elsewhere}', 1)
+        assert elsewhere in changed
+        metadata.write_text(changed)
+        with pytest.raises(RecordingError, match=r'secret\.mcap of the bag is missing'):
+            inspect_recording(bag)
+        metadata.write_text(metadata.read_text().replace(f'- {elsewhere}', f'- {name}', 1))

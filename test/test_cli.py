@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import typer
 from builders import rich_calibration
-from conftest import parsed, ran
+from conftest import ROOT, parsed, ran
 
 from thermo_comp.cli import output
 from thermo_comp.cli.app import split_arguments
@@ -23,8 +23,6 @@ from thermo_comp.recording.reader import inspect_recording, read_recording
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.nonlinearity import Nonlinearity, NonlinearTerm
-
-ROOT = Path(__file__).resolve().parent.parent
 
 
 @pytest.fixture(scope='session')

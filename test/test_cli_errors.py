@@ -6,12 +6,11 @@ import re
 
 import numpy as np
 import pytest
-from builders import axis_set, calibration, regime_set, rich_calibration
+from builders import axis_set, calibration, equal_axes, regime_set, rich_calibration
 from conftest import ROOT, parsed
 
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter
-from thermo_comp.unit.calibration import Axes, AxisReference
 from thermo_comp.unit.calibration_file import save_calibration
 
 TOPICS = Topics()
@@ -124,11 +123,6 @@ class TestBags:
     def test_a_missing_bag_is_refused(self, cli, unit, tmp_path):
         self.replayed(cli, unit, tmp_path / 'absent', r'absent: no such file or directory')
 
-    def test_random_bytes_with_the_suffix_of_a_bag_are_refused(self, cli, unit, tmp_path):
-        for name in ('noise.mcap', 'noise.db3', 'noise.bag'):
-            (tmp_path / name).write_bytes(b'\x89MCAP0\r\n' + bytes(range(256)) * 8)
-            self.replayed(cli, unit, tmp_path / name, name)
-
     def test_a_bag_without_board_temperature_is_refused(self, cli, unit, tmp_path):
         path = bag(tmp_path / 'bag', board=False)
         self.replayed(cli, unit, path, r'temperature/board.*no such topic.*--topic board=')
@@ -183,7 +177,7 @@ class TestEvaluations:
         # The second calibration is right: its level of +10 mg cancels biases of -10 mg.
         right = axis_set(delta=30.0)
         sets = regime_set(right, right, right)
-        axes = Axes(*[AxisReference(300.0, -30.0)] * 3)
+        axes = equal_axes(300.0, -30.0)
         save_calibration(
             calibration(axes=axes, static=sets, dynamic=sets), tmp_path / 'right.yaml'
         )

@@ -142,14 +142,10 @@ def test_a_bend_has_slopes_over_board_temperature_and_lag():
     assert flow.slopes(np.zeros((7, 1)))[1] is None
 
 
-def test_a_new_kind_of_column_needs_one_class_only(monkeypatch):
-    class RateSquare(Term):
-        kind, formula, order, form = 'rate_square', '(dT_s/dt)^2', 2, TERMS['square'].form
-
-        def source(self, column):
-            return Rate(column.sensor)
-
-    monkeypatch.setitem(TERMS, 'rate_square', RateSquare())
+def test_a_new_kind_of_column_needs_one_term_only(monkeypatch):
+    form = TERMS['square'].form
+    new = Term('rate_square', '(dT_s/dt)^2', lambda column: Rate(column.sensor), form, order=2)
+    monkeypatch.setitem(TERMS, 'rate_square', new)
     unit = calibration(response=(term('rate_square', (0.0, 0.0, 3e6), range=(0.0, 1e-3)),))
     correction = Correction(unit)
     assert correction.memory == MemorySpec(rates=('case',))

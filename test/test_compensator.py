@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The compensator agrees with hand calculations; single samples and blocks give equal bits."""
+"""The compensator agrees with hand calculations; a switch of sets or calibration is smooth."""
 
 import math
 import random
@@ -11,55 +11,29 @@ import pytest
 from builders import (
     GRAVITY,
     SECOND_NS,
+    UNCHECKED,
+    UNIQUE,
+    assert_equal_bits,
     axis_set,
+    batch,
     calibration,
-    columns_from_events,
+    equal_axes,
     regime_set,
     rich_calibration,
     stream,
     term,
     thermal_calibration,
+    warm,
 )
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator, CompensatorConfig
 from thermo_comp.unit.calibration import Axes, AxisReference
 from thermo_comp.unit.correction import Correction
 
-UNIQUE = [0, 1, 2, 4, 5, 8]
 #: Variance of a sample [m^2/s^4]: density^2 / cycle, plus rounding with a carried remainder.
 NOISE = 1e-4**2 / 0.01 + (1.0 / 6.0) / 300.0**2
-
-
-def warm(compensator, celsius=20.0, case=None, *, until_s=1, start_s=0, flicker=0.0):
-    """Push constant readings; with a `flicker` [K] the thermometer does not count as stuck."""
-    for second in range(start_s, until_s):
-        noise = flicker * (-1) ** second
-        compensator.push('board', second * SECOND_NS, celsius + noise)
-        compensator.push('case', second * SECOND_NS, (celsius if case is None else case) + noise)
-
-
-def batch(compensator, events):
-    columns = columns_from_events(events)
-    return process_block(compensator, columns, 1e-3 * columns.accel)
-
-
-def assert_same(blocks, rows, index):
-    if index is not None:
-        assert [k for block in blocks for k in block.index.tolist()] == index
-    parts = [
-        (block.specific_force, block.covariance, block.angular_rate, block.angular_rate_variance)
-        for block in blocks
-    ]
-    force, covariance, rate, variance = map(np.concatenate, zip(*parts, strict=True))
-    np.testing.assert_array_equal(force, rows[:, :3])
-    np.testing.assert_array_equal(covariance[:, UNIQUE], rows[:, 3:9])
-    np.testing.assert_array_equal(rate, rows[:, 9:12])
-    np.testing.assert_array_equal(variance, rows[:, 12:])
-    matrices = covariance.reshape(-1, 3, 3)
-    np.testing.assert_array_equal(matrices, matrices.transpose(0, 2, 1))
 
 
 def test_the_offset_is_half_the_sum_of_signed_counts():
@@ -77,7 +51,7 @@ def test_a_corrected_sample_agrees_with_the_formula_of_the_static_set():
     # The expected values are the formula of the static set at t = 10 K without a gradient or rate.
     axis = axis_set((0.0, 0.5, 0.01), (1.0, 1e-4), delta=2.0)
     unit = calibration(
-        axes=Axes(*[AxisReference(300.0, 7.0)] * 3),
+        axes=equal_axes(300.0, 7.0),
         static=regime_set(axis, axis, axis),
         response=(term('gradient', (9.0,) * 3, (9.0,) * 3, range=(-0.05, 0.05)),),
         misalignment=((1.0, 0.0, 0.0), (1e-3, 1.0, 0.0), (2e-3, -3e-3, 1.0)),
@@ -146,17 +120,8 @@ def at_seconds(*events):
 @settings(max_examples=40, deadline=None)
 def test_blocks_of_any_size_give_the_bits_of_single_samples(events, chunk, transition_s):
     config = CompensatorConfig(transition_time_s=transition_s, case_timeout_s=2.0)
-    streamed = Compensator(RICH, config)
-    whole = Compensator(RICH, config)
-    cut = Compensator(RICH, config)
-    rows, index = stream(streamed, events)
-    block = batch(whole, events)
-    assert_same([block], rows, index)
-    assert_sound(block, whole.counters, events)
-    pieces = [batch(cut, events[k : k + chunk]) for k in range(0, len(events), chunk)]
-    assert_same(pieces, rows, None)
-    assert streamed.counters == whole.counters == cut.counters
-    assert streamed.take_flags() == whole.take_flags() == cut.take_flags()
+    _, block, (compensator, *_) = assert_equal_bits(RICH, config, events, chunk)
+    assert_sound(block, compensator.counters, events)
 
 
 def assert_sound(block, counters, events):
@@ -282,9 +247,7 @@ def test_flush_updates_the_regime_without_samples():
 def test_another_transition_time_during_a_transition_causes_no_step_of_the_output():
     # The static and the dynamic set differ by 0.025 counts (8.5 ug) at any temperature.
     unit = calibration(dynamic=regime_set(axis_set(delta=0.025)))
-    config = CompensatorConfig(
-        transition_time_s=100.0, stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0
-    )
+    config = replace(UNCHECKED, transition_time_s=100.0)
     compensator = Compensator(unit, config)
     warm(compensator, 20.0, until_s=1200)
     for k in range(1200, 1400):
@@ -308,8 +271,7 @@ def test_a_new_transition_time_does_not_restart_the_check_of_gravity(rng):
     def published(seconds, size):
         count = 0
         for second in seconds:
-            for name in ('board', 'case'):
-                compensator.push(name, second * SECOND_NS, 20.0)
+            warm(compensator, start_s=second, until_s=second + 1)
             for k in range(10):
                 x, y, z = rng.normal((0.0, 0.0, size), 0.1)
                 stamp = second * SECOND_NS + (k + 1) * SECOND_NS // 10
@@ -367,11 +329,56 @@ def test_output_that_is_not_finite_is_never_published(monkeypatch, bad):
         if k % 4 == 0:
             events += [(name, stamp_ns, 20.0 + 0.125 * k) for name in ('board', 'case')]
         events.append(('accel', stamp_ns, (30.0 + k % 3, -20.0, 2941.0 + k % 5)))
-    one_by_one, block = (Compensator(thermal_calibration()) for _ in range(2))
-    rows, _ = stream(one_by_one, events)
+    config = CompensatorConfig()
+    rows, _, (compensator, *_) = assert_equal_bits(thermal_calibration(), config, events, 7)
     n_sent = sum(name == 'accel' for name, *_ in events)
-    assert 0 < one_by_one.counters.n_unsound == n_sent - len(rows)
+    assert 0 < compensator.counters.n_unsound == n_sent - len(rows)
     assert np.isfinite(rows).all()
-    corrected = process_block(block, columns_from_events(events))
-    np.testing.assert_array_equal(corrected.specific_force, np.array(rows)[:, :3])
-    assert block.counters == one_by_one.counters
+
+
+def test_a_switch_of_sets_causes_no_step():
+    # The output changes by 5 counts = 1.7 mg within 300 s, at most 0.28 ug per sample at 20 Hz.
+    unit = calibration(dynamic=regime_set(axis_set(delta=5.0)))
+    compensator = Compensator(unit, UNCHECKED)
+    outputs = []
+    for k in range(40_000):
+        stamp = k * 50_000_000
+        if k % 20 == 0:
+            ramp = max(k / 20.0 - 1200.0, 0.0) / 60.0
+            compensator.push('board', stamp, 20.0 + 0.3 * ramp)
+            compensator.push('case', stamp, 20.0 + ramp)
+        outputs.append(compensator.process(stamp, 0.0, 0.0, 1.0)[0])
+    steps = np.abs(np.diff(outputs))
+    assert outputs[0] == 0.0
+    assert outputs[-1] == pytest.approx(-5.0 / 300.0)
+    assert steps.max() <= 5.0 / 300.0 / 6000.0 * 1.001
+
+
+@pytest.mark.parametrize(
+    ('delta', 'given_s', 'expected_s'),
+    # The blend is limited to 1 ug/s: 102 s for sets that differ by 0.3 counts = 102 ug.
+    [(0.01, 30.0, 30.0), (0.3, 30.0, 1e-3 / 9.80665e-6), (0.3, 5.0, 50.0), (0.3, 0.0, 0.0)],
+)
+def test_a_transition_time_above_0_limits_the_change_to_1_ug_per_s(delta, given_s, expected_s):
+    unit = calibration(dynamic=regime_set(axis_set(delta=delta)))
+    compensator = Compensator(unit, CompensatorConfig(transition_time_s=given_s))
+    assert compensator.thermal.tracker.config.transition_time_s == pytest.approx(expected_s)
+
+
+def test_a_swap_of_calibrations_takes_effect_between_two_samples():
+    compensator = Compensator(calibration())
+    warm(compensator, until_s=5)
+    before = compensator.process(5 * SECOND_NS, 300.0, 0.0, 1.0)
+    compensator.swap(calibration(axes=equal_axes(150.0)))
+    after = compensator.process(5 * SECOND_NS + 1, 300.0, 0.0, 1.0)
+    assert (before[0], after[0]) == (1.0, 2.0)
+
+
+def test_a_swap_to_another_detector_loses_no_sample():
+    compensator = Compensator(calibration())
+    warm(compensator, until_s=5)
+    assert compensator.process(5 * SECOND_NS, 300.0, 0.0, 1.0) is not None
+    compensator.swap(rich_calibration())
+    row = compensator.process(5 * SECOND_NS + 1, 300.0, 0.0, 1.0)
+    assert row is not None
+    assert not compensator.status().is_settled

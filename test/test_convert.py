@@ -3,11 +3,11 @@
 """Conversion of a table: each row is in the bag or counted, and values are unchanged."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from conftest import ROOT
 
 from thermo_comp.convert.column_map import ColumnMap, load_column_map, table_log
 from thermo_comp.convert.log import Readings, write_log
@@ -15,8 +15,6 @@ from thermo_comp.errors import RecordingError, ThermoCompError
 from thermo_comp.recording.reader import read_recording
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
 from thermo_comp.unit.schema import build
-
-ROOT = Path(__file__).resolve().parent.parent
 
 
 def table(path, n=400, scale=1.0):

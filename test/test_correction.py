@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from builders import (
     SECOND_NS,
+    UNCHECKED,
+    assert_equal_bits,
     axis_set,
     calibration,
-    columns_from_events,
     drawn,
     regime_set,
     rich_calibration,
@@ -21,9 +22,7 @@ from builders import (
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
-from thermo_comp.online.status import CompensatorConfig
 from thermo_comp.thermal.lags import start_covariance
 from thermo_comp.thermal.state import RATE, StateLayout
 from thermo_comp.thermal.tracker import ThermalTracker
@@ -35,7 +34,6 @@ from thermo_comp.unit.posterior import posterior_of
 from thermo_comp.unit.prediction import SlowUncertainty
 
 SENSORS = ('case', 'tip')
-UNCHECKED = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
 
 
 def full_bank(rng, size=1.0, axes=(0, 1, 2), posterior=False):
@@ -87,13 +85,6 @@ def run_of(rng, seconds=240, rate=4, swing_k=12.0):
     return events
 
 
-def assert_same(blocks, rows):
-    force = np.concatenate([block.specific_force for block in blocks])
-    covariance = np.concatenate([block.covariance for block in blocks])
-    np.testing.assert_array_equal(force, rows[:, :3])
-    np.testing.assert_array_equal(covariance[:, [0, 1, 2, 4, 5, 8]], rows[:, 3:9])
-
-
 @given(st.integers(0, 2**32 - 1), st.integers(40, 900))
 @settings(max_examples=3, deadline=None, phases=[Phase.generate])
 def test_blocks_corrected_with_all_columns_have_the_bits_of_single_samples(seed, chunk):
@@ -101,12 +92,8 @@ def test_blocks_corrected_with_all_columns_have_the_bits_of_single_samples(seed,
     unit = full_bank(rng, posterior=True)
     # Temperatures exceed the range (5 to 35 degC) and its continuation (-2.5 to 42.5 degC).
     events = run_of(rng, seconds=50, swing_k=90.0)
-    rows = stream(Compensator(unit, UNCHECKED), events)[0]
     assert max(value for kind, _, value in events if kind == 'board') > 45.0
-    whole, cut = Compensator(unit, UNCHECKED), Compensator(unit, UNCHECKED)
-    assert_same([process_block(whole, columns_from_events(events))], rows)
-    pieces = [events[k : k + chunk] for k in range(0, len(events), chunk)]
-    assert_same([process_block(cut, columns_from_events(piece)) for piece in pieces], rows)
+    rows, _, _ = assert_equal_bits(unit, UNCHECKED, events, chunk)
     assert len(rows) > 190
 
 

@@ -14,13 +14,12 @@ import pytest
 import yaml
 from conftest import ROOT, parsed, ran
 from matplotlib import pyplot as plt
-from readme_helpers import is_alike
+from readme_helpers import FENCE, is_alike
 
 pytestmark = pytest.mark.usefixtures('equal_fits_once', 'no_figures')
 
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))]
 TUTORIAL = ROOT / 'docs' / 'tutorial.ipynb'
-FENCE = re.compile(r'^```(\w+)\n(.*?)^```', re.MULTILINE | re.DOTALL)
 # Commands that other files test: `play` takes minutes, and `record` waits for 18 positions.
 ELSEWHERE = (
     'thermo_comp play bags/held_out.mcap --rate 20',

@@ -7,14 +7,14 @@ import re
 
 import numpy as np
 import pytest
-from builders import axis_set, calibration, regime_set
+from builders import axis_set, calibration, equal_axes, regime_set
 from conftest import ROOT, parsed
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from thermo_comp.errors import ThermoCompError
 from thermo_comp.recording.topics import read_names
-from thermo_comp.unit.calibration import Axes, AxisReference, Unit
+from thermo_comp.unit.calibration import Unit
 from thermo_comp.unit.calibration_file import save_calibration
 
 FILES = sorted((ROOT / 'config' / 'drivers').glob('*.yaml'))
@@ -187,7 +187,7 @@ def warming_unit():
     """Make a unit whose z bias grows by 1 mm/s^2/K, so the output shows the reading in use."""
     return calibration(
         unit=Unit('T-1', 'm/s^2', 160.0, 1.0 / RATE),
-        axes=Axes(*[AxisReference(1.0, 0.0)] * 3),
+        axes=equal_axes(1.0),
         static=regime_set(z=axis_set((0.0, 1e-3))),
         dynamic=regime_set(z=axis_set((0.0, 1e-3))),
     )

@@ -8,14 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import strangers
 from builders import source_of
 from position_helpers import GRAVITY, MG, START_NS, Rest
-from strangers_cases import HALF, Study, consumer_grade
-from strangers_units import record, rng_of
 
 import thermo_comp as tc
-from thermo_comp.convert.exchange import export_calibration
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.simulation.campaign import positions
 from thermo_comp.unit.calibration import parameter_layout
@@ -209,36 +205,6 @@ def test_tilts_of_two_supports_are_not_taken_for_a_scale_slope_of_a_level_axis(r
     # With a force of 0.03 g, an error of 1 ug/K is 33 ppm/K of the scale factor, and the
     # difference of two rests with such errors is 47 ppm/K; the limit is ten times this.
     assert abs(np.diff(z.scale_function.value(at))[0]) < 10.0 * 47e-6
-
-
-@pytest.mark.slow
-def test_a_tilt_of_one_support_is_not_taken_for_a_scale_slope_of_a_level_axis():
-    # WHY: a support tilt of 17 urad/K was fitted as a scale slope of 817 +- 23 ppm/K.
-    rng = rng_of('linear tilts', 1)
-    unit = replace(consumer_grade(rng), counts=0.0)
-    ups = (1.0, 0.0, 0.03), (0.0, 1.0, 0.0)
-    tilted, level = (record(unit, HALF, np.array(up), rng, rate_hz=10.0) for up in ups)
-    celsius = np.interp(tilted.time_s, *tilted.temperatures['board'])
-    samples = tilted.samples + np.outer(GRAVITY * 17e-6 * (celsius - 20.0), [0.0, 0.0, 1.0])
-    study = Study('', (replace(tilted, samples=samples), replace(level, name='level')), {},
-                  {'input': 'm/s^2'})  # fmt: skip
-    calibration = strangers.fitted(study)
-    slope = parameter_layout(calibration).scale[2].static + 1
-    sd = np.sqrt(calibration.posterior.covariance()[slope, slope])
-    found = np.diff(calibration.static.z.scale_function.value(np.array([0.0, 1.0])))[0]
-    # The z axis is level in both positions, so the slope of its scale factor keeps its prior sd.
-    assert sd < 100e-6
-    assert abs(found - 1e-6 * unit.scale_curve[0, 2]) < 3.0 * sd
-
-
-def test_a_calibration_from_one_position_is_exported_to_px4(one_position):
-    text = export_calibration(one_position.calibration, 'px4', device_id=1).text
-    rows = [line.split() for line in text.splitlines() if line.startswith('1')]
-    value = {row[2]: float(row[3]) for row in rows}
-    d = np.array([17.0, 32.0]) - value['TC_A0_TREF']
-    for axis, slope in enumerate(SLOPE):
-        offset = sum(value[f'TC_A0_X{power}_{axis}'] * d**power for power in range(4))
-        assert np.diff(offset)[0] / 15.0 / MG == pytest.approx(slope, abs=0.2)
 
 
 def test_positions_without_a_thermometer_give_constants_and_wide_temperature_slopes():

@@ -28,13 +28,16 @@ def recording(up, rng, slope=None):
     return time_s, force + NOISE * rng.standard_normal((len(time_s), 3)), board
 
 
+def columns(recorded, name, thermometers=('board',)):
+    time_s, force, board = recorded
+    readings = dict.fromkeys(thermometers, (time_s[::5], board[::5]))
+    return tc.Columns(time_s, force, readings, name=name)
+
+
 def left_by(groups):
     """Fit some groups, correct another recording; return the RMS error of means over 60 s [ug]."""
     rng = np.random.default_rng(8)
-    bags = [
-        tc.Columns(time_s, force, {'board': (time_s[::5], board[::5])}, name=f'rest{k}')
-        for k, (time_s, force, board) in enumerate(recording(up, rng) for up in UPS)
-    ]
+    bags = [columns(recording(up, rng), f'rest{k}') for k, up in enumerate(UPS)]
     unit = tc.fit(bags, gravity=G, input='m/s^2', groups=groups, mounting_sd=1e-7)
     up = np.array([0.3, -0.5, 0.8])
     time_s, force, board = recording(up, rng)
@@ -64,12 +67,9 @@ def test_a_thermometer_on_two_topics_is_used_once():
     bags = []
     for copies in (('board',), ('board', 'case')):
         rng = np.random.default_rng(9)
-        collected = []
-        for k, up in enumerate(UPS[:3]):
-            time_s, force, board = recording(up, rng)
-            readings = dict.fromkeys(copies, (time_s[::5], board[::5]))
-            collected.append(tc.Columns(time_s, force, readings, name=f'rest{k}'))
-        bags.append(collected)
+        bags.append(
+            [columns(recording(up, rng), f'rest{k}', copies) for k, up in enumerate(UPS[:3])]
+        )
     first, second = (tc.fit(each, gravity=G, input='m/s^2', groups=('curve',)) for each in bags)
     assert first.static == second.static
     assert first.axes == second.axes
@@ -83,8 +83,7 @@ def columns_of(slopes, shift=0.0):
     bags = []
     for k, (up, slope) in enumerate(zip(UPS, slopes, strict=False)):
         time_s, force, board = recording(up, rng, slope)
-        force = force + shift * MICRO_G
-        bags.append(tc.Columns(time_s, force, {'board': (time_s[::5], board[::5])}, name=f'r{k}'))
+        bags.append(columns((time_s, force + shift * MICRO_G, board), f'r{k}'))
     return bags
 
 

@@ -12,14 +12,12 @@ import pytest
 from builders import calibration
 from fitting_truth import Truth, table_of
 
-from thermo_comp.errors import FitError, UndeterminedError
+from thermo_comp.errors import UndeterminedError
 from thermo_comp.fitting import FitOptions, ResidualRow
 from thermo_comp.fitting.data_checks import (
-    Finding,
     check_scale,
     determines_misalignment,
     distinct_directions,
-    enforce,
     geometry,
     judge_result,
     judge_windows,
@@ -158,14 +156,6 @@ def test_geometry_is_the_largest_sd_of_nine_parameters_per_sd_of_the_norm(rng):
     scatter = (noise @ np.linalg.pinv(jacobian).T).std(axis=0).max()
     # The sd of 4000 draws is uncertain by 1.1 %.
     assert geometry(up, with_misalignment=True) == pytest.approx(scatter, rel=0.05)
-
-
-def test_a_refusal_stops_the_fit_unless_the_user_allows_the_refusal():
-    refusal = Finding('swapped', 'refusal', 'the board leads')
-    with pytest.raises(FitError, match=r'the board leads \(override with --allow swapped\)'):
-        enforce([refusal], FitOptions(gravity=9.81))
-    (allowed,) = enforce([refusal], FitOptions(gravity=9.81, allow=('swapped',)))
-    assert (allowed.level, allowed.message) == ('advice', 'allowed: the board leads')
 
 
 def judged(

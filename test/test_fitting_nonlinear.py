@@ -36,9 +36,9 @@ from thermo_comp.recording.writer import BagWriter
 from thermo_comp.report.certificate import results
 from thermo_comp.report.evidence import evidence_of_fit
 from thermo_comp.report.statements import CertificateInfo
-from thermo_comp.simulation.campaign import Cyclogram, Position, positions
+from thermo_comp.simulation.campaign import Cyclogram, Position, Spin, positions, steps
 from thermo_comp.simulation.run import arrays
-from thermo_comp.simulation.spin import Bend, Spin, steps
+from thermo_comp.simulation.unit import Bend
 from thermo_comp.unit.gravity import STANDARD_GRAVITY as G
 from thermo_comp.unit.nonlinearity import POWERS
 from thermo_comp.unit.prediction import nonlinear_coefficients

@@ -13,7 +13,7 @@ from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, FitSource, normal_gravity
 from thermo_comp.fitting.raw_checks import judge_bags
 from thermo_comp.fitting.reduction import Readings, is_spike, reduce_source, rounding_sd
-from thermo_comp.fitting.sensors import learn_detector, learn_thermometer, quantum_of
+from thermo_comp.fitting.sensors import learn_detector, learn_thermometer
 from thermo_comp.recording.stillness import CellAccumulator
 from thermo_comp.simulation.campaign import positions
 from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
@@ -136,20 +136,6 @@ def test_vibrations_of_a_compressor_do_not_divide_a_position(rng):
     assert first.time[-1] < 345.0 < second.time[0]
 
 
-def test_a_knock_starts_a_new_position(rng):
-    # The knock turns the unit by 300 urad: x changes by 1 count of 3000, 20 sd of a cell mean.
-    accel = still(rng, 60.0, (0.0, 0.0, 3000.0))
-    accel[3000:] += (1.0, 0.0, 0.0)
-    assert len(reduced([block(accel)]).intervals) == 2
-
-
-def test_a_thermal_drift_is_not_taken_for_motion(rng):
-    # 100 ppm/K at 3 K/min are 0.015 counts/s; from cell to cell a mean changes by 0.02 of its sd.
-    accel = still(rng, 300.0, (0.0, 0.0, 3000.0))
-    accel[:, 2] += 0.015 * np.arange(len(accel)) / RATE_HZ
-    assert len(reduced([block(accel)]).intervals) == 1
-
-
 def test_bad_samples_are_counted_and_left_out(rng):
     accel = still(rng, 30.0, (0.0, 0.0, 3000.0))
     accel[10, 1] = np.nan
@@ -218,14 +204,6 @@ def test_several_samples_with_one_stamp_are_reported(rng):
     assert bag.n_repeated == bag.n_dropped == 0.9 * len(whole.accel)
     (finding,) = (f for f in judge_bags([bag], FitOptions(gravity=9.8)) if f.name == 'dropped')
     assert 'several samples with one stamp' in finding.message
-
-
-def test_stamps_that_do_not_rise_are_left_out(rng):
-    whole = block(still(rng, 30.0, (0.0, 0.0, 3000.0)))
-    again = split(whole, 3)
-    bag = reduced([again[0], again[1], again[1], again[2]])
-    assert bag.n_dropped == 1000
-    assert bag.intervals[0].count.sum() == 3000
 
 
 @pytest.mark.parametrize('n', [0, 1, 70])
@@ -365,11 +343,6 @@ def test_the_lag_is_at_least_three_reading_intervals(rng):
         stamps(len(time), 1.0 / 60.0), celsius + 0.01 * rng.standard_normal(len(time))
     )
     assert learn_thermometer([readings], ThermometerSettings()).lag_s == pytest.approx(180.0)
-
-
-def test_a_quantum_of_a_degree_is_estimated():
-    assert quantum_of(np.repeat([20.0, 21.0, 22.0, 24.0], 100)) == 1.0
-    assert quantum_of(np.full(100, 20.0)) == 0.0
 
 
 def test_without_readings_the_thermometer_settings_are_the_defaults():

@@ -99,13 +99,6 @@ def test_each_tried_model_has_a_left_out_error(calm):
     assert all(is_better(trial.score, selected.score) for trial in selected.trials[:2])
 
 
-def test_a_forced_group_stays_in_the_model(calm):
-    regression, _, truth = calm
-    _, chosen = selected_of(truth, regression.windows, calm[1].posterior.state.up, ('idle',))
-    assert chosen_groups(chosen) == set(ALL)
-    assert (chosen.posterior.prior.column_sd[:, IDLE] > 0.0).all()
-
-
 @pytest.mark.parametrize(
     ('where', 'is_chosen'), [('one bag', False), ('one section', False), ('all', True)]
 )
@@ -182,12 +175,6 @@ def test_rounding_removes_no_correlation_time_from_the_search():
     for time_s in whitener.times_s:
         assert whitener.shows(float(10.0 ** np.log10(time_s)))
     assert not whitener.shows(90.0)
-
-
-def test_white_noise_is_not_taken_for_slow_noise(calm):
-    _, chosen, truth = calm
-    np.testing.assert_allclose(chosen.posterior.prior.sigma, truth.sigma, rtol=0.12)
-    assert chosen.posterior.prior.noise == Noise()
 
 
 def test_the_estimated_prior_sd_of_a_column_is_the_rms_of_its_true_weights(calm):
@@ -405,34 +392,18 @@ def test_the_estimated_tilt_of_a_stiff_support_is_below_the_noise(calm):
     assert np.sqrt(np.mean(tilt**2)) < 0.5 * hidden
 
 
-def claimed(n_positions, gravity_sd=0.0):
+def claimed(gravity_sd):
     truth = Truth(offset_sd=20.0 * MICRO)
-    windows, up = table_of(truth, n_positions, np.random.default_rng(1), n_windows=20)
+    windows, up = table_of(truth, 12, np.random.default_rng(1), n_windows=20)
     regression, state = begin(without_starts(windows), up)
     candidates = candidates_of(windows, ('curve', 'board'))
     candidates = replace(candidates, typical=candidates.typical * ~IDLE)
     selection = select(regression, state, constants(truth), candidates)
-    claim = claim_of(regression, selection.posterior, None, gravity_sd)
-    return claim.covariance, selection.posterior.covariance
-
-
-def test_the_claimed_bias_sd_of_nine_positions_includes_undetermined_mounting_offsets():
-    ratios = []
-    for n in (9, 24):
-        claim, fitted = claimed(n)
-        assert np.linalg.eigvalsh(claim).min() > 0.0
-        # Each axis has k rows in the covariance: kappa (relative scale), bias, and weights.
-        k = (len(claim) - 3) // 3
-        at = 1 + k * np.arange(3)
-        ratios.append(np.sqrt(np.diag(claim)[at].mean() / np.diag(fitted)[at].mean()))
-    # Nine norms determine nine constants without redundancy, so the claimed sd must include
-    # mounting offsets of tens of ug.
-    assert ratios[0] > 3.0 * ratios[1]
-    assert 0.8 < ratios[1] < 1.5
+    return claim_of(regression, selection.posterior, None, gravity_sd).covariance
 
 
 def test_the_sd_of_gravity_adds_a_common_error_to_all_scale_factors():
-    (without, _), (within, _) = claimed(12), claimed(12, 5e-4)
+    without, within = claimed(0.0), claimed(5e-4)
     added = within - without
     kappa = np.arange(3) * ((len(without) - 3) // 3)
     # A relative error of gravity is a relative error of K in each axis, and of nothing else.

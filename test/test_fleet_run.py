@@ -108,18 +108,6 @@ def test_all_units_are_fitted_despite_a_killed_worker_and_only_once(client, flee
     assert {name for name, known in seen.items() if known} == {'A/good'}
 
 
-@pytest.mark.slow
-def test_results_of_units_with_dots_in_their_names_stay_in_the_output_folder(client, tmp_path):
-    fleet = tmp_path / 'fleet'
-    for seed, name in enumerate(('one', '..two', 'three..')):
-        write_unit(fleet / name, seed, 2)
-    result = fit_fleet(str(fleet / '..' / 'fleet'), tmp_path / 'out', OPTIONS, client=client)
-    # A folder whose name begins with a dot is hidden, so it is not a unit.
-    assert [row['name'] for row in result.rows] == ['one', 'three..']
-    made = {path.relative_to(tmp_path).parts[:2] for path in tmp_path.rglob('*.yaml')}
-    assert made == {('out', 'units')}
-
-
 def test_unreadable_bags_leave_earlier_results_in_place(client, tmp_path):
     # WHY: when bags could not be read, a second run deleted the results of the first run.
     bags = write_unit(tmp_path / 'bags' / 'unit', 1)
@@ -344,33 +332,6 @@ def test_the_prior_of_siblings_reduces_the_scale_error_of_a_unit_with_one_bag(cl
     assert (np.abs(errors[0] / scale - 1.0) < 3e-6 * sds[0]).all()
     assert (sds[0] < 0.5 * sds[1]).all()
     assert fit_fleet(*arguments, client=client, with_prior=True).n_done == 0
-
-
-def with_stuck_bit(bit):
-    def fault(counts):
-        counts = counts.copy()
-        counts[:, 1] |= 1 << bit
-        return counts
-
-    return fault
-
-
-@pytest.mark.slow
-def test_units_with_a_stuck_bit_are_not_fitted_again_with_the_prior(client, tmp_path):
-    # WHY: the prior increased the claimed sd, so a unit with a stuck bit was judged valid.
-    kind = unit_preset('mems', 1)
-    faults = {0: with_stuck_bit(7), 4: with_stuck_bit(10)}
-    for number in range(5):
-        keys = {'n_bags': 12, 'fault': faults[number]} if number in faults else {'n_bags': 9}
-        unit = sibling(kind, number)
-        write_unit(tmp_path / 'bags' / f'u{number}', number, unit=unit, serial='', **keys)
-    arguments = (str(tmp_path / 'bags'), tmp_path / 'out', OPTIONS)
-    alone = fit_fleet(*arguments, client=client)
-    assert alone.prior is not None
-    verdicts = [str(row['verdict']).split(',')[0] for row in alone.rows]
-    assert verdicts == ['no better than raw', 'valid', 'valid', 'valid', 'refused']
-    helped = fit_fleet(*arguments, client=client, with_prior=True)
-    assert (helped.n_done, helped.rows) == (0, alone.rows)
 
 
 @pytest.mark.parametrize(

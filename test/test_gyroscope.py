@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders import calibration, rich_calibration
+from builders import calibration, rich_calibration, warm
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -212,15 +212,12 @@ def test_the_rate_at_the_reference_temperature_is_corrected_by_its_bias():
     triad = replace(rich_calibration().gyroscope, response=(), posterior=None)
     for gyroscope in (triad, None):
         compensator = Compensator(replace(calibration(), gyroscope=gyroscope))
-        for second in range(2000):
-            compensator.push('board', second * 10**9, 20.0)
-            compensator.push('case', second * 10**9, 20.0)
+        warm(compensator, until_s=2000)
         row = compensator.process(2000 * 10**9, 300.0, 600.0, 2900.0)
         assert row[:2] == pytest.approx((1.0, 2.0))
         assert compensator.corrects_rate is (gyroscope is not None)
     compensator = Compensator(replace(calibration(), gyroscope=triad))
-    compensator.push('board', 0, 20.0)
-    compensator.push('case', 0, 20.0)
+    warm(compensator)
     assert compensator.process(0, 300.0, 600.0, 2900.0) is not None
     x, y, z, *variances = compensator.correct_rate(0, 1.0, 1.0, 1.0)
     assert (x, y, z) == pytest.approx((0.98 - 1e-5, 1.03, 0.99 - 1e-5), abs=1e-12)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from builders import GRAVITY, axis_set, calibration, regime_set
 
-from thermo_comp.errors import CalibrationError, RecordingError
+from thermo_comp.errors import RecordingError
 from thermo_comp.fitting.sources import digest
 from thermo_comp.judging.evaluation import evaluate
 from thermo_comp.judging.judgement import AxisShift, change_texts, judge
@@ -21,6 +21,7 @@ from thermo_comp.recording.reader import open_recording
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter, table_writer
 from thermo_comp.replay import replay
+from thermo_comp.unit.calibration import Axes, AxisReference, Unit
 from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.gravity import MICRO_G, parse_acceleration, ug_text
 from thermo_comp.unit.provenance import Provenance, ResidualSummary, Source
@@ -220,13 +221,6 @@ class TestWindows:
         finished = cli('report', short, *options, code=1)
         assert 'not judged: no recording has a rest' in finished.stdout
 
-    def test_another_unit_and_a_bag_shorter_than_a_window_are_refused(self, tmp_path):
-        bag = resting(tmp_path / 'bag', 20.0, minutes=1.0, serial='T-9')
-        with pytest.raises(CalibrationError, match='is of unit T-1'):
-            judged(bag, calibration())
-        with pytest.raises(RecordingError, match='no window of 600 s at rest'):
-            judged(bag, calibration(), window_s=600.0, serial='')
-
 
 class TestVerdict:
     @pytest.mark.parametrize(
@@ -422,6 +416,36 @@ def test_an_axis_that_repeats_one_value_in_a_rest_is_named(tmp_path):
         judged(bag, noisy)
     # An axis with less noise than a step of the converter may repeat values and is not reported.
     assert judged(bag, dataclasses.replace(noisy, noise_density_m_s2_sqrt_hz=(1e-5,) * 3))
+
+
+@pytest.mark.parametrize(
+    ('step', 'noise', 'is_refused'), [(0.0, 0.02, True), (0.005, 0.02, True), (0.01, 0.001, False)]
+)
+def test_a_constant_axis_of_an_imu_is_named_if_its_noise_exceeds_the_step(
+    tmp_path, rng, step, noise, is_refused
+):
+    n = 6000
+    force = noise * rng.standard_normal((n, 3)) + (1.5 * step, 0.0, GRAVITY)
+    force = step * np.round(force / step) if step else force
+    force[:, 1] = 0.0
+    path = tmp_path / 'imu.mcap'
+    with BagWriter(path) as writer:
+        readings = 20.0 + 1e-7 * (np.arange(600) % 2)
+        for topic in (TOPICS.board, TOPICS.case):
+            writer.write_temperature(topic, START_NS + np.arange(600) * 10**9, readings)
+        stamps = START_NS + np.arange(n) * 10**8
+        writer.write_imu(TOPICS.imu, stamps, force, np.zeros(9))
+    unit = Unit('T-1', 'm/s^2', 80.0, 0.1)
+    density = (noise * np.sqrt(0.1),) * 3
+    axes = Axes(*[AxisReference(1.0, 0.0)] * 3)
+    known = calibration(unit=unit, axes=axes, noise_density_m_s2_sqrt_hz=density)
+    if is_refused:
+        with pytest.raises(
+            RecordingError, match=r'imu\.mcap: dead axis: y reads exactly 0 for 0\.'
+        ):
+            judged(path, known)
+    else:
+        assert judged(path, known)
 
 
 def test_windows_are_written_as_a_table(tmp_path):

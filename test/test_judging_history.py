@@ -11,8 +11,8 @@ from builders import axis_set, calibration, regime_set
 from report_helpers import evidence, fitted, write_bag
 
 from thermo_comp.judging.evaluation import drifts_of, history_of
-from thermo_comp.report.html import number
 from thermo_comp.report.page import render_report
+from thermo_comp.report.style import number
 from thermo_comp.unit.calibration import AxisReference
 from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.gravity import MICRO_G

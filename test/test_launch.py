@@ -5,13 +5,12 @@
 import configparser
 import re
 import xml.etree.ElementTree as ET
-from pathlib import Path
 
 import pytest
+from conftest import ROOT
 
 from thermo_comp.topics import INPUTS, OUTPUTS
 
-ROOT = Path(__file__).resolve().parent.parent
 FILES = sorted((ROOT / 'launch').glob('*.launch.xml'))
 OURS = ROOT / 'launch' / 'thermo_comp.launch.xml'
 BESIDE = ROOT / 'launch' / 'beside_ins.launch.xml'

@@ -1,18 +1,22 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""No package imports from a higher layer; certain libraries are imported by few packages only."""
+"""Imports follow the layers, and the pages on architecture and theory agree with the source."""
 
 from __future__ import annotations
 
 import ast
+import re
 import sys
 from functools import cache
 from pathlib import Path
 
 import pytest
-from conftest import ran
+from conftest import ROOT, ran
 
-PACKAGE = Path(__file__).resolve().parent.parent / 'thermo_comp'
+from thermo_comp.unit.columns import bank
+from thermo_comp.unit.terms import GROUPS
+
+PACKAGE = ROOT / 'thermo_comp'
 
 # Layer of each package (a folder or file in thermo_comp): a package imports no higher layer.
 LAYERS = {
@@ -164,13 +168,6 @@ def loaded_after(statement, *watched):
     return ran(sys.executable, '-c', code, check=True, timeout=120).stdout.split()
 
 
-def test_the_node_imports_none_of_the_offline_libraries():
-    # Libraries for fits or plots would increase the memory and the start-up time of the node.
-    pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
-    offline = ('rosbags', 'mcap', 'matplotlib', 'scipy', 'scipy.optimize', 'typer', 'rich')
-    assert loaded_after('import thermo_comp.ros.node', *offline) == []
-
-
 def test_help_imports_none_of_the_heavy_libraries():
     heavy = ('numpy', 'scipy', 'rosbags', 'mcap', 'matplotlib', 'rclpy', 'dask')
     assert loaded_after('import thermo_comp.cli.app', *heavy) == []
@@ -181,6 +178,35 @@ def test_the_command_info_does_not_import_the_fit():
     assert loaded_after('import thermo_comp.recording.overview', *heavy) == []
 
 
-def test_the_compensator_imports_neither_ros_nor_libraries_for_bags():
-    statement = 'import thermo_comp.online.compensator'
-    assert loaded_after(statement, 'rclpy', 'rosbags', 'mcap', 'matplotlib', 'scipy') == []
+DOCS = ROOT / 'docs'
+
+
+def test_the_table_of_packages_on_the_page_equals_that_of_test_layers():
+    text = (DOCS / 'architecture.md').read_text()
+    rows = re.findall(r'^\| (\d) \| `(\w+)` \|', text, re.MULTILINE)
+    assert {room: int(layer) for layer, room in rows} == LAYERS
+    drawing = text.partition('```text')[2].partition('```')[0]
+    for line in drawing.strip().splitlines():
+        layer, _, rooms = line.strip().partition(' ')
+        shown = [word for word in re.findall(r'\w+', rooms) if word in LAYERS]
+        assert shown, line
+        assert {LAYERS[room] for room in shown} == {int(layer)}, line
+
+
+@pytest.mark.parametrize('page', ['architecture.md', 'theory.md'])
+def test_the_files_that_a_page_names_exist(page):
+    text = (DOCS / page).read_text()
+    for name in re.findall(r'[\w*/]+\.py\b', text):
+        places = (ROOT, ROOT / 'thermo_comp', ROOT / 'test')
+        # A page names a file by its path, or by its name alone if the folder is named before.
+        is_path = any(list(place.glob(name)) for place in places)
+        assert is_path or any(path.name == name for path in SOURCES), name
+
+
+def test_the_table_of_the_response_on_the_page_has_every_group():
+    text = (DOCS / 'theory.md').read_text()
+    shown = re.findall(r'^\| `(\w+)` \|', text, re.MULTILINE)
+    columns = bank(('case',), {'case': -0.5}, (-9.0, 9.0))
+    # The group `part` has no columns of its own: its curves are sums of other columns.
+    groups = {'part', *(column.group for column in columns)}
+    assert shown == [group for group in GROUPS if group in groups]

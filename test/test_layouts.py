@@ -10,14 +10,14 @@ import xml.etree.ElementTree as ET
 
 import numpy as np
 import pytest
-from builders import GRAVITY, SECOND_NS, calibration
+from builders import GRAVITY, SECOND_NS, calibration, equal_axes
 from conftest import ROOT
 from rosbags.typesys import Stores, get_typestore
 
 from thermo_comp.recording.reader import inspect_recording
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.replay import replay
-from thermo_comp.unit.calibration import Axes, AxisReference, Unit
+from thermo_comp.unit.calibration import Unit
 
 FOXGLOVE = ROOT / 'config' / 'thermo_comp.foxglove.json'
 PLOTJUGGLER = ROOT / 'config' / 'plotjuggler_layout.xml'
@@ -40,7 +40,7 @@ def replayed(folder, kind):
             writer.write_imu('imu/uncompensated', stamps, force, np.zeros(9))
     unit = Unit('T-1', 'counts' if kind == 'counts' else 'm/s^2', 32767.0, 0.1)
     scale = 300.0 if kind == 'counts' else 1.0
-    unit_ = calibration(unit=unit, axes=Axes(*[AxisReference(scale, 0.0)] * 3))
+    unit_ = calibration(unit=unit, axes=equal_axes(scale))
     output = folder / f'{kind}_corrected.mcap'
     replay(source, unit_, output, keep_inputs=True)
     return {name: topic[0] for name, topic in inspect_recording(output).topics.items()}

@@ -6,14 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders import calibration, columns_from_events, rich_calibration, stream
+from builders import UNCHECKED, assert_equal_bits, calibration, rich_calibration, stream, warm
 from field_helpers import in_any_attitude, rests
-from test_correction import UNCHECKED, assert_same, run_of
+from test_correction import run_of
 
 from thermo_comp.errors import CalibrationError
 from thermo_comp.field.series import series_of
 from thermo_comp.fitting.assembly import parameters_of, with_parameters
-from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.thermal.state import BOARD, StateLayout
 from thermo_comp.unit.calibration import parameter_layout
@@ -78,10 +77,8 @@ def test_a_correction_inverts_the_terms_at_their_temperature():
     at = [np.array(term.coefficient) + t * np.array(term.per_kelvin) for term in BENT.terms]
     x = f + at[0] * f**2 + at[1] * np.abs(f) * f + at[2] * f**3
     compensator = Compensator(unit, UNCHECKED)
-    for k in range(120):
-        compensator.push('board', k * 10**9, 20.0 + t)
-        compensator.push('case', k * 10**9, 20.0 + t)
-        corrected = compensator.process(k * 10**9, *(300.0 * G * x).tolist())
+    warm(compensator, 20.0 + t, until_s=120)
+    corrected = compensator.process(119 * 10**9, *(300.0 * G * x).tolist())
     assert np.array(corrected[:3]) / G == pytest.approx(f, abs=1e-11)
 
 
@@ -93,12 +90,8 @@ def test_nonlinear_corrections_of_single_samples_and_blocks_have_equal_bits(rng)
         (kind, stamp, tuple(9.0 * count for count in value) if kind == 'accel' else value)
         for kind, stamp, value in run_of(rng, seconds=60)
     ]
-    rows, _ = stream(Compensator(unit, UNCHECKED), events)
+    rows, _, _ = assert_equal_bits(unit, UNCHECKED, events, 77)
     assert (np.abs(rows[:, 2]) > BENT.force_range_m_s2[1]).any()
-    cut = Compensator(unit, UNCHECKED)
-    pieces = [events[k : k + 77] for k in range(0, len(events), 77)]
-    assert_same([process_block(Compensator(unit, UNCHECKED), columns_from_events(events))], rows)
-    assert_same([process_block(cut, columns_from_events(piece)) for piece in pieces], rows)
 
 
 def test_a_nonlinearity_without_terms_does_not_change_a_bit(rng):
@@ -136,8 +129,7 @@ def test_beyond_the_largest_force_the_variance_includes_an_unknown_square():
     compensator = Compensator(unit, UNCHECKED)
     variances = []
     for k, f in enumerate((50.0, 59.99, 70.0, 90.0)):
-        compensator.push('board', k * 10**9, 20.0)
-        compensator.push('case', k * 10**9, 20.0)
+        warm(compensator, start_s=k, until_s=k + 1)
         variances.append(compensator.process(k * 10**9, 300.0 * f, 0.0, 1.0)[3])
     assert variances[1] == pytest.approx(variances[0], rel=0.01)
     for f, variance in zip((70.0, 90.0), variances[2:], strict=True):

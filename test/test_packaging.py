@@ -1,21 +1,19 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The package states the same version, licence, commands and dependencies in all its files."""
+"""All files state the same version, licence and dependencies; the ROS linters find nothing."""
 
 import ast
 import os
 import re
 import sys
 import xml.etree.ElementTree as ET
-from pathlib import Path
 
 import pytest
 import yaml
-from conftest import ran
+from conftest import ROOT, ran
 
 import thermo_comp
 
-ROOT = Path(__file__).resolve().parent.parent
 MANIFEST = ET.parse(ROOT / 'package.xml').getroot()  # noqa: S314 - our own file
 
 # Dependency names that rosdep can install on Ubuntu 24.04: Python packages and ROS 2 Jazzy.
@@ -120,3 +118,29 @@ def test_the_installed_share_folder_contains_the_files_that_ros_needs(tmp_path):
         kept = {p.name for p in (ROOT / folder).glob('*') if p.suffix in ('.yaml', '.xml')}
         there = share / 'thermo_comp' / folder
         assert kept <= {p.name for p in there.glob('*')}, folder
+
+
+SOURCES = [str(ROOT / name) for name in ('thermo_comp', 'test', 'setup.py')]
+#: As in setup.cfg: the summary of a docstring is on its second line and may have two lines.
+STYLE = ['D200', 'D205', 'D400', 'D403']
+
+
+@pytest.mark.filterwarnings('ignore')
+def test_ament_flake8_finds_nothing():
+    linter = pytest.importorskip('ament_flake8.main')
+    code, errors = linter.main_with_errors(argv=['--config', str(ROOT / 'setup.cfg'), *SOURCES])
+    assert code == 0, '\n'.join(errors)
+
+
+@pytest.mark.filterwarnings('ignore')
+def test_ament_pep257_finds_nothing():
+    linter = pytest.importorskip('ament_pep257.main')
+    assert linter.main(argv=['--add-ignore', *STYLE, '--', *SOURCES]) == 0
+
+
+@pytest.mark.filterwarnings('ignore')
+def test_ament_xmllint_finds_nothing():
+    linter = pytest.importorskip('ament_xmllint.main')
+    assert (
+        linter.main(argv=[str(ROOT / name) for name in ('package.xml', 'config', 'launch')]) == 0
+    )

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import second_simulator
 import strangers
-import strangers_units
 from accuracy import errors, fit_and_correct
+from simulation_helpers import slow
 from strangers_baselines import minutes
 from strangers_cases import (
     FULL_SCALE,
@@ -26,11 +26,9 @@ from strangers_cases import (
     one_test,
     positions,
     program,
-    slow_drift,
     soaks,
     third_node,
 )
-from strangers_helpers import slow
 from strangers_units import GRAVITY, UG, rng_of, spread
 
 from thermo_comp.fitting.population import population
@@ -39,7 +37,6 @@ from thermo_comp.thermal.settings import DetectorSettings
 from thermo_comp.unit.calibration_file import load_calibration
 from thermo_comp.unit.columns import FINE_TAUS, Part, bank
 from thermo_comp.unit.functions import Polynomial
-from thermo_comp.unit.prediction import in_a_soak
 
 HEADER = 'time_s,accel_x,accel_y,accel_z,temperature_board,temperature_case'
 PARTS_S = np.array([520.0, 910.0, 1400.0])
@@ -148,19 +145,6 @@ def test_lags_of_the_thermometers_themselves_are_fitted(sensors):
 
 
 @pytest.mark.slow
-def test_slow_tilts_of_a_support_are_not_fitted_by_a_second_stage_of_a_lag():
-    # WHY: tilts of 60 urad within 4 h were fitted by second stages of lags and offsets of 5 mg: in
-    # a held-out program the force error was 5.8 mg, that of a cubic 0.27 mg.
-    _, study, _ = slow_drift(2)
-    calibration = strangers.fitted(study)
-    parts = {part.part for part in calibration.response if part.kind == 'board'}
-    assert {part.second_tau_s for part in parts} == {0.0}
-    # The tilts cause a drift of 40 ug RMS in each position, and less in the mean of 12 positions.
-    tests = {'': [minutes(bag) for bag in study.tests['']]}
-    assert strangers.scored(study, calibration, tests)[''].vector < 40.0
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize('number', [0, 1, 3])
 def test_with_a_coarse_or_noisy_thermometer_the_fit_is_as_good_as_a_cubic_by_scipy(number):
     study = list(coarse_thermometer(1))[number]
@@ -223,14 +207,6 @@ def test_powers_of_a_part_temperature_are_sums_of_columns():
         np.testing.assert_allclose(row @ columns, (t - m) ** (k % 3 + 1))
     without = replace(model, columns=tuple(col for col in model.columns if col.kind != 'cube'))
     assert not len(without.part_sums)
-
-
-@pytest.mark.slow
-def test_lags_are_fitted_without_a_case_thermometer():
-    unit, study = study_of('parts', up=12, part_s=PARTS_S, sensors=('board',))
-    calibration = strangers.fitted(study)
-    assert np.array(taus_of(calibration)) == pytest.approx(unit.part_s[:, None], rel=0.01)
-    assert judged(calibration, study).norm < 2.0
 
 
 @pytest.mark.slow
@@ -389,29 +365,6 @@ def test_a_fit_to_soaks_has_no_fitted_lag_and_no_range_of_the_gradient():
     calibration = strangers.fitted(replace(study, bags=study.bags[:9]))
     assert lags_of(calibration) <= {*FINE_TAUS}
     assert calibration.rest_gradient_range_k is None
-
-
-@pytest.mark.slow
-def test_the_bias_of_a_mems_follows_its_curve_in_three_soaks_of_six_faces():
-    # WHY: for two of 78 such units the fit chose constants and no curve, because few left-out
-    # norms were determined; the errors of the bias were 6 mg.
-    rng = rng_of('faces', 66)
-    unit = replace(consumer_grade(rng), misalignment=1e-3 * rng.standard_normal(3))
-    bags = []
-    for celsius in (20.0, 35.0, 5.0):
-        ups = FACES + 0.035 * rng.standard_normal((6, 3))
-        ups /= np.linalg.norm(ups, axis=1, keepdims=True)
-        soak = program(celsius, 20.0)
-        bags += [
-            strangers_units.record(unit, soak, up, rng, name=f'{celsius:g}-{k}', rate_hz=10.0)
-            for k, up in enumerate(ups)
-        ]
-    calibration = strangers.fitted(Study('', tuple(bags), {}, MEMS_SCALE))
-    for celsius in (5.0, 20.0, 35.0):
-        bias, *_ = in_a_soak(calibration, celsius)
-        true_bias = unit.bias_at(np.full((1, 3), celsius), np.zeros((1, 1)))[0]
-        # Faces hardly determine misalignments of 1 mrad, which cause errors of up to 1 mg.
-        assert np.abs(bias / UG - true_bias).max() < 1000.0
 
 
 def test_units_of_a_type_share_the_lags_of_the_bank(parts):

@@ -209,3 +209,43 @@ def test_the_warm_up_after_power_on_is_not_taken_for_swapped_topics():
         tracker.read('board', second * SECOND_NS, 20.0 + warm + 0.7 * air + flicker)
         tracker.read('case', second * SECOND_NS, 20.0 + warm / 3.0 + air - flicker)
         assert not tracker.lead.is_reversed
+
+
+def in_ramp(tracker, case_of, order, seconds=300):
+    """Heat the board by 1 K/min with a reading each second; `case_of` gives the case's reading."""
+    rng = np.random.default_rng(8)
+    for second in range(seconds):
+        board = 20.0 + second / 60.0 + 0.005 * rng.standard_normal()
+        readings = {'board': board, 'case': case_of(board, second, rng)}
+        for name in order:
+            tracker.read(name, second * SECOND_NS, readings[name])
+    return tracker.sample(seconds * SECOND_NS)
+
+
+@pytest.mark.parametrize('order', [('board', 'case'), ('case', 'board')])
+def test_one_topic_given_for_both_thermometers_is_named_and_claimed(order):
+    tracker = tracker_of()
+    state = in_ramp(tracker, lambda board, *_: board, order)
+    assert tracker.copies['case'].is_copy
+    # In a ramp of 1 K/min the case of a unit with a board lag of 900 s is 15 K before the board.
+    assert abs(state[GRADIENT]) < 0.1
+    assert state[VAR_GRADIENT] ** 0.5 == pytest.approx(15.0, rel=0.2)
+    # Readings that differ from the board's end the fault.
+    tracker.read('board', 300 * SECOND_NS, 25.0)
+    tracker.read('case', 300 * SECOND_NS, 25.1)
+    assert not tracker.copies['case'].is_copy
+
+
+@pytest.mark.parametrize('quantum', [0.0, 0.0625, 1.0])
+def test_two_thermometers_at_one_temperature_are_not_taken_for_one(quantum):
+    def rounded(celsius):
+        return quantum * round(celsius / quantum) if quantum else celsius
+
+    tracker = tracker_of('degrees')
+    rng = np.random.default_rng(9)
+    for second in range(20_000):
+        true = 20.0 + 10.0 * math.sin(second / 1000.0)
+        for name in ('board', 'case'):
+            reading = rounded(true + 0.02 * rng.standard_normal())
+            tracker.read(name, second * SECOND_NS, reading)
+        assert not tracker.copies['case'].is_copy

@@ -30,11 +30,11 @@ def random_covariance(seed, n, spread=1.0):
     return covariance * scale * scale[:, np.newaxis]
 
 
-@given(st.integers(0, 2**32 - 1), st.integers(1, 30), st.sampled_from([0.0, 1e-5, 1e-3, 0.1]))
+@given(st.integers(0, 2**32 - 1), st.integers(1, 30))
 @settings(max_examples=60, deadline=None)
-def test_variances_are_kept_and_correlation_errors_are_within_the_tolerance(seed, n, tolerance):
-    covariance = random_covariance(seed, n)
-    posterior = posterior_of(covariance, tolerance)
+def test_variances_are_kept_and_correlation_errors_are_within_the_tolerance(seed, n):
+    covariance, tolerance = random_covariance(seed, n), 1e-5
+    posterior = posterior_of(covariance)
     sd = np.sqrt(np.diag(covariance))
     error = (posterior.covariance() - covariance) / sd / sd[:, np.newaxis]
     # The factor of the covariance is stored in single precision.
@@ -44,11 +44,8 @@ def test_variances_are_kept_and_correlation_errors_are_within_the_tolerance(seed
     assert posterior.matrix.shape == (n, posterior.rank)
 
 
-def test_a_larger_tolerance_gives_a_smaller_factor():
-    covariance = random_covariance(1, 30)
-    ranks = [posterior_of(covariance, share).rank for share in (0.1, 1e-3, 1e-5)]
-    assert ranks == sorted(ranks)
-    assert ranks[0] < ranks[-1] <= 30
+def test_the_factor_of_a_covariance_has_few_columns():
+    assert posterior_of(random_covariance(1, 30)).rank < 30
 
 
 def test_exactly_known_parameters_have_zero_variance():

@@ -294,6 +294,3 @@ def test_the_output_for_any_messages_is_finite_and_bounded(of, config, sent):
         covariance = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         assert np.linalg.eigvalsh(covariance).min() > 0.0
     assert compensator.counters.n_out <= n_counts
-
-
-finite = st.floats(-1e3, 1e3)

@@ -42,11 +42,6 @@ def test_commands_in_the_readme_exist():
         assert (ROOT / script).is_file(), script
 
 
-def test_targets_of_the_links_in_the_readme_exist():
-    for target in re.findall(r'\]\(([^)#]+)\)', README):
-        assert (ROOT / target).exists(), target
-
-
 def test_the_excerpt_of_a_calibration_on_the_page_is_part_of_the_example():
     page = (ROOT / 'docs' / 'calibration_file.md').read_text(encoding='utf-8')
     (excerpt,) = (yaml.safe_load(text) for kind, text in FENCE.findall(page) if kind == 'yaml')

@@ -33,7 +33,6 @@ from thermo_comp.recording.reader import open_recording, read_recording
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter
 
-ALL_TOPICS = (ACCEL, BOARD, CASE, OTHER)
 WIDTHS = {ACCEL: 3, IMU_IN: 37, BOARD: 2, CASE: 2, OTHER: 0}
 
 
@@ -190,17 +189,6 @@ def test_blocks_end_where_the_frame_changes_and_together_have_all_messages(tmp_p
         n_accel += len(block)
     assert (before, n_accel) == (8, 60)
     assert_columns(read(tmp_path / 'bag.mcap').columns, messages)
-
-
-def test_overlapping_chunks_of_single_topics_are_merged(tmp_path):
-    """A chunk has the messages of one topic in 0.1 s; messages are read in log-time order."""
-    messages = regular_messages(200)
-    by_topic = sorted(
-        messages, key=lambda m: ((m.log_ns - START_NS) // 100_000_000, ALL_TOPICS.index(m.topic))
-    )
-    write_mcap(tmp_path / 'bag.mcap', by_topic, chunk_size=400)
-    # Messages with equal log times keep the order of the file, here counts, then temperatures.
-    assert_columns(read(tmp_path / 'bag.mcap').columns, in_reading_order(by_topic))
 
 
 def test_too_many_overlapping_chunks_are_refused(tmp_path, monkeypatch):

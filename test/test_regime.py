@@ -21,6 +21,7 @@ from thermal_signals import (
     lagged,
     lagged_twice,
     read,
+    regimes,
     ripple,
     switches,
 )
@@ -215,15 +216,10 @@ def test_the_threshold_follows_from_the_noise_of_the_filter(dt):
 
 
 def test_the_regime_is_unknown_until_there_are_enough_readings():
-    settings = detector_settings(0.001)
-    detector = RegimeDetector(settings)
-    case, board = Thermometer(settings.case), Thermometer(settings.board)
-    assert detector.update(0, None, None) == UNKNOWN
-    for k in range(30):
-        board.update(k * SECOND_NS, 20.0)
-        case.update(k * SECOND_NS, 20.0)
-        assert detector.update(k * SECOND_NS, case, board) == UNKNOWN
-    assert detector.direction == 0
+    settings, constant = detector_settings(0.001), np.full(30, 20.0)
+    assert RegimeDetector(settings).update(0, None, None) == UNKNOWN
+    states = regimes(settings, np.arange(30.0), constant, constant)
+    assert {state[1:] for state in states} == {(UNKNOWN, 0)}
 
 
 def run_once(corners, *, noise=0.001, quantum=0.0, lag=LAG_S, begin=-1800.0, end=8000.0, **parts):
@@ -310,25 +306,12 @@ def test_the_regime_stays_dynamic_at_a_reversal_of_the_ramp(lost, quantum):
     assert [regime for _, regime, _ in changes] == [STATIC, DYNAMIC, STATIC]
 
 
-def regimes_and_directions(settings, case_readings, board_readings):
-    """Return regime and direction after each pair of readings, one pair per second."""
-    case, board = Thermometer(settings.case), Thermometer(settings.board)
-    detector = RegimeDetector(settings)
-    states = []
-    for k, (c, b) in enumerate(zip(case_readings, board_readings, strict=True)):
-        board.update(k * SECOND_NS, float(b))
-        case.update(k * SECOND_NS, float(c))
-        detector.update(k * SECOND_NS, case, board)
-        states.append((detector.regime, detector.direction))
-    return states
-
-
 def test_the_direction_changes_when_the_case_reverses():
     rng = np.random.default_rng(8)
     t = np.arange(-1800.0, 7200.0)
     readings = [read(x, 0.001, 0.0, rng) for x in case_and_board(t, TRIANGLE)]
-    states = regimes_and_directions(detector_settings(0.001), *readings)
-    directions = {at: direction for at, (_, direction) in zip(t, states, strict=True)}
+    states = regimes(detector_settings(0.001), t, *readings)
+    directions = {at: direction for at, _, direction in states}
     assert directions[-100.0] == 0
     assert directions[600.0] == directions[3600.0] == 1
     # The case reverses LAG_S * ln(2 - exp(-3600 s / LAG_S)) = 616 s after the chamber.
@@ -343,8 +326,8 @@ def test_repeated_readings_do_not_change_the_direction():
     t = np.arange(-2400.0, 6000.0)
     truths = case_and_board(t, [(0.0, 2.0), (3000.0, 0.0)], 300.0)
     held = [np.repeat(read(x, 0.001, 0.0625, rng)[::30], 30) for x in truths]
-    seen = set(regimes_and_directions(detector_settings(0.001, 0.0625, 300.0), *held))
-    assert seen == {(UNKNOWN, 0), (STATIC, 0), (DYNAMIC, 1)}
+    states = regimes(detector_settings(0.001, 0.0625, 300.0), t, *held)
+    assert {state[1:] for state in states} == {(UNKNOWN, 0), (STATIC, 0), (DYNAMIC, 1)}
 
 
 def test_the_first_regime_is_dynamic_if_readings_begin_in_a_ramp():
@@ -355,18 +338,11 @@ def test_the_first_regime_is_dynamic_if_readings_begin_in_a_ramp():
 
 
 def test_the_dynamic_regime_ends_by_the_case_if_the_board_thermometer_fails():
-    settings = detector_settings(0.001)
-    case, board = Thermometer(settings.case), Thermometer(settings.board)
-    detector = RegimeDetector(settings)
     t = np.arange(-1800.0, 8000.0)
-    truths = case_and_board(t, RAMP)
-    for k, (c, b) in enumerate(zip(*truths, strict=True)):
-        stamp_ns = k * SECOND_NS
-        if t[k] < 3600.0:
-            board.update(stamp_ns, float(b))
-        case.update(stamp_ns, float(c))
-        detector.update(stamp_ns, case, board)
-    assert detector.regime == STATIC
+    case, board = case_and_board(t, RAMP)
+    board[t >= 3600.0] = np.nan
+    changes = switches(detector_settings(0.001), t, case, board)
+    assert [regime for _, regime, _ in changes][-2:] == [DYNAMIC, STATIC]
 
 
 @pytest.mark.parametrize('quantum', [0.0, 0.0625])

@@ -19,8 +19,8 @@ from thermo_comp.fitting.reduction import Readings
 from thermo_comp.judging.evaluation import open_bags
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.report.evidence import LEFT_OUT, evidence_of_bags
-from thermo_comp.report.html import spelt
 from thermo_comp.report.page import drawn_figures, figures_of, render_report, write_report
+from thermo_comp.report.style import spelt
 from thermo_comp.thermal.regime import Regime
 
 pytestmark = pytest.mark.usefixtures('equal_fits_once')

@@ -14,11 +14,17 @@ from report_helpers import evidence, fitted, write_bag
 
 from thermo_comp.errors import ThermoCompError
 from thermo_comp.judging.verdicts import Verdict
-from thermo_comp.report.certificate import budget, combined, conformity, over_temperature, results
-from thermo_comp.report.html import rounded
+from thermo_comp.report.certificate import (
+    budget,
+    combined,
+    conformity,
+    over_temperature,
+    results,
+    table_temperatures,
+)
 from thermo_comp.report.page import render_report
 from thermo_comp.report.statements import CertificateInfo, load_certificate_info
-from thermo_comp.report.temperature_curves import table_temperatures
+from thermo_comp.report.style import rounded
 from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.gravity import MICRO_G
 from thermo_comp.unit.prediction import in_a_soak
@@ -199,13 +205,10 @@ def test_the_table_over_temperature_agrees_with_the_calibration(tmp_path):
     assert [table.axis for table in tables] == ['x', 'y', 'z']
     calibration = fitted().calibration
     for k, table in enumerate(tables):
-        assert len({row.program for row in table.rows}) == 3
-        for row in table.rows:
-            if row.program != 'soak':
-                continue
-            at = float(row.temperature.replace('−', '-'))
+        assert len({program for program, *_ in table.rows}) == 3
+        for cells in (cells for program, *cells in table.rows if program == 'soak'):
+            at, *numbers = (float(cell.replace('−', '-')) for cell in cells)
             bias, sd, scale, scale_sd = in_a_soak(calibration, at)
-            numbers = [float(cell.replace('−', '-')) for cell in row[2:]]
             # Values and temperatures are rounded; the tolerance is half of the last digit.
             slack = 0.06 * abs(table.bias_slope) + 0.06 * numbers[1]
             assert numbers[0] == pytest.approx(bias[k] / MICRO_G, abs=slack)

@@ -15,14 +15,11 @@ from builders import axis_set, calibration, regime_set, rich_calibration, term
 from matplotlib.colors import to_rgb
 from report_helpers import certificate, evidence, fitted
 
-from thermo_comp.report import figures_bags as of_bags
-from thermo_comp.report import figures_unit as of_unit
-from thermo_comp.report.evidence import LEFT_OUT
-from thermo_comp.report.html import number
+from thermo_comp.report import figures
+from thermo_comp.report.certificate import curves
+from thermo_comp.report.evidence import LEFT_OUT, shown_bag
 from thermo_comp.report.page import figures_of, position_error, schuler_peak
-from thermo_comp.report.style import drawing, svg
-from thermo_comp.report.temperature_curves import curves
-from thermo_comp.report.trace import shown_bag
+from thermo_comp.report.style import drawing, number, svg
 from thermo_comp.thermal.regime import Regime
 from thermo_comp.thermal.settings import DetectorSettings
 from thermo_comp.unit.gravity import MICRO_G
@@ -60,7 +57,7 @@ def test_measured_errors_in_soaks_are_those_of_the_scale_factors():
     up = np.array([position.up for position in evidence().positions])[windows.position]
     length = np.where(windows.is_dynamic, 1.0, 1.0 + 30e-6) * windows.gravity
     wrong = replace(evidence(), windows=replace(windows, force=up * length[:, None]))
-    temperature, errors = of_unit.soak_measurements(wrong)
+    temperature, errors = figures.soak_measurements(wrong)
     assert len(temperature) >= len(wrong.positions)
     bias, scale = errors[:, :3], errors[:, 3:]
     known = np.isfinite(scale)
@@ -77,10 +74,10 @@ def test_position_errors_of_a_navigator_agree_with_hand_numbers():
 
 
 def test_the_map_of_the_sphere_preserves_areas():
-    assert of_bags.equal_area((0.0, 0.0, 1.0), 1) == (0.0, 0.0)
-    assert of_bags.equal_area((0.0, 1.0, 0.0), -1) == (0.0, 1.0)
+    assert figures.equal_area((0.0, 0.0, 1.0), 1) == (0.0, 0.0)
+    assert figures.equal_area((0.0, 1.0, 0.0), -1) == (0.0, 1.0)
     # The cap above 45 degrees has 1 - sin 45 of the area of a hemisphere, and of the disc.
-    x, y = of_bags.equal_area((np.sqrt(0.5), 0.0, np.sqrt(0.5)), 1)
+    x, y = figures.equal_area((np.sqrt(0.5), 0.0, np.sqrt(0.5)), 1)
     assert x**2 + y**2 == pytest.approx(1.0 - np.sqrt(0.5))
 
 
@@ -115,9 +112,9 @@ def look(line):
 @pytest.mark.parametrize(
     'draw',
     [
-        of_bags.draw_temperatures, of_bags.draw_dynamics, of_bags.draw_residuals,
-        of_bags.draw_gravity, of_unit.draw_functions, of_bags.draw_positions,
-        of_bags.draw_every_position,
+        figures.draw_temperatures, figures.draw_dynamics, figures.draw_residuals,
+        figures.draw_gravity, figures.draw_functions, figures.draw_positions,
+        figures.draw_every_position,
     ],
 )  # fmt: skip
 def test_lines_of_figures_differ_without_colour(draw):
@@ -136,7 +133,7 @@ def test_lines_of_figures_differ_without_colour(draw):
 
 def test_the_area_of_a_ring_is_proportional_to_the_residual_of_its_position():
     with drawing():
-        lines = [line for axes in of_bags.draw_positions(evidence()).axes for line in axes.lines]
+        lines = [line for axes in figures.draw_positions(evidence()).axes for line in axes.lines]
     rings = [line for line in lines if line.get_marker() == 'o' and line.get_mfc() == 'none']
     areas = np.sort([ring.get_markersize() ** 2 for ring in rings])
     # A position without a left-out residual has a ring of area 0.
@@ -156,7 +153,7 @@ def test_numbers_have_three_to_four_digits(value, text):
 
 def test_the_label_of_a_drawing_is_escaped():
     with drawing():
-        text = svg(of_bags.draw_temperatures(evidence()), 'x', '"><script>')
+        text = svg(figures.draw_temperatures(evidence()), 'x', '"><script>')
     assert '<script>' not in text
     assert 'aria-label="&quot;&gt;&lt;script&gt;"' in text
 
@@ -164,7 +161,7 @@ def test_the_label_of_a_drawing_is_escaped():
 def test_the_figure_of_rates_shows_the_bias_of_the_gyroscope():
     unit = rich_calibration()
     with drawing():
-        figure = of_unit.draw_rates(replace(evidence(), calibration=unit))
+        figure = figures.draw_rates(replace(evidence(), calibration=unit))
     gyroscope = unit.gyroscope
     for axes, curve in zip(figure.axes, gyroscope.static.axes(), strict=True):
         soak = axes.get_lines()[0]

@@ -1,24 +1,31 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Invalid samples (stuck, zero, too fast) are rejected, one by one and in blocks alike."""
+"""Invalid samples are dropped; the gravity check refuses aged calibrations, and ignores motion."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders import GRAVITY, SECOND_NS, calibration, columns_from_events
+from builders import (
+    GRAVITY,
+    SECOND_NS,
+    UNCHECKED,
+    assert_equal_bits,
+    calibration,
+    equal_axes,
+    stream,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.signal import lfilter
 
-from thermo_comp.online.batch import process_block
-from thermo_comp.online.checks import STUCK_SAMPLES, StuckCheck
+from thermo_comp.online.checks import STUCK_SAMPLES, GravityCheck, StuckCheck
 from thermo_comp.online.compensator import Compensator, CompensatorConfig
-from thermo_comp.online.status import DROPPED, Counters
-from thermo_comp.unit.calibration import Axes, AxisReference, Unit
+from thermo_comp.unit.calibration import Unit
 
 K = 300.0
 UP = (0.36, -0.48, 0.8)
-UNIQUE = [0, 1, 2, 4, 5, 8]
 
 
 def at_rest(rng, bias=0.0):
@@ -31,19 +38,6 @@ def readings(second):
         ('board', second * SECOND_NS, 20.0 + flicker),
         ('case', second * SECOND_NS, 20.0 - flicker),
     ]
-
-
-def run(compensator, events):
-    stamps, rows = [], []
-    for kind, stamp_ns, value in events:
-        if kind == 'accel':
-            row = compensator.process(stamp_ns, *value)
-            if row is not None:
-                stamps.append(stamp_ns)
-                rows.append(row)
-        else:
-            compensator.push(kind, stamp_ns, value)
-    return stamps, rows
 
 
 def recording(n, rate_hz, sample, start_ns=0):
@@ -62,7 +56,7 @@ def recording(n, rate_hz, sample, start_ns=0):
 def test_few_equal_samples_are_accepted_at_any_sample_rate(rng):
     compensator = Compensator(calibration())
     stuck = at_rest(rng)
-    run(compensator, recording(STUCK_SAMPLES, 1.0, lambda _: stuck))
+    stream(compensator, recording(STUCK_SAMPLES, 1.0, lambda _: stuck))
     assert compensator.counters.n_stuck == 0
 
 
@@ -80,10 +74,11 @@ def test_few_equal_samples_are_accepted_at_any_sample_rate(rng):
 def test_constant_samples_are_found_in_batches_of_any_size(parts, cuts, period):
     # In each part of a recording an axis is constant or changes with each sample; some are NaN.
     stands = np.repeat([which >> np.arange(3) & 1 for _, which in parts], [n for n, _ in parts], 0)
-    samples = 1.0 + np.cumsum(1.0 - stands.reshape(-1, 3), axis=0)
+    sizes = 1.0 + np.arange(len(stands)) % 4
+    samples = 1.0 + np.cumsum((1.0 - stands.reshape(-1, 3)) * sizes[:, np.newaxis], axis=0)
     samples[7::97, 1] = np.nan
     stamps = np.arange(len(samples), dtype=np.int64) * 20_000_000
-    single, batched = (StuckCheck(period / 50.0, 30.0) for _ in range(2))
+    single, batched = (StuckCheck(period / 50.0, 60.0, (2.0, 1.5, 2.5)) for _ in range(2))
     expected = []
     for stamp_ns, (x, y, z) in zip(stamps.tolist(), samples.tolist(), strict=True):
         last = single.last
@@ -116,7 +111,7 @@ def test_a_constant_axis_is_stuck_if_the_other_axes_change(axis, value):
         counts[axis] = value
         return tuple(counts)
 
-    run(compensator, recording(1000, 100.0, sample))
+    stream(compensator, recording(1000, 100.0, sample))
     assert compensator.counters.n_out == 201  # two seconds
     assert compensator.counters.n_stuck == 799
 
@@ -124,7 +119,7 @@ def test_a_constant_axis_is_stuck_if_the_other_axes_change(axis, value):
 def test_a_constant_axis_at_rest_is_not_stuck(rng):
     compensator = Compensator(calibration())
     # Noise is below a rounding step: x is constant, y and z are at an edge and alternate.
-    run(
+    stream(
         compensator,
         recording(
             5000,
@@ -139,11 +134,61 @@ def test_a_constant_axis_at_rest_is_not_stuck(rng):
     assert compensator.counters.n_out == 5000
 
 
-def test_checks_of_samples_can_be_switched_off():
-    compensator = Compensator(
-        calibration(), CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
+def noisy_unit(noise_counts, n_in_counts=K):
+    """Make a calibration whose samples have a noise of that many counts [sd] at 100 Hz."""
+    density = noise_counts / n_in_counts / 10.0
+    return calibration(
+        axes=equal_axes(n_in_counts),
+        unit=replace(calibration().unit, cycle_time_s=0.01),
+        noise_density_m_s2_sqrt_hz=(density,) * 3,
     )
-    run(compensator, recording(1000, 100.0, lambda _: (0.0, 0.0, 0.0)))
+
+
+@pytest.mark.parametrize('dead', [(0,), (1,), (2,), (0, 1), (1, 2)])
+def test_a_constant_axis_at_rest_is_stuck_if_its_noise_would_show(dead, rng):
+    compensator = Compensator(noisy_unit(3.0))
+
+    def sample(_):
+        counts = [float(round(K * GRAVITY * u + rng.normal(0.0, 3.0))) for u in UP]
+        for axis in dead:
+            counts[axis] = float(round(K * GRAVITY * UP[axis]))
+        return tuple(counts)
+
+    stream(compensator, recording(1000, 100.0, sample))
+    # The time-out of two seconds, or somewhat later, as the other axes must have shown noise.
+    assert 201 <= compensator.counters.n_out <= 260
+    assert compensator.counters.n_stuck == 1000 - compensator.counters.n_out
+
+
+@pytest.mark.parametrize('correlation', [0.0, 0.9, 0.999])
+def test_no_sample_of_a_working_sensor_is_stuck_whatever_its_bandwidth(correlation, rng):
+    compensator = Compensator(noisy_unit(3.0))
+    n = 30_000
+    noise = lfilter(
+        [3.0 * math.sqrt(1.0 - correlation**2)],
+        [1.0, -correlation],
+        rng.normal(size=(n, 3)),
+        axis=0,
+    )
+    table = np.round(K * GRAVITY * np.array(UP) + noise)
+    stream(compensator, recording(n, 100.0, lambda k: tuple(table[k].tolist())))
+    assert compensator.counters.n_stuck == 0
+
+
+@pytest.mark.parametrize('step', [1.0, 2.0, 5.0])
+def test_a_sensor_that_is_quieter_than_its_calibration_is_not_stuck(step, rng):
+    # Calibrated on a vibrating chamber; used at rest, with a noise far below the converter's step.
+    compensator = Compensator(noisy_unit(3.0))
+    edge = np.array([0.5, 0.0, 0.5])
+    centre = step * (np.round(K * GRAVITY * np.array(UP) / step) + edge)
+    table = step * np.round((centre + rng.normal(0.0, 0.1 * step, (5000, 3))) / step)
+    stream(compensator, recording(5000, 100.0, lambda k: tuple(table[k].tolist())))
+    assert compensator.counters.n_stuck == 0
+
+
+def test_checks_of_samples_can_be_switched_off():
+    compensator = Compensator(calibration(), UNCHECKED)
+    stream(compensator, recording(1000, 100.0, lambda _: (0.0, 0.0, 0.0)))
     assert compensator.counters.n_out == 1000
 
 
@@ -154,16 +199,14 @@ def test_samples_in_bursts_are_not_taken_for_too_fast(rng):
         events += readings(burst) if burst % 2 == 0 else []
         stamp_ns = burst * SECOND_NS // 2
         events += [('accel', stamp_ns + 1000 * k, at_rest(rng)) for k in range(1, 51)]
-    run(compensator, events)
+    stream(compensator, events)
     assert compensator.counters.n_too_fast == 0
 
 
 def test_the_variance_of_samples_in_m_s2_is_proportional_to_their_rate(rng):
-    unit = calibration(
-        unit=Unit('T-1', 'm/s^2', 100.0, 0.01), axes=Axes(*[AxisReference(1.0, 0.0)] * 3)
-    )
+    unit = calibration(unit=Unit('T-1', 'm/s^2', 100.0, 0.01), axes=equal_axes(1.0))
     compensator = Compensator(unit)
-    _, rows = run(
+    rows, _ = stream(
         compensator,
         recording(8000, 400.0, lambda _: tuple(GRAVITY * u + rng.normal(0.0, 1e-3) for u in UP)),
     )
@@ -176,15 +219,10 @@ def test_the_variance_of_samples_in_m_s2_is_proportional_to_their_rate(rng):
 def test_the_gravity_check_uses_local_gravity_or_that_of_the_calibration(rng):
     for local, expected in ((0.0, 0.0), (GRAVITY + 2e-3, -2e-3)):
         compensator = Compensator(calibration(), CompensatorConfig(local_gravity_m_s2=local))
-        run(compensator, recording(6000, 100.0, lambda _: at_rest(rng)))
+        stream(compensator, recording(6000, 100.0, lambda _: at_rest(rng)))
         gravity = compensator.status().gravity
         # The tolerance is that of a mean of 110 samples with a noise of 1.4 mm/s^2, and rounding.
         assert gravity.residual == pytest.approx(expected, abs=5 * 1.4e-3 / math.sqrt(110) + 2e-4)
-
-
-def test_the_number_of_samples_is_the_sum_of_all_reasons():
-    counters = Counters(**{name: 2**k for k, name in enumerate(DROPPED)})
-    assert counters.n_in == 2 ** len(DROPPED) - 1
 
 
 @st.composite
@@ -221,20 +259,112 @@ def stretches(draw):
 @settings(max_examples=60, deadline=None)
 def test_the_batch_drops_the_samples_that_the_stream_drops(events, chunk, stuck_s):
     config = CompensatorConfig(stuck_timeout_s=stuck_s, gravity_tolerance_m_s2=0.1)
-    unit = calibration(axes=Axes(*[AxisReference(K, 60.0)] * 3))
-    streamed, whole, cut = (Compensator(unit, config) for _ in range(3))
-    stamps, rows = run(streamed, events)
-    blocks = [process_block(whole, columns_from_events(events))]
-    pieces = [
-        process_block(cut, columns_from_events(events[k : k + chunk]))
-        for k in range(0, len(events), chunk)
-    ]
-    for parts in (blocks, pieces):
-        assert np.concatenate([part.stamp_ns for part in parts]).tolist() == stamps
-        table = np.array(rows).reshape(-1, 9)
-        force = np.concatenate([part.specific_force for part in parts])
-        covariance = np.concatenate([part.covariance for part in parts])
-        np.testing.assert_array_equal(force, table[:, :3])
-        np.testing.assert_array_equal(covariance[:, UNIQUE], table[:, 3:])
-    assert streamed.counters == whole.counters == cut.counters
-    assert streamed.status() == whole.status() == cut.status()
+    unit = calibration(axes=equal_axes(K, 60.0))
+    _, _, compensators = assert_equal_bits(unit, config, events, chunk)
+    first, *others = (compensator.status() for compensator in compensators)
+    assert others == [first, first]
+
+
+@pytest.mark.parametrize('is_mended', [False, True])
+def test_a_jump_back_in_time_does_not_restore_a_refuted_calibration(rng, is_mended):
+    compensator = Compensator(calibration(), CompensatorConfig(gravity_tolerance_m_s2=0.1))
+
+    def events(bias, start_ns=0):
+        return recording(6000, 100.0, lambda _: at_rest(rng, bias), start_ns)
+
+    stream(compensator, events(100.0, 100 * SECOND_NS))
+    assert compensator.is_refusing
+    n_out, n_refuted = compensator.counters.n_out, compensator.counters.n_refuted
+    stream(compensator, events(0.0 if is_mended else 100.0))
+    assert compensator.counters.n_time_jumps == 1
+    if is_mended:
+        # Windows of 5 s; the first has no window to compare with, the next two restore the output.
+        assert compensator.counters.n_out - n_out == pytest.approx(4500, abs=200)
+    else:
+        assert compensator.counters.n_out == n_out
+        assert compensator.counters.n_refuted == n_refuted + 6000
+
+
+NOISE_SD = 2e-3
+BIAS_SD = 1e-4
+VARIANCE = NOISE_SD**2 + BIAS_SD**2
+COVARIANCE = (VARIANCE, 0.0, 0.0, VARIANCE, 0.0, VARIANCE)
+
+
+def watch(rng, *, bias=0.0, seconds=60, motion=0.0, rate_hz=100, monitor=None):
+    monitor = monitor or GravityCheck(GRAVITY)
+    up = np.array([0.3, -0.5, math.sqrt(1 - 0.34)])
+    n = seconds * rate_hz
+    t = np.arange(n) / rate_hz
+    force = GRAVITY * up + bias * up + NOISE_SD * rng.standard_normal((n, 3))
+    force += motion * np.sin(2 * np.pi * 1.3 * t)[:, None] * [0.7, 0.6, 0.1]
+    for stamp, row in zip(np.rint(t * 1e9).astype(int).tolist(), force.tolist(), strict=True):
+        monitor.add(stamp, tuple(row), COVARIANCE, 3 * NOISE_SD**2)
+    return monitor.result
+
+
+def test_the_residual_of_a_good_calibration_is_near_0_and_its_sd_is_right(rng):
+    result = watch(rng)
+    # The mean of 99 samples has a noise of 0.2 mm/s^2, the mean of 30 such windows 0.04 mm/s^2.
+    assert abs(result.residual) < 5 * NOISE_SD / math.sqrt(100 * 15)
+    assert result.residual_sd == pytest.approx(math.hypot(BIAS_SD, NOISE_SD / math.sqrt(99)))
+    assert result.n_windows == 59  # the first of 60 windows has no predecessor to compare with
+    assert result.is_still
+
+
+def test_an_aged_calibration_is_reported(rng):
+    result = watch(rng, bias=3e-3)
+    assert result.residual == pytest.approx(3e-3, abs=5 * NOISE_SD / math.sqrt(100 * 15))
+    assert result.residual > 10 * result.residual_sd
+
+
+def test_motion_gives_no_verdict(rng):
+    assert watch(rng, motion=0.05) is None
+
+
+def test_a_jump_of_the_stamps_starts_a_new_window(rng):
+    monitor = GravityCheck(GRAVITY)
+    watch(rng, seconds=10, monitor=monitor)
+    result = watch(rng, seconds=10, monitor=monitor)
+    assert result.n_windows == 19
+
+
+def steps(rng, *, offset, at_s=20.0, ramp_s=0.0, rate_hz=2.5, scatter=0.0):
+    """Change |f| at `at_s`; return the time from then to the refusal [s], and the result."""
+    monitor = GravityCheck(GRAVITY, tolerance=0.1)
+    up = np.array([0.3, -0.5, math.sqrt(1 - 0.34)])
+    for k in range(round((at_s + 10.0) * rate_hz)):
+        seconds = k / rate_hz
+        grown = min(max((seconds - at_s) / ramp_s, 0.0), 1.0) if ramp_s else seconds >= at_s
+        sd = math.hypot(NOISE_SD, scatter * (seconds >= at_s))
+        force = (GRAVITY + offset * grown) * up + sd * rng.standard_normal(3)
+        monitor.add(round(seconds * 1e9), tuple(force), COVARIANCE, 3 * NOISE_SD**2)
+        if monitor.is_refuted:
+            return seconds - at_s, monitor.result
+    return math.inf, monitor.result
+
+
+@pytest.mark.parametrize('rate_hz', [2.5, 5.0, 10.0])
+@pytest.mark.parametrize('offset', [0.3, -3.0, 15.0])
+def test_a_step_at_rest_refutes_the_calibration_within_a_second(rng, rate_hz, offset):
+    # WHY: the refusal came after five seconds, and its printed mean included samples before the
+    # change.
+    after_s, result = steps(rng, offset=offset, rate_hz=rate_hz)
+    assert after_s < 1.0
+    assert result.residual == pytest.approx(offset, abs=5 * NOISE_SD)
+
+
+def test_a_change_by_motion_does_not_refute_the_calibration_at_once(rng):
+    # Such changes occur in a lift that accelerates for 0.8 s, and in a shaking car.
+    assert steps(rng, offset=1.0, ramp_s=0.8, rate_hz=5.0)[0] > 2.0
+    assert steps(rng, offset=1.0, scatter=0.05, rate_hz=5.0)[0] > 2.0
+
+
+def test_the_message_states_the_deviation_of_the_latest_windows(rng):
+    monitor = GravityCheck(GRAVITY, tolerance=0.1)
+    watch(rng, seconds=40, bias=0.001, monitor=monitor)
+    assert not monitor.is_refuted
+    # The stamps start again at 0, so the change of |f| is taken for a restart, not for a step.
+    result = watch(rng, seconds=8, bias=0.5, monitor=monitor)
+    assert monitor.is_refuted
+    assert result.residual == pytest.approx(0.5, abs=1e-3)

@@ -80,8 +80,6 @@ def test_plans_have_the_stated_durations_and_attitudes():
     fitted = np.array([p.up for p in plan('chamber-18', 1)])
     held_out = np.array([p.up for p in plan('held-out', 1)])
     assert (held_out @ fitted.T).max() < 0.999
-    with pytest.raises(ValueError, match=r"`name` must be one of chamber-18, .*, got 'oven'"):
-        plan('oven')
 
 
 def test_a_slipping_joint_has_a_closed_hysteresis_loop():
@@ -215,18 +213,6 @@ def test_equal_seeds_give_equal_units_and_other_seeds_other_units():
         assert unit_of(name, 1) == unit_of(name, 1)
         assert unit_of(name, 1) != unit_of(name, 2)
         assert unit_of(name, 1).serial == f'{name}-0001'
-    with pytest.raises(ValueError, match=r"`name` must be one of thermostatted, .*, got 'laser'"):
-        unit_preset('laser')
-
-
-def test_the_sum_of_counts_is_the_integral_within_one_count(rng):
-    charge = rng.uniform(-3000.0, 3000.0, (200_000, 3))
-    start = first_charge(7)
-    counts, _ = balanced(charge, start)
-    # At each cycle sum of charge less sum of counts is 0 to 1 count; 1e-6 is the rounding error.
-    short = np.cumsum(charge, axis=0) + start / 2.0**40 - np.cumsum(counts, axis=0)
-    assert short.min() > -1e-6
-    assert short.max() < 1.0 + 1e-6
 
 
 def test_the_sum_of_counts_of_a_day_at_100_hz_is_exact_to_one_count():
@@ -241,19 +227,6 @@ def test_the_sum_of_counts_of_a_day_at_100_hz_is_exact_to_one_count():
     exact = n_cycles * Fraction(8935, 3)
     # The remainder has steps of 2^-40 counts; in 8.8e6 cycles the rounding adds up to 8e-6 counts.
     assert abs(total - exact) < 1 + 1e-4
-
-
-def test_blocks_of_any_size_give_equal_counts(rng):
-    charge = rng.normal(0.0, 2e4, (10_000, 3))
-    start = first_charge(1)
-    whole, last = balanced(charge, start)
-    for size in (1, 7, 999, 10_000):
-        remainder, pieces = start, []
-        for first in range(0, len(charge), size):
-            counts, remainder = balanced(charge[first : first + size], remainder)
-            pieces.append(counts)
-        np.testing.assert_array_equal(np.concatenate(pieces), whole)
-        np.testing.assert_array_equal(remainder, last)
 
 
 def test_the_converter_saturates_at_16_bits_and_recovers():

@@ -120,14 +120,6 @@ def test_a_change_between_steps_of_1_k_determines_the_temperature():
     assert 0.005 < math.sqrt(thermometer.var_temperature) < 0.03
 
 
-def test_equal_coarse_readings_leave_the_sd_of_their_quantum():
-    # A temperature within one quantum is uniformly distributed: sd 1 / sqrt(12) quanta.
-    thermometer = Thermometer(ThermometerSettings(0.001, 0.0625))
-    for k in range(5000):
-        thermometer.update(k * SECOND_NS, 20.0)
-    assert thermometer.var_temperature == pytest.approx(0.0625**2 / 12.0, rel=0.2)
-
-
 @pytest.mark.parametrize(('quantum', 'lag_s'), [(0.1, 120.0), (0.5, 180.0), (1.0, 600.0)])
 def test_equal_readings_each_minute_keep_the_error_below_1_5_quanta(quantum, lag_s):
     # WHY: when the predicted temperature was more than a quantum from the reading, equal readings

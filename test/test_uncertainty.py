@@ -1,20 +1,32 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The claimed covariance covers a start in a ramp, a lost thermometer, and forces beyond 1 g."""
+"""The claimed covariance covers starts in a ramp, lost thermometers and ranges exceeded."""
 
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders import GRAVITY, SECOND_NS, axis_set, calibration, regime_set, term
+from builders import (
+    GRAVITY,
+    SECOND_NS,
+    UNCHECKED,
+    axis_set,
+    calibration,
+    drawn,
+    regime_set,
+    rich_calibration,
+    term,
+    warm,
+)
 
 from thermo_comp.online.compensator import Compensator
-from thermo_comp.online.status import CompensatorConfig
-from thermo_comp.unit.calibration import LackOfFit
-from thermo_comp.unit.prediction import ramp_states, sd_of_states
-
-UNCHECKED = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
+from thermo_comp.thermal.state import BOARD, RATE, WEIGHT, StateLayout
+from thermo_comp.unit.calibration import AxisSet, LackOfFit, parameter_layout
+from thermo_comp.unit.correction import VARIANCES, Correction
+from thermo_comp.unit.covariance import N_ROWS
+from thermo_comp.unit.functions import CubicSpline, Exponential, Polynomial
+from thermo_comp.unit.prediction import SlowUncertainty, ramp_states, sd_of_states
 
 
 def test_the_claimed_sd_covers_a_start_in_a_ramp():
@@ -73,8 +85,7 @@ def test_beyond_1_g_the_covariance_includes_an_unknown_k2():
     # Rests do not determine K2, the error proportional to the square of the force. Its assumed sd
     # is 100 ug/g^2, for forces above 1.01 g.
     compensator = Compensator(calibration(), UNCHECKED)
-    for name in ('board', 'case'):
-        compensator.push(name, 10**12, 20.0)
+    warm(compensator, start_s=1000, until_s=1001)
     at_1_g, at_4_g = (
         compensator.process(10**12 + k * 10**6, 0.0, 0.0, 300.0 * 9.80665 * force)
         for k, force in enumerate((1.0, 4.0))
@@ -131,3 +142,189 @@ def test_the_lack_of_fit_is_divided_between_bias_and_scale():
     added = np.array([[0.0, 3e-3, 4e-3], [0.0, 0.0, 0.0]]) ** 2
     np.testing.assert_allclose(after[0] - before[0], added, rtol=1e-9, atol=1e-18)
     np.testing.assert_allclose(after[1] - before[1], added / GRAVITY**2, rtol=1e-9, atol=1e-18)
+
+
+def test_a_state_beyond_the_edge_of_a_column_is_limited_and_increases_the_sd():
+    unit = calibration(response=(term('gradient', (30.0, 0.0, 0.0), range=(-1.0, 1.0)),))
+    correction = Correction(unit)
+    inside, outside = ((20.0, 0.0, 0.0, 0.0, 0.0, g, 0.0) for g in (1.0, 3.0))
+    edge, beyond = (correction.line(s, s, np.zeros(N_ROWS), 0.0) for s in (inside, outside))
+    assert beyond[:12].tolist() == edge[:12].tolist()
+    assert math.sqrt(beyond[12] - edge[12]) == pytest.approx(30.0 / 300.0 * 2.0)
+    of_y = [27, 29, 32]  # terms 1, y and y^2 of the covariance element yy
+    assert beyond[of_y].tolist() == edge[of_y].tolist()
+    excess = correction.excess(outside, is_dynamic=False)
+    assert excess.relative == pytest.approx(2.0)
+    assert excess[:3] == (0.0, 0.0, 2.0)
+
+
+def sd_at(unit, board, behind=0.0, force=0.0):
+    """Return the claimed sd of x in a soak, without noise; `behind`: lag of parts [K]."""
+    correction = Correction(unit)
+    layout = StateLayout(correction.memory)
+    state = [0.0] * layout.width
+    state[BOARD] = board
+    for lag in layout.lags:
+        state[layout.places[lag]] = behind
+    line = correction.line(tuple(state), tuple(state), np.zeros(N_ROWS), 0.0)
+    a, b, c = line[12:15]
+    return math.sqrt(a - correction.noise[0] + b * force + c * force**2)
+
+
+def test_beyond_the_range_curve_and_lag_do_not_cancel_in_the_claimed_sd():
+    # Inside the range the slopes of curve and lag over board temperature cancel; outside of it
+    # their sum is not known, and the claimed sd is that of the curve.
+    bias = axis_set((0.0, 0.5), residual_sd_m_s2=1e-6)
+    unit = calibration(
+        static=regime_set(bias), dynamic=regime_set(bias),
+        response=(term('board', (-0.5, 0.0, 0.0), tau_s=600.0),),
+    )  # fmt: skip
+    assert sd_at(unit, 35.0) == pytest.approx(1e-6, rel=1e-6)
+    # The board is at 41 degC, 6 K above the range of 20 +- 15 degC.
+    far = math.sqrt(1.0 + (6.0 / 15.0) ** 2)
+    assert sd_at(unit, 41.0) == pytest.approx(0.5 * 6.0 / 300.0 * far, rel=1e-3)
+
+
+def test_beyond_the_range_bias_and_scale_slopes_do_not_cancel_in_the_claimed_sd():
+    # At the upper edge the bias slope is 0.8 counts/K, which the scale slope cancels at a force of
+    # 10 m/s^2.
+    bent = axis_set((0.0, 0.5, 0.01), (1.0, -0.8 / 3000.0), residual_sd_m_s2=1e-6)
+    unit = calibration(static=regime_set(bent), dynamic=regime_set(bent))
+    # The bias slope changes by 0.02 counts/K^2: over 30 K its sd is 0.02 * 30 / sqrt(12) counts/K.
+    bends = 0.6 / math.sqrt(12.0)
+    far = math.sqrt(1.0 + (6.0 / 15.0) ** 2)
+    assert sd_at(unit, 41.0, force=10.0) == pytest.approx(bends * 6.0 / 300.0 * far, rel=0.05)
+    assert sd_at(unit, 41.0) == pytest.approx(math.hypot(bends, 0.8) * 6.0 / 300.0 * far, rel=0.05)
+
+
+def curves_at(unit, celsius):
+    """Return bias and relative scale of x in both sets at n temperatures, shape (2, 2, n)."""
+    return Correction(unit).curves.values(np.array(celsius))[:, ::3]
+
+
+BENT, WAVY = (0.0, 0.5, 0.01), (0.0, -0.3, 0.02, 1e-3)
+
+
+def test_beyond_the_range_curves_follow_their_tangent_for_a_quarter_of_the_range():
+    static, dynamic = axis_set(BENT, (1.0, 1e-4, 2e-6)), axis_set(WAVY, (1.0, 5e-5), delta=2.0)
+    unit = calibration(static=regime_set(static), dynamic=regime_set(dynamic))
+    for edge, sign in ((35.0, 1.0), (5.0, -1.0)):
+        at_edge, *outside = np.moveaxis(
+            curves_at(unit, edge + sign * np.array([0.0, 1e-9, 3.0, 7.5, 7.5 + 1e-9, 300.0])), 2, 0
+        )
+        t = edge - 20.0
+        slopes = [
+            [np.polynomial.Polynomial(c).deriv()(t) for c in rows]
+            for rows in ((BENT, (1.0, 1e-4, 2e-6)), (WAVY, (1.0, 5e-5)))
+        ]
+        for value, beyond in zip(outside, (1e-9, 3.0, 7.5, 7.5, 7.5), strict=True):
+            expected = at_edge + sign * beyond * np.array(slopes)
+            np.testing.assert_allclose(value, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_outside_its_range_a_set_follows_the_curve_of_the_other_set():
+    # The static set has a range of 5 to 35 degC, the dynamic set of 0 to 30 degC.
+    unit = calibration(
+        static=regime_set(axis_set(BENT)),
+        dynamic=regime_set(axis_set(WAVY, delta=2.0), temperature_range_c=(0.0, 30.0)),
+    )
+    celsius = [-20.0, -7.5, -3.0, 0.0, 5.0, 30.0, 35.0, 38.0, 42.5, 60.0]
+    static, dynamic = curves_at(unit, celsius)[:, 0]
+    # Outside the common range, 5 to 30 degC, the difference of the sets is that at its edge.
+    np.testing.assert_allclose((dynamic - static)[:5], dynamic[4] - static[4], rtol=1e-12)
+    np.testing.assert_allclose((dynamic - static)[5:], dynamic[5] - static[5], rtol=1e-12)
+    wavy, bent = np.polynomial.Polynomial(WAVY), np.polynomial.Polynomial(BENT)
+    lower, upper = wavy.deriv()(-20.0), bent.deriv()(15.0)
+    np.testing.assert_allclose(dynamic[:4] - dynamic[3], lower * np.array([-7.5, -7.5, -3, 0]))
+    np.testing.assert_allclose(static[6:] - static[6], upper * np.array([0, 3, 7.5, 7.5]))
+
+
+def test_the_sd_beyond_the_range_includes_every_parameter_of_the_tangents(rng):
+    # A change of parameters must change bias and scale by regressors times change. The ranges are
+    # 5 to 35 degC (static) and 0 to 30 degC (dynamic).
+    spline = CubicSpline((-15.0, 0.0, 15.0), (-4.0, 0.0, 6.0))
+    exponential = Exponential(-1.0, (1.0,), (18.0,))
+    splined = AxisSet(spline, Polynomial((1.0, 1e-4)))
+    two = AxisSet(exponential, Polynomial((1.0, 1e-4, 1e-6)))
+    unit = calibration(
+        static=regime_set(splined, two, axis_set(BENT)),
+        dynamic=regime_set(two, splined, axis_set(WAVY), temperature_range_c=(0.0, 30.0)),
+    )
+    layout = parameter_layout(unit)
+    change = 1e-3 * rng.standard_normal(layout.n_parameters)
+    change[[level for block in layout.scale for level in (block.static, block.dynamic)]] = 0.0
+    states = np.zeros((StateLayout(Correction(unit).memory).width, 9))
+    states[BOARD] = -40.0, -5.0, 3.0, 20.0, 33.0, 36.0, 42.0, 43.0, 90.0
+    states[WEIGHT] = 0.0, 1.0, 0.3, 0.5, 1.0, 0.3, 0.0, 0.7, 1.0
+    moved, nominal = (
+        Correction(each).bias_scale(states) for each in (drawn(unit, layout, change), unit)
+    )
+    regressors = Correction(unit).curves.regressors(states, np.zeros((0, 9)))
+    moved_by = moved - nominal
+    moved_by[1] /= 300.0
+    for axis in range(3):
+        for block, of, row in (
+            (layout.bias[axis], regressors[axis], moved_by[0, axis]),
+            (layout.scale[axis], regressors[axis + 3], moved_by[1, axis]),
+        ):
+            expected = change[block.static : block.end] @ of
+            np.testing.assert_allclose(row, expected, rtol=1e-9, atol=1e-12)
+
+
+def test_the_claimed_sd_grows_with_the_distance_from_the_range():
+    unit = rich_calibration()
+    correction = Correction(unit)
+    slow = SlowUncertainty(unit, correction)
+    nobody = np.zeros((len(correction.memory.lags), 1))
+    for sign in (1.0, -1.0):
+        variances = []
+        for beyond in (0.0, 0.1, 1.0, 3.0, 7.4, 7.6, 15.0, 40.0):
+            state = np.zeros((StateLayout(correction.memory).width, 1))
+            state[BOARD] = 20.0 + sign * (15.0 + beyond)
+            line = correction.line(state, state, slow.at(state, nobody), 0.0)
+            variances.append(line[list(VARIANCES), 0])
+        assert (np.diff(variances, axis=0) > 0.0).all()
+        # If the true curve is constant beyond the edge, the error is within the claimed sd.
+        slopes = np.abs(correction.curves.slopes(np.array([35.0]))[0, :3, 0]) / correction.K[:, 0]
+        assert (np.sqrt(variances[3]) > 3.0 * np.abs(slopes)).all()
+
+
+def test_with_lags_the_sd_in_a_ramp_does_not_depend_on_the_calibrated_rates():
+    # WHY: after bags of soaks, with rates below 0.1 K/min, the variance in a ramp was multiplied
+    # by several hundred, although it already contained the variance of the lag in the ramp.
+    axis = axis_set(residual_sd_m_s2=1e-5)
+    soaks = regime_set(axis, rate_range_k_min=(-0.1, 0.1))
+    sds = []
+    for response in ((), (term('board', tau_s=600.0),)):
+        correction = Correction(calibration(static=soaks, dynamic=soaks, response=response))
+        state = np.zeros(StateLayout(correction.memory).width)
+        state[BOARD], state[RATE] = 20.0, 2.0 / 60.0
+        line = correction.line(state, state, np.zeros(N_ROWS), 0.0)
+        sds.append(math.sqrt(line[VARIANCES[0]] - correction.noise[0]))
+    # The ramp is 19 half ranges beyond the calibrated rates, which adds variance to the output of
+    # the unit without lags only.
+    assert sds == pytest.approx([1e-5 * math.hypot(1.0, 19.0), 1e-5], rel=1e-6)
+
+
+def test_the_distance_of_a_squared_column_from_its_range_is_that_of_its_quantity():
+    # WHY: after bags with lags up to 0.1 K, a lag of 10 K is 100 ranges, its square 10000 ranges.
+    # The claimed sd was that of 10000 ranges, 0.1 g.
+    unit = calibration(response=(term('square', (1.0, 0.0, 0.0), tau_s=600.0, range=(0.0, 0.01)),))
+    correction = Correction(unit)
+    state = np.zeros(StateLayout(correction.memory).width)
+    state[BOARD], state[correction.layout.places[unit.response[0].source]] = 20.0, 10.0
+    excess = correction.excess(state, is_dynamic=False)
+    assert 99.0 < excess.relative < 150.0
+
+
+def test_a_lagged_temperature_outside_the_range_increases_the_claimed_sd():
+    bent = axis_set((0.0, 0.5, 0.01), residual_sd_m_s2=1e-6)
+    unit = calibration(
+        static=regime_set(bent), dynamic=regime_set(bent),
+        response=(term('board', (-0.5, 0.0, 0.0), tau_s=600.0),),
+    )  # fmt: skip
+    # The board is at 33 degC, inside the range of 5 to 35 degC. A part at 34 degC adds no
+    # variance; a part at 41 degC does.
+    assert sd_at(unit, 33.0, behind=-1.0) == pytest.approx(1e-6, rel=1e-6)
+    bends = 0.6 / math.sqrt(12.0)
+    assert sd_at(unit, 33.0, behind=-8.0) == pytest.approx(bends * 6.0 / 300.0, rel=0.05)

@@ -14,10 +14,9 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from ros_helpers import DEEP, TIMEOUT, bare_node
-from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
-from thermo_comp.ros.waitloop import OTHERS_PERIOD_NS, RCLError, WaitLoop, overrides
+from thermo_comp.ros.waitloop import RCLError, WaitLoop, overrides
 
 RELIABLE = QoSProfile(depth=2000)
 BEST_EFFORT = QoSProfile(depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -81,21 +80,6 @@ def test_names_of_parameters_that_the_user_set_are_returned(node):
     assert overrides(node) == {'mispelt': 1, 'known': 2}
 
 
-def test_messages_arrive_serialized_in_order_with_their_reception_time(node, peer):
-    with Running(node) as running:
-        publisher = peer.publisher(Vector3Stamped, 'samples')
-        for k in range(500):
-            message = Vector3Stamped()
-            message.vector.x = float(k)
-            publisher.publish(message)
-        running.wait_for(lambda: len(running.messages) == 500)
-    values = [deserialize_message(data, Vector3Stamped).vector.x for data in running.messages]
-    assert values == [float(k) for k in range(500)]
-    # The node sorts messages of several topics by reception time, so these times must rise.
-    assert running.received_ns == sorted(running.received_ns)
-    assert running.received_ns[0] > 0
-
-
 def test_messages_lost_by_a_full_queue_are_counted(node, peer):
     loop = WaitLoop(node)
     raw = loop.subscribe(Vector3Stamped, 'samples', QoSProfile(depth=10))
@@ -114,38 +98,6 @@ def test_messages_lost_by_a_full_queue_are_counted(node, peer):
 
     peer.poll(is_last_taken, 'the last message')
     assert raw.n_lost == 51 - len(taken)
-
-
-def test_services_and_timers_are_served_while_samples_flow(node, peer):
-    ticks = []
-    heard = []
-    running = Running(node)
-    running.loop.call_every(0.01, lambda: ticks.append(len(running.messages)))
-    node.create_subscription(Bool, 'ordinary', lambda m: heard.append(m.data), 10)
-    node.create_service(Trigger, 'ask', lambda _, answer: answer)
-    with running:
-        publisher = peer.publisher(Vector3Stamped, 'samples')
-        ordinary = peer.publisher(Bool, 'ordinary')
-        stop = threading.Event()
-
-        def flood():
-            while not stop.wait(0.0005):
-                publisher.publish(Vector3Stamped())
-
-        flooding = threading.Thread(target=flood, daemon=True)
-        flooding.start()
-        try:
-            # Begin when samples arrive, so that services and timers compete with samples.
-            running.wait_for(lambda: len(running.messages) > 100)
-            n_ticks = len(ticks)
-            ordinary.publish(Bool(data=True))
-            peer.call(Trigger, 'ask', Trigger.Request())
-            running.wait_for(lambda: len(ticks) > n_ticks + 3 and heard)
-        finally:
-            stop.set()
-            flooding.join(TIMEOUT)
-    # If services are polled every 20 ms, a client gets the answer to a reload within 100 ms.
-    assert OTHERS_PERIOD_NS <= 20_000_000
 
 
 def test_a_periodic_function_is_called_with_and_without_samples(node, peer):

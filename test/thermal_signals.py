@@ -53,11 +53,10 @@ def detector_settings(noise, quantum=0.0, lag=LAG_S, **changes):
     )
 
 
-def switches(settings, t, case, board):
+def regimes(settings, t, case, board):
+    """Yield time [s], regime and direction after each reading; a missing sensor is None."""
     case_thermometer, board_thermometer = Thermometer(settings.case), Thermometer(settings.board)
     detector = RegimeDetector(settings)
-    collected = []
-    regime = Regime.UNKNOWN
     nothing = [None] * len(t)
     rows = zip(
         np.round(t * 1e9).astype(np.int64).tolist(),
@@ -70,12 +69,19 @@ def switches(settings, t, case, board):
             board_thermometer.update(stamp_ns, b)
         if c is not None and not case_thermometer.update(stamp_ns, c):
             continue
-        now = detector.update(
+        regime = detector.update(
             stamp_ns,
             None if case is None else case_thermometer,
             None if board is None else board_thermometer,
         )
-        if now != regime:
-            collected.append((stamp_ns / 1e9, now, detector.direction))
-            regime = now
+        yield stamp_ns / 1e9, regime, detector.direction
+
+
+def switches(settings, t, case, board):
+    """Return time, regime and direction at each change of the regime."""
+    collected, before = [], Regime.UNKNOWN
+    for state in regimes(settings, t, case, board):
+        if state[1] != before:
+            collected.append(state)
+            before = state[1]
     return collected

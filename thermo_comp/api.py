@@ -255,8 +255,8 @@ def fit(
                 nothing: Temperature = ([], [])
                 readings = {'board': nothing, 'case': nothing, **item.temperatures}
                 block = _block(item.time_s, item.counts, readings, item.start_ns)
-                text = parse_sections(item.specific_force) if item.specific_force else ()
-                known = KnownForce(item.name, text) if text else None
+                text = item.specific_force
+                known = KnownForce(item.name, parse_sections(text)) if text else None
                 source = FitSource(item.name, partial(list, [block]), None, item.serial, known)
                 sources.append(source)
         return run(sources, FitOptions(gravity=gravity, **options)).calibration

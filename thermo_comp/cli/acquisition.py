@@ -198,11 +198,11 @@ class Acquisition:
 
     def _rest(self, cells: Cells, end_ns: int) -> _Rest:
         """Combine the rests of the present position that end before `end_ns`."""
-        by_name = {
-            name: survey_thermometer([_part(part, _FIRST_NS, end_ns) for part in parts])
+        surveys = {
+            name: survey
             for name, parts in self._readings.items()
+            if (survey := survey_thermometer([_part(part, _FIRST_NS, end_ns) for part in parts]))
         }
-        surveys = {name: survey for name, survey in by_name.items() if survey is not None}
         end_s = (end_ns - cells.start_ns) * 1e-9 - 0.5 * cells.cell_s
         cells = cells.part(slice(int(np.searchsorted(cells.time, end_s))))
         ranges = still_intervals(cells, self._rest_s)
@@ -235,11 +235,9 @@ class Acquisition:
         misalignment_sd = misalignment_scale(float(np.median(in_1_hz)) if len(in_1_hz) else 0.0)
         sds = np.hypot(of_means, _FLOOR_SD)
         positions: list[Position] = []
-        for up, rest, ratio, sd in zip(ups, rests, noise / median, sds, strict=True):
+        for up, rest, ratio, sd in zip(ups, rests, noise / median, sds.tolist(), strict=True):
             reason = self._reason(rest, up, ratio, positions)
-            positions.append(
-                Position(up, rest.still_s, rest.n_rests, float(sd), rest.surveys, reason)
-            )
+            positions.append(Position(up, rest.still_s, rest.n_rests, sd, rest.surveys, reason))
         known = [position for position in positions if np.isfinite(position.up).all()]
         ups = np.array([position.up for position in known]).reshape(-1, 3)
         sds = np.array([position.sd_g for position in known])
@@ -281,9 +279,8 @@ class Acquisition:
                 return f'repeats position {number}'
         if rest.still_s < self._soak_s:
             is_last = len(before) == len(self._rests)
-            soak = (
-                f'{self._soak_s / 60.0:.4g} min' if self._soak_s > 90.0 else f'{self._soak_s:g} s'
-            )
+            minutes = self._soak_s / 60.0
+            soak = f'{minutes:.4g} min' if minutes > 1.5 else f'{self._soak_s:g} s'
             return f'keep at rest for {soak}' if is_last else f'left before {soak}'
         return ''
 
@@ -313,9 +310,8 @@ def _part(readings: Readings, begin_ns: int, end_ns: int) -> Readings:
 
 
 def _combined_surveys(surveys: Sequence[Surveys]) -> Surveys:
-    by_name: dict[str, list[ThermometerSurvey]] = {}
-    for name, survey in (item for position in surveys for item in position.items()):
-        by_name.setdefault(name, []).append(survey)
+    names = dict.fromkeys(name for position in surveys for name in position)
+    by_name = {name: [some[name] for some in surveys if name in some] for name in names}
     return {
         name: replace(
             parts[-1],

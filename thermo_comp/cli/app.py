@@ -22,7 +22,7 @@ from typer import rich_utils
 from .. import __version__
 from ..errors import ThermoCompError
 from ..text import hold_standard_streams
-from . import bags, convert, field, fit, fleet, judge, output, record, simulate
+from . import bags, convert, fit, fleet, judge, output, record, simulate
 from .shared_options import expanded, option
 
 # Base class of all errors of a command line; typer does not export this class.
@@ -36,9 +36,6 @@ rich_utils.RANGE_STRING = '\n[{}]'
 
 app = typer.Typer(
     name='thermo_comp',
-    help='Thermal-drift compensation of a three-axis accelerometer.',
-    add_completion=True,
-    rich_markup_mode='rich',
     pretty_exceptions_enable=False,
     context_settings={'help_option_names': ['-h', '--help']},
 )
@@ -61,7 +58,7 @@ def _top(
 
 for _command in (
     *(record.record, fit.fit, fit.prior, judge.evaluate, bags.replay, bags.play, bags.info),
-    *(field.update, judge.report, convert.convert, convert.export, convert.import_),
+    *(judge.update, judge.report, convert.convert, convert.export, convert.import_),
     simulate.simulate,
 ):
     app.command(_command.__name__.rstrip('_'))(expanded(_command))
@@ -97,27 +94,26 @@ def run(arguments: list[str]) -> int:
     except typer.Abort:
         return 1
     except ThermoCompError as failure:
-        output.error(str(failure))
-        return 1
+        problem = str(failure)
     except ModuleNotFoundError as failure:
-        output.error(f'this command needs {failure.name}: pip install thermo_comp')
-        return 1
+        problem = f'this command needs {failure.name}: pip install thermo_comp'
     except BrokenPipeError:
         # The reader has closed the pipe (`... | head`): avoid the interpreter's message at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as failure:
         where = f'{failure.filename}: ' if failure.filename else ''
-        output.error(f'{where}{failure.strerror or failure}')
-        return 1
+        problem = f'{where}{failure.strerror or failure}'
     except Exception as failure:  # noqa: BLE001 - any other error is a bug of thermo_comp
         return _unexpected(failure)
-    return code if isinstance(code, int) else 0
+    else:
+        return code if isinstance(code, int) else 0
+    output.error(problem)
+    return 1
 
 
 def _plain(message: str, arguments: list[str]) -> str:
     """Rewrite a message of typer in plain words; quote a given value that is not a number."""
-    message = message.replace('Value error, ', '').replace('Input should be', 'must be')
     message = message.removeprefix('Invalid value: ')  # the rest of the message names the option
     option = _NO_NUMBER.search(message)
     if option is None:

@@ -171,15 +171,12 @@ def print_nonlinearity(out: Output, calibration: 'Calibration') -> None:
 
 def replay(
     bag: Path = _BAG,
-    calibration: Path = option('Calibration of the unit (YAML).', ..., '--calibration', '-c'),
+    calibration: Path = option('Calibration of the unit (YAML).', ..., '-c'),
     output: Path = option(
-        'Output: *.mcap or a folder for a bag, *.csv or *.parquet for a table.',
-        ...,
-        '--output',
-        '-o',
+        'Output: *.mcap or a folder for a bag, *.csv or *.parquet for a table.', ..., '-o'
     ),
-    keep_inputs: bool = option('Also copy the input topics.', False, '--keep-inputs'),
-    all_topics: bool = option('Also copy all topics of the bag.', False, '--all-topics'),
+    keep_inputs: bool = option('Also copy the input topics.', False),
+    all_topics: bool = option('Also copy all topics of the bag.', False),
     serial: str | None = options.SERIAL,
     frame_id: str = option('frame_id of the output messages; default: that of the input.', ''),
     transition_time: float = option(

@@ -38,7 +38,7 @@ def convert(
         'Table (.csv, .tsv, .txt, .parquet), PX4 (.ulg) or ArduPilot log (.bin), or bag.',
         metavar='FILE',
     ),
-    output: Path = option('Bag to write: a file *.mcap, or a folder.', ..., '--output', '-o'),
+    output: Path = option('Bag to write: a file *.mcap, or a folder.', ..., '-o'),
     columns: Path | None = option('Column map of a table (YAML): columns and their units.'),
     rate_hz: float | None = options.TABLE_RATE,
     imu: int | None = option('Number of the IMU in an autopilot log, counted from 0.'),
@@ -46,9 +46,7 @@ def convert(
         'Number of the barometer in an autopilot log that gives the case temperature.'
     ),
     allow_compensated: bool = option(
-        'Accept samples that the autopilot has corrected by INS_TCAL or TC_A parameters.',
-        False,
-        '--allow-compensated',
+        'Accept samples that the autopilot has corrected by INS_TCAL or TC_A parameters.', False
     ),
     names: dict[str, str] = options.named_topics,
     unit: Literal['m/s^2', 'g', 'mg'] = option('Unit of acceleration in the bag.', 'm/s^2'),
@@ -141,36 +139,30 @@ def print_guess(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:
     Print a guessed column map and the unused columns of a table, unless `shown` contains the same
     map or list of columns from another table.
     """
-    _print_map(out, log, shown)
+    from ..convert.column_map import column_map_text
+    from ..convert.headings import map_lines
+
+    if log.guessed is not None and log.guessed.format is None:  # guessed from headings
+        lines = map_lines(log.guessed)
+        first = shown.setdefault('\n'.join(lines), log.path)
+        if first == log.path:
+            out.line(f'{log.path}: guessed column map; if the map is wrong, edit it for --columns')
+            for line in lines:
+                out.line(f'  {line}')
+        else:
+            out.line(f'{log.path}: same column map as {first}')
+    elif log.guessed is not None:
+        text = column_map_text(log.guessed)
+        out.line(f'{log.path}: guessed {text}; if this guess is wrong, give --columns')
     not_used = f'columns not used: {", ".join(log.not_used)}'
     if log.not_used and shown.setdefault(not_used, log.path) == log.path:
         out.line(f'{log.path}: {not_used}')
 
 
-def _print_map(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:
-    from ..convert.column_map import column_map_text
-    from ..convert.headings import map_lines
-
-    if log.guessed is None:
-        return
-    if log.guessed.format is None:  # the map was guessed from headings
-        lines = map_lines(log.guessed)
-        first = shown.setdefault('\n'.join(lines), log.path)
-        if first != log.path:
-            out.line(f'{log.path}: same column map as {first}')
-            return
-        out.line(f'{log.path}: guessed column map; if the map is wrong, edit it for --columns')
-        for line in lines:
-            out.line(f'  {line}')
-    else:
-        text = column_map_text(log.guessed)
-        out.line(f'{log.path}: guessed {text}; if this guess is wrong, give --columns')
-
-
 def export(
     path: Path = argument('Calibration of the unit.', metavar='YAML'),
     to: Tool = option('Tool for which the file is written.', ...),
-    output: Path = option('File to write.', ..., '--output', '-o'),
+    output: Path = option('File to write.', ..., '-o'),
     number: int | None = option(
         'Number of the set of parameters: TC_A0.. of PX4 (default 0), INS_TCAL1.. of ArduPilot '
         '(1), imu0.. of Kalibr (0).',

@@ -79,7 +79,7 @@ def fit(
     rate_hz: float | None = options.TABLE_RATE,
     topics: Any = options.reading_part,
     force: bool = options.FORCE,
-    verbose: bool = option('Also print the table of positions.', False, '--verbose', '-v'),
+    verbose: bool = option('Also print the table of positions.', False, '-v'),
     out: Output = options.out,
 ) -> None:
     """
@@ -158,7 +158,7 @@ def prior(
     calibrations: list[Path] = argument(
         'Calibrations of different units of one type.', metavar='YAML...'
     ),
-    output: Path = option('Prior to write (YAML).', ..., '--output', '-o'),
+    output: Path = option('Prior to write (YAML).', ..., '-o'),
     force: bool = options.FORCE,
     out: Output = options.out,
 ) -> None:
@@ -343,7 +343,7 @@ def _print_models(out: Output, trials: Sequence['Trial']) -> None:
     names = [list(columns)[k] for k in kept]
     rows: list[tuple[Cell, ...]] = []
     for model, row in zip(trials, left, strict=True):
-        first, *more = _wrapped(_named(model.groups))
+        first, *more = _name_lines(model.groups)
         mark = '*' if model.is_chosen else '~' if model.is_near else ''
         rows.append((mark, *(row[k] for k in kept), first))
         rows += [('', *[''] * len(kept), line) for line in more]
@@ -355,15 +355,14 @@ def _print_models(out: Output, trials: Sequence['Trial']) -> None:
     out.line('*: chosen; ~: worse than * by at most a standard error; +: groups besides the curve')
 
 
-def _named(groups: tuple[str, ...]) -> str:
-    """Name a model by its groups, without `curve` if this is the first of several groups."""
-    if len(groups) < 2 or groups[0] != 'curve':
-        return '+'.join(groups) or 'constants'
-    return ''.join(f'+{group}' for group in groups[1:])
-
-
-def _wrapped(name: str) -> list[str]:
-    """Break a long name of a model before a group, so that the table fits 80 columns."""
+def _name_lines(groups: tuple[str, ...]) -> list[str]:
+    """
+    Name a model by its groups, without `curve` if this is the first of several groups; a long
+    name is broken before a group, so that the table fits 80 columns.
+    """
+    name = '+'.join(groups) or 'constants'
+    if len(groups) > 1:
+        name = name.removeprefix('curve')
     lines = ['']
     for part in re.split(r'(?=\+)', name):
         if len(lines[-1]) + len(part) > _MODEL_WIDTH:

@@ -18,9 +18,7 @@ def fleet_fit(
     folder: str = argument(
         'Folder of the bags DIR/[LOT/]UNIT/BAG, as a path or a URL.', metavar='DIR'
     ),
-    output: Path = option(
-        'Folder of the results; an earlier run is continued.', ..., '--output', '-o'
-    ),
+    output: Path = option('Folder of the results; an earlier run is continued.', ..., '-o'),
     settings: dict[str, Any] = options.fitting,
     scheduler: str | None = option(
         'Address of a running Dask scheduler, as tcp://host:8786; default: fit on this machine.',
@@ -28,12 +26,10 @@ def fleet_fit(
     ),
     workers: int | None = option('Processes on this machine; default: all processors.', min=1),
     no_certificates: bool = option(
-        'Write no certificates, which halves the computing time.', False, '--no-certificates'
+        'Write no certificates, which halves the computing time.', False
     ),
     with_prior: bool = option(
-        'Fit units with incomplete data again, with the prior of the other units.',
-        False,
-        '--with-prior',
+        'Fit units with incomplete data again, with the prior of the other units.', False
     ),
     earlier: list[Path] | None = option(
         'Earlier fleet.parquet of these units, to show their drift.', metavar='TABLE'

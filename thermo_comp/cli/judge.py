@@ -1,22 +1,30 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the commands ``evaluate`` and ``report``, which judge a calibration on new bags."""
+"""
+Owns the commands on a calibration in use: ``evaluate`` and ``report`` judge a calibration on new
+bags or rest logs, ``update`` updates a calibration by rest logs.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime, timezone
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..files import CSV, PAGE, check_output
-from ..unit.gravity import STANDARD_GRAVITY
+from ..files import CALIBRATION, CSV, PAGE, check_output
+from ..unit.gravity import STANDARD_GRAVITY, ug_text
 from . import shared_options as options
-from .field import evaluate_rests
 from .output import Cell, Output, micro, micro_g, millidegrees, picked
 from .shared_options import argument, option
 
 if TYPE_CHECKING:
+    from ..field.ageing import Ageing
+    from ..field.update import Update
     from ..judging.evaluation import Drift
     from ..judging.judgement import Judgement
+
+#: Exit code of an update that determines no axis, or is not clearly better on left-out days.
+NOTHING_GAINED = 3
 
 
 def evaluate(
@@ -24,10 +32,7 @@ def evaluate(
         'Bags of one unit in any positions, or rest logs of the unit.', metavar='BAG...'
     ),
     calibration: list[Path] = option(
-        'Calibration (YAML); further calibrations are compared with the first.',
-        ...,
-        '--calibration',
-        '-c',
+        'Calibration (YAML); further calibrations are compared with the first.', ..., '-c'
     ),
     judging: dict[str, Any] = options.judging,
     known_force: Any = options.force,
@@ -64,7 +69,7 @@ def evaluate(
             raise options.usage(
                 'rest logs need one calibration and no --csv, and cannot be mixed with bags'
             )
-        evaluate_rests(logs, calibration[0], judging['gravity'], judging['tolerance'], out)
+        _evaluate_rests(logs, calibration[0], judging, out)
         return
     if csv is not None:
         kind = TABLES.get(csv.suffix, CSV)
@@ -183,10 +188,12 @@ def _sections(
 
 
 def report(
-    output: Path = option('Page to write (HTML).', ..., '--output', '-o'),
-    bags: list[Path] | None = options.JUDGED_BAGS,
+    output: Path = option('Page to write (HTML).', ..., '-o'),
+    bags: list[Path] | None = argument(
+        'Bags to judge the calibration on.', None, metavar='[BAG]...'
+    ),
     calibration: list[Path] | None = option(
-        'Calibrations of the unit (YAML), whose changes are shown.', None, '--calibration', '-c'
+        'Calibrations of the unit (YAML), whose changes are shown.', None, '-c'
     ),
     figures: Path | None = option('Folder for the figures as PNG files.', metavar='DIR'),
     certificate_info: Path | None = options.CERTIFICATE_INFO,
@@ -222,10 +229,8 @@ def report(
     if certificate_info is not None:
         info = load_certificate_info(certificate_info, loaded.unit.serial if loaded else None)
     with out.progress('reading') as done:
-        window_s = judging['window_s']
-        opened = open_bags(
-            *(paths, known[:1]), topics=topics, window_s=window_s, force=known_force, progress=done
-        )
+        usual: dict[str, Any] = {'topics': topics, 'force': known_force, 'progress': done}
+        opened = open_bags(paths, known[:1], window_s=judging['window_s'], **usual)
     with options.usage_of():
         evidence = evidence_of_bags(opened, loaded, **judging, others=known[1:])
     out.recordings(opened)
@@ -239,4 +244,136 @@ def report(
         **picked(evidence, 'headline findings'),
         history=drifts_of(evidence.history),
         **(judgement.facts() if judgement else {}),
+    )
+
+
+def update(
+    calibration: Path = argument('Calibration of the unit (YAML).', metavar='YAML'),
+    rests: list[Path] = argument('Folders or files of rest logs.', metavar='RESTS...'),
+    output: Path = options.NEW_CALIBRATION,
+    where: tuple[float | None, float] = options.place,
+    ahead: float = option(
+        'Days of ageing after the last rest that the claimed sd covers.', 1.0, min=0.0, max=3650.0
+    ),
+    allow: list[str] | None = option(
+        'gravity: take local gravity as exact; unit: accept an |f| like that of another unit.'
+    ),
+    force: bool = options.FORCE,
+    out: Output = options.out,
+) -> None:
+    """
+    Update a calibration in the field, by rests that the node has logged.
+
+    The calibration is the prior; the ageing since the fit is estimated from
+    the rests, which may be in any attitude. Old and new calibration are
+    compared on days left out of the update. The new calibration is written only
+    if the rests determine an axis and lower the mean square of |f| - g by more than
+    its standard error; else the exit code is 3, and the present sds are printed.
+
+    Example:
+      thermo_comp update unit42.yaml rests -o unit42_new.yaml
+    """
+    from ..field.series import read_rests, series_of
+    from ..field.update import OVERRIDES, change_texts, refuse_another_unit
+    from ..field.update import update as run
+    from ..unit.calibration_file import load_calibration, save_calibration
+
+    allowed = allow or []
+    for word in allowed:
+        if word not in OVERRIDES:
+            raise options.usage(f'--allow: expected one of {", ".join(OVERRIDES)}, got {word!r}')
+    check_output(output, CALIBRATION, overwrite=force, others=[calibration, *rests])
+    old = load_calibration(calibration)
+    logged, source, notes = read_rests(rests, old, ahead=ahead)
+    created = datetime.now(timezone.utc).strftime('%Y-%m-%dT%H:%M:%SZ')
+    series = series_of(logged, old, gravity=where[0])
+    result = run(series, old, source, created, ahead, is_gravity_certain='gravity' in allowed)
+    if 'unit' not in allowed:
+        refuse_another_unit(result)
+    out.points(notes)
+    _show_axis_changes(result, out)
+    out.points(change_texts(result))
+    out.line(str(result.judged))
+    is_better = result.judged.is_better and any(axis.is_determined for axis in result.axis_changes)
+    if is_better:
+        save_calibration(result.calibration, output, overwrite=force)
+        out.line(f'{output}: written')
+    else:
+        out.line(f'the update is no improvement: {output} is not written, keep {calibration}')
+        sds = [
+            f'{row.axis} {micro_g(row.present_sd)} ug ({micro_g(row.claimed_sd)} ug in the file)'
+            for row in result.axis_changes
+        ]
+        out.line(f'sd of the correction at the last rest, with ageing: {", ".join(sds)}')
+    out.end(
+        0 if is_better else NOTHING_GAINED,
+        output=output if is_better else None,
+        moved=result.axis_changes,
+        **picked(result, 'changes judged'),
+        **_ageing(result.ageing),
+        is_better=is_better,
+        notes=[*notes, *change_texts(result)],
+    )
+
+
+def _show_axis_changes(result: 'Update', out: Output) -> None:
+    out.table(
+        ('axis', 'bias ug', '+-', 'scale ppm', '+-', 'curve ug', '+-', 'at rest ug', '+-', 'sds'),
+        [
+            (
+                axis.axis,
+                *(micro_g(axis.bias), micro_g(axis.bias_sd)),
+                *(micro(1e6 * axis.scale), micro(1e6 * axis.scale_sd)),
+                *(micro_g(axis.curve), micro_g(axis.curve_sd)),
+                *(micro_g(axis.reading), micro_g(axis.reading_sd)),
+                f'{axis.reading / axis.reading_sd:+.1f}' if axis.is_determined else 'unknown',
+            )
+            for axis in result.axis_changes
+        ],
+        title=f'changes shown by {len(result.series)} rests in {result.series.start.max() + 1} '
+        'starts of the node (at rest: change of the reading at the mean force; sds: at rest / +-)',
+    )
+
+
+def _ageing(ageing: 'Ageing | None') -> dict[str, Any]:
+    """Return the sds of `Ageing` [m/s^2] and the ratio of the lags' sd to the assumed sd."""
+    values = vars(ageing).copy() if ageing else {}
+    share = values.pop('lags', None)
+    return {'ageing_m_s2': values or None, 'lags_at_start': share}
+
+
+def _evaluate_rests(
+    rests: list[Path], calibration: Path, judging: dict[str, Any], out: Output
+) -> None:
+    """Print |f| - g over a rest log; exit with 1 if the unit is outside the limit."""
+    from ..field.series import read_rests, series_of
+    from ..field.watch import LIMIT, watch
+    from ..unit.calibration_file import load_calibration
+
+    known, tolerance = load_calibration(calibration), judging['tolerance']
+    logged, _, notes = read_rests(rests, known, is_for_update=False)
+    result = watch(series_of(logged, known, judging['gravity']), known, tolerance)
+    out.points(notes)
+    limit = f'{LIMIT:g} times the claimed sd' if tolerance is None else ug_text(tolerance)
+    for rows, name in ((result.periods, 'from'), (result.temperatures, 'board')):
+        out.table(
+            (name, 'rests', 'degC', 'mean ug', 'RMS ug', 'claimed ug', 'within'),
+            [
+                (
+                    *(row.name, row.n_rests, row.temperature, micro_g(row.mean)),
+                    *(micro_g(row.rms), micro_g(row.claim), 'yes' if row.is_within else 'no'),
+                )
+                for row in rows
+            ],
+            title=f'|f| - g at rest; within: RMS of at most {limit}',
+        )
+    out.line(str(result))
+    out.end(
+        result.exit_code,
+        **picked(result, 'days temperatures'),
+        left=result.outside_since,
+        forecast_days=result.forecast,
+        interval_days=result.interval,
+        **_ageing(result.ageing),
+        notes=notes,
     )

@@ -31,9 +31,7 @@ _COLUMNS = ('no', 'up x', 'y', 'z', 'min', 'degC', 'K/min', 'state')
 
 def record(
     context: typer.Context,
-    output: Path = option(
-        'Folder of the bags; bags already in it belong to the test.', ..., '--output', '-o'
-    ),
+    output: Path = option('Folder of the bags; bags already in it belong to the test.', ..., '-o'),
     bag: Path | None = argument(
         'Bag to read instead of live topics, also while it is written.', None, metavar='[BAG]'
     ),
@@ -42,7 +40,9 @@ def record(
     serial: str | None = option(
         'Serial of the unit, written to the bags.', callback=options.check_serial
     ),
-    finish: bool = option('First complete the bags that a crashed run has left.', False),
+    finish: bool = option(
+        'First complete the bags that a crashed run has left.', False, '--finish/--no-finish'
+    ),
     offset: float | None = options.OFFSET,
     topics: Any = options.reading,
     out: Output = options.out,

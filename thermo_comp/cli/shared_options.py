@@ -13,6 +13,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import wraps
 from importlib.util import find_spec
 from pathlib import Path
@@ -36,22 +37,30 @@ _VALUES: dict[Any, str] = {
     **dict.fromkeys((Path, Path | None, list[Path], list[Path] | None), 'PATH'),
 }
 
-#: Options whose names differ from the names of the library's arguments, by argument.
+#: Options whose names differ from the names of the parameters and of the library's arguments.
 _FLAGS = {
+    'as_json': '--json',
+    'begin': '--from',
     'case_timeout_s': '--case-timeout',
+    'end': '--to',
     'forced': '--force-groups',
     'height_m': '--height',
+    'input_': '--input',
     'latitude_deg': '--latitude',
     'min_rest_s': '--min-rest',
     'temperature_timeout_s': '--temperature-timeout',
     'transition_time_s': '--transition-time',
+    'window_s': '--window',
 }
 
 usage = typer.BadParameter  # error in the command line, exit code 2
 
 
 def option(text: str, default: Any = None, *flags: str, **rules: Any) -> Any:
-    """Return a typer option; `flags`: its names (default: the parameter's), `rules`: for typer."""
+    """
+    Return a typer option; `rules`: for typer. `flags`: names; the name ``--parameter`` is added
+    if `flags` contain no long name.
+    """
     return typer.Option(default, *flags, help=text, **rules)
 
 
@@ -79,12 +88,19 @@ def expanded(command: Callable[..., Any]) -> Any:
         return command(**values)
 
     for parameter in options:
-        default = parameter.default
-        if isinstance(default, typer.models.OptionInfo) and default.metavar is None:
-            default.metavar = _VALUES.get(parameter.annotation)
+        made = parameter.default
+        if isinstance(made, typer.models.OptionInfo):
+            made.metavar = made.metavar or _VALUES.get(parameter.annotation)
+            flags = made.param_decls or ()
+            if not any(flag.startswith('--') for flag in flags):
+                made.param_decls = (_flag_of(parameter.name), *flags)
     run.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in options}
     return run
+
+
+def _flag_of(name: str) -> str:
+    return _FLAGS.get(name, f'--{name.replace("_", "-")}')
 
 
 @contextmanager
@@ -96,12 +112,9 @@ def usage_of(what: str = '', **flags: str) -> Iterator[None]:
     try:
         yield
     except ValueError as mistake:
-        known = _FLAGS | flags
-
-        def flag_of(name: re.Match[str]) -> str:
-            return known.get(name[1], f'--{name[1].replace("_", "-")}')
-
-        text = str(mistake) if what else re.sub(r'`(\w+)`', flag_of, str(mistake))
+        text = str(mistake)
+        if not what:
+            text = re.sub(r'`(\w+)`', lambda name: flags.get(name[1]) or _flag_of(name[1]), text)
         raise usage(f'{what}{text}') from mistake
 
 
@@ -120,10 +133,9 @@ def check_rate(rate_hz: float | None) -> float | None:
     return rate_hz
 
 
-FORCE = option('Overwrite an existing output of the same kind.', False, '--force', '-f')
-QUIET = option('Print only errors and missing parts of bags.', False, '--quiet', '-q')
-NEW_CALIBRATION = option('Calibration to write (YAML).', ..., '--output', '-o')
-JUDGED_BAGS = argument('Bags to judge the calibration on.', None, metavar='[BAG]...')
+FORCE = option('Overwrite an existing output of the same kind.', False, '-f')
+QUIET = option('Print only errors and missing parts of bags.', False, '-q')
+NEW_CALIBRATION = option('Calibration to write (YAML).', ..., '-o')
 CERTIFICATE_INFO = option(
     'Statements of the laboratory for the certificate: number, customer, ... (YAML).'
 )
@@ -136,19 +148,11 @@ OFFSET = option(
     'Reading of raw samples at zero force, in counts, e.g. 32768; default: detected.',
     metavar='COUNTS',
 )
-INPUT = option(
-    'Samples to read from the bag: counts, imu, or auto (counts if present, else imu).',
-    'auto',
-    '--input',
-    metavar='KIND',
-)
-Input = Literal['auto', 'counts', 'imu']
 
 
 @expanded
 def out(
-    as_json: bool = option('Print the result as one JSON object.', False, '--json'),
-    quiet: bool = QUIET,
+    as_json: bool = option('Print the result as one JSON object.', False), quiet: bool = QUIET
 ) -> Output:
     """Build the output of a command."""
     return Output(as_json, quiet)
@@ -170,35 +174,39 @@ def named_topics(
     return named
 
 
-def _reading(
-    input_: Input = INPUT,
+@expanded
+def reading(
+    input_: Literal['auto', 'counts', 'imu'] = option(
+        'Samples to read from the bag: counts, imu, or auto (counts if present, else imu).',
+        'auto',
+        metavar='KIND',
+    ),
     names: dict[str, str] = named_topics,
-    begin: float | None = option(
-        'Begin of the part to read: seconds from the first sample, or a stamp (seconds since '
-        '1970).',
-        None,
-        '--from',
-        metavar='S',
-    ),
-    end: float | None = option(
-        'End of the part to read: seconds or a stamp, as for --from.', None, '--to', metavar='S'
-    ),
 ) -> Any:
-    from ..recording.topics import BagPart, Topics
+    """Build `Topics`, the topics of the inputs in a bag, for the whole bag."""
+    from ..recording.topics import Topics
 
-    with usage_of('--from, --to: '):
-        part = BagPart(begin, end)
     with usage_of('--topic, --topics: '):
-        return Topics.named(names, part=part, input=input_)
-
-
-reading_part = expanded(_reading)
+        return Topics.named(names, input=input_)
 
 
 @expanded
-def reading(input_: Input = INPUT, names: dict[str, str] = named_topics) -> Any:
-    """Build `Topics`, the topics of the inputs in a bag, for the whole bag."""
-    return _reading(input_, names, None, None)
+def reading_part(
+    topics: Any = reading,
+    begin: float | None = option(
+        'Begin of the part to read: seconds from the first sample, or a stamp (seconds since '
+        '1970).',
+        metavar='S',
+    ),
+    end: float | None = option(
+        'End of the part to read: seconds or a stamp, as for --from.', metavar='S'
+    ),
+) -> Any:
+    """Build `Topics`, the topics of the inputs in a bag and the part of the bag to read."""
+    from ..recording.topics import BagPart
+
+    with usage_of('--from, --to: '):
+        return replace(topics, part=BagPart(begin, end))
 
 
 #: Sd of the difference between local gravity and normal gravity in mountains [m/s^2]: some 50 mGal
@@ -244,7 +252,7 @@ def site(
 def judging(
     where: tuple[float | None, float] = place,
     window_s: float = option(
-        'Averaging time at rest, in s.', 60.0, '--window', metavar='S', min=1e-3, max=86400.0
+        'Averaging time at rest, in s.', 60.0, metavar='S', min=1e-3, max=86400.0
     ),
     tolerance: str | None = option('Largest accepted RMS of |f| - g, e.g. 100ug, 1e-3m/s^2.'),
     serial: str | None = SERIAL,
@@ -299,8 +307,6 @@ def fitting(
     ),
     min_rest_s: float | None = option(
         'Shortest rest used, in s; default: 3, or 1 or 2 if they determine bias and scale better.',
-        None,
-        '--min-rest',
         metavar='S',
         show_default=False,
     ),
@@ -324,23 +330,20 @@ def fitting(
     allow: list[str] | None = option('Refusal to override, by the name in its message.'),
 ) -> dict[str, Any]:
     """Return keywords of `FitOptions`."""
-    given = locals()
+    given = locals() | where
     if fault := QUANTITIES['temperature'].fault(reference_temperature):
         raise usage(f'--reference-temperature: {fault} degC, got {reference_temperature:g}')
     for name, value, unit in (('--k2-sd', k2_sd, 'ug/g^2'), ('--k3-sd', k3_sd, 'ug/g^3')):
         if value is not None and value > 1e6 * (QUANTITIES['nonlinearity'].at_most or math.inf):
             raise usage(f'{name}: must be at most 1e6 {unit}, got {value:g}')
-    return (
-        {name: value for name, value in given.items() if name != 'where'}
-        | where
-        | {
-            'still_sd': acceleration(still_sd, '--still-sd'),
-            'mounting_sd': acceleration(mounting_sd, '--mounting-sd'),
-            'k2_sd': None if k2_sd is None else k2_sd * 1e-6,
-            'k3_sd': None if k3_sd is None else k3_sd * 1e-6,
-            'allow': tuple(allow or ()),
-        }
-    )
+    del given['where']
+    return given | {
+        'still_sd': acceleration(still_sd, '--still-sd'),
+        'mounting_sd': acceleration(mounting_sd, '--mounting-sd'),
+        'k2_sd': None if k2_sd is None else k2_sd * 1e-6,
+        'k3_sd': None if k3_sd is None else k3_sd * 1e-6,
+        'allow': tuple(allow or ()),
+    }
 
 
 def acceleration(text: str | None, name: str) -> float | None:

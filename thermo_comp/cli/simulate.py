@@ -17,9 +17,8 @@ from .shared_options import option
 
 if TYPE_CHECKING:
     from ..recording.writer import BagWriter
-    from ..simulation.campaign import Position
+    from ..simulation.campaign import Position, Spin
     from ..simulation.run import SimulatedRun
-    from ..simulation.spin import Spin
     from ..simulation.unit import UnitModel
 
 #: Rate table: topic of the rotation rate, interval between two messages [s], sd of the radius [m].
@@ -27,9 +26,7 @@ _RATE_TOPIC, _RATE_STEP_S, _RADIUS_SD_M = 'table/angular_velocity', 0.5, 1e-3
 
 
 def simulate(
-    output: Path = option(
-        'Bag to write; with several positions, folder of the bags.', ..., '--output', '-o'
-    ),
+    output: Path = option('Bag to write; with several positions, folder of the bags.', ..., '-o'),
     unit: str = option(
         'Kind of unit: thermostatted, bare-quartz, mems, or demo (the unit of the sample bags).',
         'thermostatted',
@@ -55,7 +52,6 @@ def simulate(
         'Write sensor_msgs/Imu instead of counts, with the angular rate if the unit has a '
         'gyroscope.',
         False,
-        '--imu',
     ),
     level: int = option(
         'Compression of the bags (zstd level): 1 is fast, 19 gives the smallest files.',
@@ -82,7 +78,7 @@ def simulate(
     """
     from ..recording.writer import BagWriter
     from ..simulation import campaign, presets, run
-    from ..simulation.spin import Bend
+    from ..simulation.unit import Bend
 
     with options.usage_of(name='--unit'):
         specimen = presets.unit_preset(unit, unit_seed)

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
@@ -34,8 +34,6 @@ from .series import RestSeries
 #: walks of bias and of scale times g, per root day, and of the scatter of a rest. Prior sd of the
 #: natural logarithm of each sd in `Ageing` (1 sd is a factor of 5).
 _WALK_SHARE, _SCATTER_SHARE, _LOG_SD = 0.5, 0.3, 1.6
-#: Prior centre of the sd of lag states at a start, divided by the sd in the calibration.
-_LAG_SHARE = 1.0
 #: Smallest centre of the prior of the turn-on offset's sd [m/s^2].
 _LEAST_TURN_ON = 5.0 * MICRO_G
 #: Prior standard deviations tried for a jump of the levels, or of gravity [m/s^2].
@@ -55,6 +53,8 @@ _SLOPE_WALK = _BENDS[0] / np.sqrt(365.25)
 #: the variances; largest number of rows of all starts in the search, whose computing time grows
 #: with the cube of this number.
 _ROWS, _SEARCH_ROWS, _MOST_ROWS = 6, 3, 600
+
+_Kind: TypeAlias = Literal['levels', 'gravity', 'curve']
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class Change:
     may_be_gravity: whether a jump of gravity explains the rests about as well as a jump of levels
     """
 
-    kind: Literal['levels', 'gravity', 'curve']
+    kind: _Kind
     time: float | None
     sd: float
     log_bayes_factor: float
@@ -95,7 +95,7 @@ class Change:
     def columns(self, rows: Rows) -> Floats:
         """Return derivatives of rows by levels (n, 6), gravity (n, 1) or bias slopes (n, 3)."""
         if self.time is None:
-            return np.asarray(rows.by_level[:, :3] * rows.warmth[:, np.newaxis])
+            return rows.by_slope
         of_jump = rows.by_jump[:, 6:] if self.kind == 'gravity' else rows.by_jump[:, :6]
         return np.asarray(of_jump * (rows.time >= self.time)[:, np.newaxis])
 
@@ -126,6 +126,11 @@ class Rows:
     rank: Ints
 
     @property
+    def by_slope(self) -> Floats:
+        """Derivatives by the slopes of the bias over temperature, (n, 3)."""
+        return np.asarray(self.by_level[:, :3] * self.warmth[:, np.newaxis])
+
+    @property
     def by_jump(self) -> Floats:
         """Derivatives by a jump of levels, times `_JUMP_SHARES`, and of gravity, (n, 7)."""
         return np.column_stack((self.by_level * _JUMP_SHARES, self.by_gravity))
@@ -137,7 +142,7 @@ class Rows:
 
 def rows_of(series: RestSeries, scatter: float) -> Rows:
     """Return the equations of rests, weighted by noise and a scatter of rests [m/s^2]."""
-    parts: list[tuple[Floats, ...]] = []
+    parts: list[list[Floats]] = []
     variance = series.noise + (series.by_start**2).sum(axis=1) + scatter**2
     for start in np.unique(series.start):
         at = np.flatnonzero(series.start == start)
@@ -149,18 +154,11 @@ def rows_of(series: RestSeries, scatter: float) -> Rows:
         Q = Q * weight[:, np.newaxis]
         n, warmth = Q.shape[1], series.temperature[at].mean() - series.reference_temperature
         # A change of gravity changes |f| by the same value in all attitudes.
-        ones = np.ones(len(series))
-        levels = (series.by_parameter, series.by_level, ones)
+        levels = (series.by_parameter, series.by_level, np.ones(len(series)))
         summed = (series.residual, *levels, series.by_start, series.lack)
-        parts.append(
-            (
-                *(np.full(n, series.time[at].mean()), np.full(n, start)),
-                *(Q.T @ column[at] for column in summed),
-                np.full(n, warmth),
-                *((Q**2).T @ series.noise[at], (Q**2).sum(axis=0)),
-                np.arange(n),
-            )
-        )
+        part = [np.full(n, series.time[at].mean()), np.full(n, start)]
+        part += [*(Q.T @ column[at] for column in summed), np.full(n, warmth)]
+        parts.append([*part, (Q**2).T @ series.noise[at], (Q**2).sum(axis=0), np.arange(n)])
     rows = Rows(*[np.concatenate(part) for part in zip(*parts, strict=True)])
     searched = rows.start[rows.rank < _SEARCH_ROWS]
     if len(searched) <= _MOST_ROWS:
@@ -196,8 +194,7 @@ class Model:
         near = np.exp(-0.5 * (np.subtract.outer(rows.warmth, rows.warmth) / 10.0) ** 2)
         self.base = rows.by_parameter @ self.prior @ rows.by_parameter.T
         self.base += near * (rows.lack @ rows.lack.T) + np.diag(rows.noise)
-        slopes = Change('curve', None, 1.0, 0.0).columns(rows)
-        self.base += _SLOPE_WALK**2 * elapsed * (slopes @ slopes.T)
+        self.base += _SLOPE_WALK**2 * elapsed * (rows.by_slope @ rows.by_slope.T)
         for change in changes:
             columns = change.columns(rows)
             self.base += change.sd**2 * columns @ columns.T
@@ -215,15 +212,12 @@ class Model:
 
         def loss(logs: Floats) -> tuple[float, Floats]:
             sd = np.exp(logs)
-            factor = cho_factor(self.covariance(Ageing(*sd)), lower=True)
-            inverse = cho_solve(factor, np.eye(len(self.rows.y)))
+            factor, inverse = self._factor(Ageing(*sd))
             alpha = inverse @ self.rows.y
             shift = (logs - middle) / _LOG_SD
-            value = np.log(np.diag(factor[0])).sum() + 0.5 * (self.rows.y @ alpha + shift @ shift)
-            slope = [
-                v**2 * float((inverse * part).sum() - alpha @ part @ alpha)
-                for v, part in zip(sd, self.parts, strict=True)
-            ]
+            value = np.log(np.diag(factor)).sum() + 0.5 * (self.rows.y @ alpha + shift @ shift)
+            pairs = zip(sd, self.parts, strict=True)
+            slope = [v**2 * float((inverse * P).sum() - alpha @ P @ alpha) for v, P in pairs]
             return float(value), np.array(slope) + shift / _LOG_SD
 
         # The gradient of the evidence is almost 0 where a variance is small, so the search begins
@@ -231,35 +225,29 @@ class Model:
         steps = np.abs(np.diff(self.rows.y[self.rows.rank == 0]))
         step = max(float(np.median(steps)), centre.rest)
         bounds = middle - 5.0 * _LOG_SD, middle + 5.0 * _LOG_SD
-        best = min(
-            (
-                minimize(
-                    loss,
-                    np.clip(np.log([*(step * np.array(shares)), centre.lags]), *bounds),
-                    jac=True,
-                    method='L-BFGS-B',
-                    bounds=list(zip(*bounds, strict=True)),
-                    options={'maxiter': 30, 'ftol': 1e-5},
-                )
-                for shares in ((0.1, 0.1, 1.0, 0.3), (1.0, 1.0, 0.3, 0.1))
-            ),
-            key=lambda result: result.fun,
-        )
-        ageing = Ageing(*np.exp(best.x).tolist())
+        search: dict[str, Any] = {'method': 'L-BFGS-B', 'bounds': list(zip(*bounds, strict=True))}
+        search['options'] = {'maxiter': 30, 'ftol': 1e-5}
+        results = []
+        for shares in ((0.1, 0.1, 1.0, 0.3), (1.0, 1.0, 0.3, 0.1)):
+            begin = np.clip(np.log([*(step * np.array(shares)), centre.lags]), *bounds)
+            results.append(minimize(loss, begin, jac=True, **search))
+        ageing = Ageing(*np.exp(min(results, key=lambda result: result.fun).x).tolist())
         return ageing, self.inverse(ageing)
 
     def inverse(self, ageing: Ageing) -> Floats:
         """Return the inverse of `covariance`."""
+        return self._factor(ageing)[1]
+
+    def _factor(self, ageing: Ageing) -> tuple[Floats, Floats]:
+        """Return the lower Cholesky factor of `covariance`, and its inverse."""
         factor = cho_factor(self.covariance(ageing), lower=True)
-        return np.asarray(cho_solve(factor, np.eye(len(self.rows.y))))
+        return factor[0], np.asarray(cho_solve(factor, np.eye(len(self.rows.y))))
 
     def log_covariance(self, ageing: Ageing) -> Floats:
         """Return the covariance of the log sds of `Ageing`, by Fisher information and prior."""
         inverse = self.inverse(ageing)
-        parts = [
-            2.0 * sd**2 * inverse @ part
-            for sd, part in zip(vars(ageing).values(), self.parts, strict=True)
-        ]
+        pairs = zip(vars(ageing).values(), self.parts, strict=True)
+        parts = [2.0 * sd**2 * inverse @ part for sd, part in pairs]
         information = [[0.5 * float((a * b.T).sum()) for a in parts] for b in parts]
         return np.asarray(np.linalg.inv(information + np.eye(len(parts)) / _LOG_SD**2))
 
@@ -269,7 +257,7 @@ def usual(calibration: Calibration) -> Ageing:
     residual = max(axis.residual_sd_m_s2 for axis in calibration.static.axes())
     turn_on = max(residual or max(calibration.noise_density_m_s2_sqrt_hz), _LEAST_TURN_ON)
     walk = _WALK_SHARE * turn_on
-    return Ageing(walk, walk, turn_on, _SCATTER_SHARE * turn_on, _LAG_SHARE)
+    return Ageing(walk, walk, turn_on, _SCATTER_SHARE * turn_on, lags=1.0)
 
 
 def learn(
@@ -314,13 +302,10 @@ def _best(candidates: Iterable[Change], is_gravity_certain: bool) -> Change | No
     Return the most probable change, or None if no log Bayes factor reaches `_LEAST_GAIN`. That of
     a jump of gravity must also exceed those of all other changes by `_LEAST_LEAD`.
     """
-    best: dict[str, Change] = {}
-    for change in candidates:
-        if change.log_bayes_factor > _gain(best.get(change.kind)):
-            best[change.kind] = change
-    gravity = None if is_gravity_certain else best.get('gravity')
-    others = (change for kind, change in best.items() if kind != 'gravity')
-    other = max(others, key=_gain, default=None)
+    every = list(candidates)
+    of_gravity = [change for change in every if change.kind == 'gravity']
+    gravity = None if is_gravity_certain else max(of_gravity, key=_gain, default=None)
+    other = max((change for change in every if change.kind != 'gravity'), key=_gain, default=None)
     lead = _gain(gravity) - max(_gain(other), 0.0)
     if gravity is not None and lead >= _LEAST_LEAD and _gain(gravity) >= _LEAST_GAIN:
         return gravity
@@ -349,19 +334,15 @@ def _candidates(model: Model, inverse: Floats) -> Iterator[Change]:
     after = np.cumsum(np.cumsum(precision[::-1, ::-1], axis=0), axis=1)[::-1, ::-1]
     gradient = np.cumsum(gradient[::-1], axis=0)[::-1]
     known = {(change.kind, change.time) for change in model.changes}
-    places: tuple[tuple[Literal['levels', 'gravity'], slice], ...]
-    places = ('levels', slice(6)), ('gravity', slice(6, width))
-    for k in range(n):
-        time = float(rows.time[first[k]])
-        for kind, at in places:
+    parts: list[tuple[_Kind, slice]] = [('levels', slice(6)), ('gravity', slice(6, width))]
+    for k, time in enumerate(rows.time[first].tolist()):
+        for kind, at in parts:
             for sd in _JUMPS if (kind, time) not in known else ():
                 gain = _log_bayes_factor(after[k, k][at, at], gradient[k, at], sd)
                 yield Change(kind, time, sd, gain - float(np.log(n * len(_JUMPS))))
-    if ('curve', None) in known:
-        return
-    columns = Change('curve', None, 1.0, 0.0).columns(rows)
-    for sd in _BENDS:
-        gain = _log_bayes_factor(columns.T @ inverse @ columns, columns.T @ alpha, sd)
+    by_slope = rows.by_slope
+    for sd in _BENDS if ('curve', None) not in known else ():
+        gain = _log_bayes_factor(by_slope.T @ inverse @ by_slope, by_slope.T @ alpha, sd)
         yield Change('curve', None, sd, gain - float(np.log(len(_BENDS))))
 
 
@@ -409,8 +390,7 @@ def solve(model: Model, ageing: Ageing, to_file: Floats, bend: Floats, ahead: fl
     age = np.maximum(rows.time - model.since, 0.0)[:, np.newaxis]
     walk = np.repeat([ageing.bias**2, ageing.scale**2], 3)
     crossed = rows.by_parameter @ model.prior + (age * rows.by_level * walk) @ to_file.T
-    slopes = Change('curve', None, 1.0, 0.0).columns(rows)
-    crossed += _SLOPE_WALK**2 * (age * slopes) @ bend.T
+    crossed += _SLOPE_WALK**2 * (age * rows.by_slope) @ bend.T
     per_day = (to_file * walk) @ to_file.T + _SLOPE_WALK**2 * bend @ bend.T
     prior = model.prior + float(age.max()) * per_day
     lower = np.linalg.cholesky(model.covariance(ageing))
@@ -427,12 +407,6 @@ def solve(model: Model, ageing: Ageing, to_file: Floats, bend: Floats, ahead: fl
         crossed += change.sd**2 * columns @ onto.T
         prior += change.sd**2 * onto @ onto.T
     gains = solve_triangular(lower, crossed, lower=True)
-    return Solution(
-        gains.T @ innovations,
-        prior,
-        prior - gains.T @ gains,
-        ahead * per_day,
-        gains,
-        innovations,
-        tuple(gravity),
-    )
+    posterior, future = prior - gains.T @ gains, ahead * per_day
+    shift = gains.T @ innovations
+    return Solution(shift, prior, posterior, future, gains, innovations, tuple(gravity))

@@ -30,6 +30,12 @@ _SECOND_NS = 1_000_000_000
 _SPACING = ((360, 30), (60, 6), (0, 1))
 
 
+#: Thermal state, and remaining fractions of the unknown initial lag states.
+_State = tuple[Sequence[float], Sequence[float]]
+#: A function that returns the present state, or None before the first temperature reading.
+StateNow = Callable[[], _State | None]
+
+
 @dataclass
 class _Cell:
     """Sums of samples, less the first sample `origin`, over the seconds `begin` to `last`."""
@@ -37,40 +43,33 @@ class _Cell:
     begin: int
     last: int
     origin: Floats
-    n: int = 0
-    total: Floats = field(default_factory=lambda: np.zeros(0))
+    total: Floats
     squares: Floats = field(default_factory=lambda: np.zeros(3))
+    n: int = 0
+    state: _State = ((), ())  # thermal state at the end of the cell
 
     @property
     def mean(self) -> Floats:
         return np.asarray(self.origin + self.total / self.n)
 
 
-#: A function that returns the thermal state, and the fractions of the unknown initial lag states
-#: that have not yet decayed, or None before the first temperature reading.
-StateNow = Callable[[], tuple[Sequence[float], Sequence[float]] | None]
-
-
 class RestFinder:
     """Finds the rests in a stream of samples of one unit."""
 
     def __init__(
-        self,
-        scale: Floats,
-        noise: Floats,
-        full_scale: float,
-        state_now: StateNow,
-        cycle_s: float = 0.0,
+        self, scale: Floats, noise: Floats, full_scale: float, state_now: StateNow, cycle_s: float
     ) -> None:
         # `scale`: scale factors [input units per m/s^2]; `noise`: variance of one sample
         # [m^2/s^4] of each axis, at one sample per `cycle_s`, larger at a higher rate.
         self._scale, self._noise, self._full_scale = scale, float(noise.sum()), full_scale
         self._state_now, self._cycle_s = state_now, cycle_s
         self._cell: _Cell | None = None
+        self._forget()
+
+    def _forget(self) -> None:
         self._run: list[_Cell] = []
-        self._states: list[tuple[Sequence[float], Sequence[float]]] = []
+        self._last: list[_Cell] = []  # the last cell of the previous window
         self._n_windows = 0
-        self._last: list[_Cell] = []  # sums of the last cell of the previous window
 
     def add(self, stamps: Stamps, samples: Floats) -> list[Rest]:
         """Add samples of rising stamps, (n, 3) or, with angular rates, (n, 6); return rests."""
@@ -86,7 +85,7 @@ class RestFinder:
                     rests += self._close(cell, is_followed=is_next)
                     cell = None
             if cell is None:
-                cell = _Cell(number, number, part[0], total=np.zeros(part.shape[1]))
+                cell = _Cell(number, number, part[0], np.zeros(part.shape[1]))
             deviation, self._cell, cell.last = part - cell.origin, cell, number
             cell.n += len(part)
             cell.total += deviation.sum(axis=0)
@@ -98,8 +97,8 @@ class RestFinder:
         if state is None:
             self._forget()
             return []
+        cell.state = state
         self._run.append(cell)
-        self._states.append(state)
         rests = []
         if cell.last + 1 - self._run[0].begin >= SECONDS:
             spacing = next(spacing for begin, spacing in _SPACING if self._n_windows >= begin)
@@ -107,14 +106,10 @@ class RestFinder:
                 rests.append(self._window())
             self._n_windows += 1
             # The first cell of the next window is compared with the last cell of this window.
-            self._run, self._states = [], []
-            self._last = [cell]
+            self._run, self._last = [], [cell]
         if not is_followed:
             self._forget()
         return rests
-
-    def _forget(self) -> None:
-        self._run, self._states, self._n_windows, self._last = [], [], 0, []
 
     def _is_still(self, cell: _Cell) -> bool:
         n = cell.n
@@ -138,13 +133,8 @@ class RestFinder:
         weights = np.array([cell.n for cell in self._run]) / n
         mean = weights @ np.array([cell.mean for cell in self._run])
         within = sum(cell.squares - cell.total[:3] ** 2 / cell.n for cell in self._run)
-        states, shares = (np.array(part) for part in zip(*self._states, strict=True))
-        return Rest(
-            (self._run[0].begin + self._run[-1].last + 1) * _SECOND_NS // 2,
-            n,
-            tuple(mean[:3].tolist()),
-            tuple(np.sqrt(within / (n - len(self._run))).tolist()),
-            tuple((weights @ states).tolist()),
-            tuple((weights @ shares).tolist()),
-            tuple(mean[3:].tolist()),
-        )
+        sd = np.sqrt(within / (n - len(self._run)))
+        states, shares = zip(*(cell.state for cell in self._run), strict=True)
+        parts = mean[:3], sd, weights @ np.array(states), weights @ np.array(shares), mean[3:]
+        stamp_ns = (self._run[0].begin + self._run[-1].last + 1) * _SECOND_NS // 2
+        return Rest(stamp_ns, n, *(tuple(part.tolist()) for part in parts))

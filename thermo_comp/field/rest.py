@@ -134,12 +134,8 @@ def _rest(data: list[Any], memory: MemorySpec) -> Rest:
 def _quantity(cls: type[Any], values: Sequence[Any]) -> Any:
     """Make a lag or a play from the values of its first fields."""
     names = cls._fields[: len(values)]
-    return cls(
-        *(
-            str(value) if name in ('input', 'sensor') else _number(value)
-            for name, value in zip(names, values, strict=True)
-        )
-    )
+    pairs = zip(names, values, strict=True)
+    return cls(*(str(v) if name in ('input', 'sensor') else _number(v) for name, v in pairs))
 
 
 def _number(value: float) -> float:
@@ -168,13 +164,11 @@ def thinned(content: bytes) -> bytes:
     kept: list[bytes] = []
     n = 0
     for line in content.splitlines(keepends=True):
-        if line[8:10] == _OF_START:
-            n = 0
-            kept.append(line)
-        elif line[8:10] == _OF_REST and line.endswith(b'\n'):
-            if not n % 2:
+        is_start = line[8:10] == _OF_START
+        if is_start or (line[8:10] == _OF_REST and line.endswith(b'\n')):
+            n = 0 if is_start else n + 1
+            if is_start or n % 2:
                 kept.append(line)
-            n += 1
     return b''.join(kept)
 
 

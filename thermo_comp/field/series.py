@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -84,11 +84,8 @@ class RestSeries:
 
     def at(self, chosen: Bools | slice) -> RestSeries:
         """Return the selected rests; the remaining starts are numbered from 0."""
-        parts: dict[str, Any] = {
-            name: value[chosen]
-            for name, value in vars(self).items()
-            if isinstance(value, np.ndarray)
-        }
+        arrays = (item for item in vars(self).items() if isinstance(item[1], np.ndarray))
+        parts: dict[str, Any] = {name: value[chosen] for name, value in arrays}
         parts['start'] = np.unique(parts['start'], return_inverse=True)[1]
         return replace(self, **parts)
 
@@ -143,10 +140,9 @@ def read_rests(
     if others:
         notes.append(f'rests of {", ".join(sorted(others))} are not of unit {wanted}: left out')
     if not rests:
-        found = ': the files contain no rests'
-        if others:
-            found = f': the rests are of {", ".join(sorted(others))}'
-        raise RecordingError(f'no rest of unit {wanted}{found}', ', '.join(map(str, paths)))
+        of_others = f'the rests are of {", ".join(sorted(others))}'
+        found = of_others if others else 'the files contain no rests'
+        raise RecordingError(f'no rest of unit {wanted}: {found}', ', '.join(map(str, paths)))
     begin, _, is_update = valid_since(calibration)
     # The name of an update's source has the time of the last rest rounded down to a second.
     first_ns = begin * _DAY_NS + 1e9 * is_update
@@ -191,9 +187,8 @@ def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
     The first time is that of the last rest of an update, else the date of the test or of the file,
     or -inf without a date.
     """
-    names = [
-        source.name for source in calibration.provenance.sources if source.name.startswith(_UNTIL)
-    ]
+    every = (source.name for source in calibration.provenance.sources)
+    names = [name for name in every if name.startswith(_UNTIL)]
     text = names[-1].removeprefix(_UNTIL) if names else calibration.provenance.date
     date, _, aged = text.partition(_AGED)
     try:
@@ -216,11 +211,9 @@ def series_of(
     RecordingError if the log does not have the lags of the calibration.
     """
     correction = Correction(calibration)
-    layout, K = StateLayout(correction.memory), correction.K[:, 0]
+    K = correction.K[:, 0]
     places = {spec: _places(spec, correction.memory) for spec in {s.memory for s, _ in rests}}
-    n_lags = len(correction.memory.lags)
     states = np.array([np.array(r.state)[places[s.memory][0]] for s, r in rests])
-    states = states.reshape(len(rests), layout.width)
     shares = np.array([np.array(r.shares)[places[s.memory][1]] for s, r in rests])
     mean, sd = (np.array([getattr(r, name) for _, r in rests]) for name in ('mean', 'sd'))
     n = np.array([r.n for _, r in rests])
@@ -230,9 +223,10 @@ def series_of(
     group = _grouped(beginnings, states[:, BOARD], mean / K)
     sizes = np.bincount(group)
     averaged = partial(means_by, group)
-    first = np.searchsorted(group, np.arange(len(sizes)))
-    states, mean = averaged(states), averaged(mean)
-    shares, local = averaged(shares.reshape(len(rests), n_lags)), averaged(local)
+    of_rests = beginnings[np.searchsorted(group, np.arange(len(sizes)))]
+    _, first, start = np.unique(of_rests, return_index=True, return_inverse=True)
+    start = np.argsort(np.argsort(first))[start]  # numbers from 0 in the order of the rests
+    states, mean, shares, local = map(averaged, (states, mean, shares, local))
     bias, scale = (part.T for part in correction.bias_scale(states.T))
     x = (mean - bias) / scale
     if correction.of_force is not None:
@@ -244,22 +238,21 @@ def series_of(
     v = u @ M
     white = averaged(np.maximum((sd / K) ** 2, correction.noise) / n[:, np.newaxis])
     noise = (v**2 * white).sum(axis=1) / sizes
-    slow, claim, lack = _uncertainty(calibration, correction, states, shares, u, v, x)
-    of_start = SlowUncertainty(calibration, correction).of_start(
-        states.T, shares.T, np.abs(states[:, RATE])
-    )
-    of_start = np.moveaxis(of_start, 2, 0)
+    at = _Geometry(states, shares, u, v, x)
+    full = SlowUncertainty(calibration, correction)
+    slow, claim, lack = _uncertainty(calibration, correction, full, at)
+    of_start = np.moveaxis(full.of_start(states.T, shares.T, np.abs(states[:, RATE])), 2, 0)
     of_start = of_start[:, :, :3] / K + of_start[:, :, 3:] * x[:, np.newaxis]
     return RestSeries(
         time=averaged(stamps / _DAY_NS),
-        start=_numbered(beginnings[first]),
+        start=start,
         temperature=states[:, BOARD],
         state=states,
         direction=v,
         force=x,
         gravity=local,
         residual=size - local,
-        by_parameter=_by_parameter(calibration, correction, states, u, v, x, scale),
+        by_parameter=_by_parameter(calibration, correction, at, scale),
         by_level=np.hstack((v * K / scale, v * x / calibration.gravity_m_s2)),
         noise=noise + np.maximum(slow, 0.0),
         by_start=(of_start * v[:, np.newaxis]).sum(axis=2),
@@ -283,12 +276,6 @@ def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
         ) from error
 
 
-def _numbered(start: Ints) -> Ints:
-    """Return the number of each rest's start of the node, from 0 in order of appearance."""
-    _, first, start = np.unique(start, return_index=True, return_inverse=True)
-    return np.asarray(np.argsort(np.argsort(first))[start], dtype=np.int64)
-
-
 def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
     """
     Return the number of the group of each window; the at most 60 consecutive windows of a group
@@ -302,79 +289,65 @@ def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
     group = np.zeros(len(start), dtype=np.int64)
     first = 0
     for k in range(1, len(start)):
-        is_same = (
-            start[k] == start[first]
-            and abs(temperature[k] - temperature[first]) < 1.0
-            and np.abs(direction[k] - direction[first]).max() < 1e-3
-            and k - first < 60
-        )
+        is_near = np.abs(direction[k] - direction[first]).max() < 1e-3
+        is_near &= abs(temperature[k] - temperature[first]) < 1.0
+        is_same = is_near and start[k] == start[first] and k - first < 60
         first = first if is_same else k
         group[k] = group[k - 1] + (not is_same)
     return group
 
 
+class _Geometry(NamedTuple):
+    """Thermal states, remaining shares of lag states, and u, v, x of this module's docstring."""
+
+    states: Floats
+    shares: Floats
+    u: Floats
+    v: Floats
+    x: Floats
+
+
 def _uncertainty(
-    calibration: Calibration,
-    correction: Correction,
-    states: Floats,
-    shares: Floats,
-    u: Floats,
-    v: Floats,
-    x: Floats,
+    calibration: Calibration, correction: Correction, full: SlowUncertainty, at: _Geometry
 ) -> tuple[Floats, Floats, Floats]:
     """
     Return the variance of |f| due to thermometers and regime, (n,), the variance of |f| that the
     calibration claims, (n,), and the sd of the lack of fit of each axis, (n, 3).
     """
     without = replace(calibration, posterior=None, misalignment_sd=(0.0, 0.0, 0.0))
-    bare, full = (SlowUncertainty(tried, correction) for tried in (without, calibration))
-    slow = _variance_along(correction, states, np.zeros_like(shares), bare, u, x)
-    claim = _variance_along(correction, states, shares, full, u, x)
-    of_one_sample = (v**2 * np.array(correction.noise)).sum(axis=1)
-    slow, claim = slow - of_one_sample, claim - of_one_sample
-    weight, unknown = states[:, WEIGHT], states[:, UNKNOWN]
+    settled = at._replace(shares=np.zeros_like(at.shares))
+    slow = _variance_along(correction, SlowUncertainty(without, correction), settled)
+    claim = _variance_along(correction, full, at)
+    weight, unknown = at.states[:, WEIGHT], at.states[:, UNKNOWN]
     regimes = np.array([1.0 - weight, weight])
-    unexplained = correction.curves.unexplained(states[:, BOARD])
+    unexplained = correction.curves.unexplained(at.states[:, BOARD])
     # The ageing model has separate terms for the residual sd and the lack of fit, so both
     # variances are subtracted here, those of both sets if the regime is unknown.
     of_sets = regimes + unknown * regimes[::-1]
-    slow -= (v.T**2 * (of_sets[:, np.newaxis] * unexplained).sum(axis=0)).sum(axis=0)
+    slow -= (at.v.T**2 * (of_sets[:, np.newaxis] * unexplained).sum(axis=0)).sum(axis=0)
     residual = [[a.residual_sd_m_s2**2 for a in part.axes()] for part in calibration.regime_sets()]
     lack = np.maximum(unexplained - np.array(residual)[:, :, np.newaxis], 0.0)
     return slow, claim, np.sqrt((regimes[:, np.newaxis] * lack).sum(axis=0).T)
 
 
-def _variance_along(
-    correction: Correction,
-    states: Floats,
-    shares: Floats,
-    slow: SlowUncertainty,
-    u: Floats,
-    x: Floats,
-) -> Floats:
-    """Return the variance of the error of a sample along u, including the sample's noise, (n,)."""
-    columns = states.T
-    parts = slow.at(columns, shares.T)
-    line = list(correction.line(columns, columns, parts, np.zeros(len(states))))
-    covariance = (
-        covariance_at(line[12:], *x.T)
-        if correction.of_force is None
-        else nonlinear_covariance(line, correction.misalignment, *x.T)
-    )
+def _variance_along(correction: Correction, slow: SlowUncertainty, at: _Geometry) -> Floats:
+    """Return the variance of the error along u without the noise of a sample, (n,)."""
+    columns, x = at.states.T, at.x.T
+    line = list(correction.line(columns, columns, slow.at(columns, at.shares.T), 0.0))
+    if correction.of_force is None:
+        covariance = covariance_at(line[12:], *x)
+    else:
+        covariance = nonlinear_covariance(line, correction.misalignment, *x)
     i, j = np.triu_indices(3)
-    products = u[:, i] * u[:, j] * np.where(i == j, 1.0, 2.0)
-    return np.asarray((products.T * np.array(covariance)).sum(axis=0))
+    products = at.u[:, i] * at.u[:, j] * np.where(i == j, 1.0, 2.0)
+    of_one_sample = (at.v**2 * np.array(correction.noise)).sum(axis=1)
+    return np.asarray((products.T * np.array(covariance)).sum(axis=0) - of_one_sample)
 
 
 def _by_parameter(
-    calibration: Calibration,
-    correction: Correction,
-    states: Floats,
-    u: Floats,
-    v: Floats,
-    x: Floats,
-    scale: Floats,
+    calibration: Calibration, correction: Correction, at: _Geometry, scale: Floats
 ) -> Floats:
+    states, _, u, v, x = at
     columns, layout = states.T, parameter_layout(calibration)
     regressors = correction.curves.regressors(columns, correction.table.values(columns))
     result = np.zeros((len(states), layout.n_parameters))

@@ -8,7 +8,7 @@ An axis is updated only if the rests reduce the sd of a combination of its bias 
 most 0.6 times the sd before the update, with ageing. Other axes keep their values; their sd grows.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -33,8 +33,6 @@ OVERRIDES = ('gravity', 'unit')
 #: shock), and in claimed sd (30, some milli-g for a poor sensor). An RMS above both limits is
 #: taken for that of another unit.
 _LARGEST_PART, _LARGEST_SIGMAS = 1e-3, 30.0
-#: Default time of use after the last rest, for which the covariance includes ageing [days].
-AHEAD_DAYS = 1.0
 
 
 @dataclass(frozen=True)
@@ -120,7 +118,7 @@ def update(
     calibration: Calibration,
     source: Source | None = None,
     created: str = '',
-    ahead: float = AHEAD_DAYS,
+    ahead: float = 1.0,
     *,
     is_gravity_certain: bool = False,
 ) -> Update:
@@ -144,73 +142,64 @@ def update(
     # time is unknown or after the first rest (the last, for an updated file), at the first rest.
     since = aged if -np.inf < aged < (last if is_update else first) else first
     ageing, model, used = learn(series, calibration, since, is_gravity_certain=is_gravity_certain)
-    to_file, bend = _levels(calibration), _slopes(calibration)
-    solution = solve(model, ageing, to_file, bend, ahead)
+    solution = solve(model, ageing, *_derivatives(calibration), ahead)
     determined, by_axis = _axis_changes(used, calibration, model, solution, ageing)
     judged = _judged(used, model, solution, determined)
     shift, kept = solution.shift * determined, solution.shift * ~determined
     # The estimated shift of parameters that are not updated is an error of their old values.
     covariance = solution.posterior + solution.future + np.outer(kept, kept)
     turn_on = float(np.hypot(ageing.turn_on, ageing.rest))
-    axis_determined = [change.is_determined for change in by_axis]
     new = _shifted(calibration, shift, covariance)
-    before = calibration.provenance
     new = replace(
         new,
-        static=_with_residual(new.static, turn_on, axis_determined),
-        dynamic=_with_residual(new.dynamic, turn_on, axis_determined),
-        provenance=replace(
-            _with_update(before, series, judged),
-            created=created or before.created,
-            tested=last_rest(source) if source else '',
-            sources=(*before.sources, *([source] if source else [])),
-        ),
+        static=_with_residual(new.static, turn_on, by_axis),
+        dynamic=_with_residual(new.dynamic, turn_on, by_axis),
+        provenance=_with_update(new.provenance, series, judged, source, created),
     )
     n_outliers = len(series) - len(used)
     return Update(new, by_axis, ageing, model.changes, judged, used, n_outliers, model, solution)
 
 
-def _with_update(provenance: Provenance, series: RestSeries, judged: Judged) -> Provenance:
-    """Add the residuals on left-out rests, and a note on the update, to a provenance."""
+def _with_update(
+    before: Provenance, series: RestSeries, judged: Judged, source: Source | None, created: str
+) -> Provenance:
+    """Add the source, the residuals on left-out rests and a note on the update."""
     largest, day = float(np.abs(series.residual).max()), np.datetime64(int(series.time.max()), 'D')
-    residuals = ResidualSummary(
-        f'left-out {judged.over}', judged.n, judged.before, judged.after, largest
-    )
+    section = f'left-out {judged.over}'
+    residuals = ResidualSummary(section, judged.n, judged.before, judged.after, largest)
     note = (
         f'updated by {int(series.n_windows.sum())} windows at rest up to {day}; before: '
-        f'{provenance.created or "no date"}. {judged}'
+        f'{before.created or "no date"}. {judged}'
     )
     return replace(
-        provenance, residuals=(*provenance.residuals, residuals), notes=(*provenance.notes, note)
+        before,
+        created=created or before.created,
+        tested=last_rest(source) if source else '',
+        sources=(*before.sources, *([source] if source else [])),
+        residuals=(*before.residuals, residuals),
+        notes=(*before.notes, note),
     )
 
 
-def _levels(calibration: Calibration) -> Floats:
-    """Return the parameters' derivatives by bias and by scale times g of each axis, (n, 6)."""
-    layout = parameter_layout(calibration)
-    result = np.zeros((layout.n_parameters, 6))
+def _derivatives(calibration: Calibration) -> tuple[Floats, Floats]:
+    """
+    Return the parameters' derivatives by bias and by scale times g of each axis, (n, 6), and by a
+    slope of each axis' bias [m/s^2 per K], (n, 3).
+    """
+    layout, reference_c = parameter_layout(calibration), calibration.reference_temperature_c
+    levels, slopes = np.zeros((layout.n_parameters, 6)), np.zeros((layout.n_parameters, 3))
     for axis, reference in enumerate(calibration.axes):
         bias, scale = layout.bias[axis], layout.scale[axis]
-        result[[bias.static, bias.dynamic], axis] = reference.scale_factor
-        result[[scale.static, scale.dynamic], axis + 3] = 1.0 / calibration.gravity_m_s2
-    return result
-
-
-def _slopes(calibration: Calibration) -> Floats:
-    """Return the parameters' derivatives by a slope of each axis' bias [m/s^2 per K], (n, 3)."""
-    layout = parameter_layout(calibration)
-    result = np.zeros((layout.n_parameters, 3))
-    for axis, reference in enumerate(calibration.axes):
-        block = layout.bias[axis]
-        for part, level in zip(calibration.regime_sets(), block[:2], strict=True):
+        levels[[bias.static, bias.dynamic], axis] = reference.scale_factor
+        levels[[scale.static, scale.dynamic], axis + 3] = 1.0 / calibration.gravity_m_s2
+        for part, level in zip(calibration.regime_sets(), bias[:2], strict=True):
             function = part.axes()[axis].bias_function
-            t = np.linspace(*part.temperature_range_c, 50) - calibration.reference_temperature_c
+            t = np.linspace(*part.temperature_range_c, 50) - reference_c
             if function.n_free:
-                basis = np.array(function.basis(t)).T
-                free = np.linalg.lstsq(basis, t, rcond=None)[0]
+                free = np.linalg.lstsq(np.array(function.basis(t)).T, t, rcond=None)[0]
                 places = slice(level + 1, level + 1 + function.n_free)
-                result[places, axis] = reference.scale_factor * free
-    return result
+                slopes[places, axis] = reference.scale_factor * free
+    return levels, slopes
 
 
 def _axis_changes(
@@ -245,10 +234,9 @@ def _axis_changes(
         present = float(np.hypot(np.sqrt(error), max(residual, scatter)))
         change = rows @ solution.shift * is_determined
         sd = np.sqrt(np.maximum(np.diag(posterior if is_determined else prior), 0.0))
-        of_scale = change[1] / gravity, sd[1] / gravity
-        values = [change[0], sd[0], *of_scale, change[2], sd[2], change[3], sd[3]]
-        values += [claimed, present]
-        shifts.append(AxisChange(name, is_determined, *map(float, values)))
+        change[1], sd[1] = change[1] / gravity, sd[1] / gravity
+        values = [*np.stack((change, sd), axis=1).ravel().tolist(), claimed, present]
+        shifts.append(AxisChange(name, is_determined, *values))
     determined[layout.misalignment :] = all(shift.is_determined for shift in shifts)
     return determined, tuple(shifts)
 
@@ -271,15 +259,9 @@ def _judged(series: RestSeries, model: Model, solution: Solution, determined: Bo
     before, after = np.array(squares).T
     gain = before - after
     gain_sd = float(gain.std(ddof=1) / np.sqrt(len(gain))) if len(gain) > 1 else np.inf
-    return Judged(
-        over,
-        len(gain),
-        float(np.sqrt(before.mean())),
-        float(np.sqrt(after.mean())),
-        float(gain.mean()),
-        gain_sd,
-        int((gain < -gain_sd).sum()),
-    )
+    old, new = (float(np.sqrt(square.mean())) for square in (before, after))
+    n_worse = int((gain < -gain_sd).sum())
+    return Judged(over, len(gain), old, new, float(gain.mean()), gain_sd, n_worse)
 
 
 def _gravity_part(series: RestSeries, solution: Solution) -> Floats:
@@ -313,38 +295,21 @@ def refuse_another_unit(result: Update) -> None:
 def _shifted(calibration: Calibration, shift: Floats, covariance: Floats) -> Calibration:
     """Add a shift to a calibration's parameters; multiply K by 1 + the shift of the scale."""
     layout = parameter_layout(calibration)
-    of_scale = np.array([shift[block.static] for block in layout.scale])
     K = np.array([axis.scale_factor for axis in calibration.axes])
-    if not shift.any():
-        return with_parameters(calibration, K, parameters_of(calibration), covariance)
-    return with_parameters(
-        calibration, K * (1.0 + of_scale), parameters_of(calibration) + shift, covariance
-    )
+    K *= 1.0 + shift[[block.static for block in layout.scale]]
+    parameters = parameters_of(calibration)
+    if shift.any():
+        parameters += shift
+    return with_parameters(calibration, K, parameters, covariance)
 
 
-def _with_residual(part: RegimeSet, turn_on: float, determined: Sequence[bool]) -> RegimeSet:
+def _with_residual(part: RegimeSet, turn_on: float, changes: Sequence[AxisChange]) -> RegimeSet:
     """Set the residual sd to `turn_on` on determined axes, and at least to `turn_on` on others."""
-    axes: dict[str, Any] = {
-        name: replace(
-            axis,
-            residual_sd_m_s2=turn_on if is_determined else max(turn_on, axis.residual_sd_m_s2),
-        )
-        for name, axis, is_determined in zip(AXES, part.axes(), determined, strict=True)
-    }
+    axes: dict[str, Any] = {}
+    for axis, change in zip(part.axes(), changes, strict=True):
+        sd = turn_on if change.is_determined else max(turn_on, axis.residual_sd_m_s2)
+        axes[change.axis] = replace(axis, residual_sd_m_s2=sd)
     return replace(part, **axes)
-
-
-def _gravity_texts(result: Update) -> Iterator[str]:
-    for change, size, sd in result.solution.gravity:
-        time = change.time or 0.0
-        stated = result.series.gravity[np.argmin(np.abs(result.series.time - time))]
-        yield (
-            f'from {np.datetime64(int(time * 86400.0), "s")} on |f| is '
-            f'{"larger" if size > 0.0 else "smaller"} by {ug_text(abs(size))} +- {ug_text(sd)} '
-            f'than before in all attitudes, as if gravity were not the stated {stated:.5f} m/s^2: '
-            'no scale was changed for this; state the gravity of the place (--gravity; parameter '
-            'local_gravity of the node) or, if the stated gravity is right, use --allow gravity'
-        )
 
 
 def change_texts(result: Update) -> list[str]:
@@ -371,7 +336,16 @@ def change_texts(result: Update) -> list[str]:
                     'parameter local_gravity of the node)'
                 )
             lines.append(text)
-    lines += _gravity_texts(result)
+    for change, size, sd in result.solution.gravity:
+        time = change.time or 0.0
+        stated = result.series.gravity[np.argmin(np.abs(result.series.time - time))]
+        lines.append(
+            f'from {np.datetime64(int(time * 86400.0), "s")} on |f| is '
+            f'{"larger" if size > 0.0 else "smaller"} by {ug_text(abs(size))} +- {ug_text(sd)} '
+            f'than before in all attitudes, as if gravity were not the stated {stated:.5f} m/s^2: '
+            'no scale was changed for this; state the gravity of the place (--gravity; parameter '
+            'local_gravity of the node) or, if the stated gravity is right, use --allow gravity'
+        )
     undetermined = [change.axis for change in result.axis_changes if not change.is_determined]
     if undetermined:
         lines.append(

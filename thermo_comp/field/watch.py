@@ -89,10 +89,8 @@ class Watch:
 
     def __str__(self) -> str:
         n_out = sum(not row.is_within for row in self.week)
-        week = (
-            f'RMS of |f| - g {self.recent:.2g} times the limit over the last {_WINDOW_DAYS} days'
-        )
-        week += f', {n_out} of {counted(len(self.week), "day")} above the limit'
+        week = f'RMS of |f| - g {self.recent:.2g} times the limit over the last {_WINDOW_DAYS} '
+        week += f'days, {n_out} of {counted(len(self.week), "day")} above the limit'
         if self.outside_since and self.recent <= 1.0:
             week += ', but the error at the last rest by the ageing model is above the limit'
         if self.outside_since:
@@ -132,12 +130,11 @@ def watch(series: RestSeries, calibration: Calibration, tolerance: float | None 
     days = _rows(series, names, ordered.tolist(), tolerance)
     together = -(-len(ordered) // _PERIODS)
     firsts = ordered[np.searchsorted(ordered, names) // together * together]
-    lower = np.floor(series.temperature / _CLASS_K) * _CLASS_K
-    classes = [f'{edge:g} .. {edge + _CLASS_K:g} degC' for edge in lower]
-    warmer = [f'{edge:g} .. {edge + _CLASS_K:g} degC' for edge in np.unique(lower)]
+    lower, of_class = np.unique(np.floor(series.temperature / _CLASS_K), return_inverse=True)
+    classes = [f'{edge:g} .. {edge + _CLASS_K:g} degC' for edge in lower * _CLASS_K]
     numbers = np.unique(series.day)
     first, recent = _smoothed(numbers, np.array([row.rms / row.limit for row in days]))
-    last, ageing = days[-1].name, None
+    ageing: Ageing | None = None
     forecast: tuple[float, ...] = ()
     interval: tuple[float, ...] = ()
     if series.start[-1] >= 2:
@@ -164,9 +161,9 @@ def watch(series: RestSeries, calibration: Calibration, tolerance: float | None 
         until = int(np.flatnonzero(recent > 1.0)[-1])
         inside_since = days[int(np.flatnonzero(is_row_out[: until + 1])[-1]) + 1].name
     periods = _rows(series, firsts, ordered[::together].tolist(), tolerance)
-    temperatures = _rows(series, np.array(classes), warmer, tolerance)
+    temperatures = _rows(series, np.array(classes)[of_class], classes, tolerance)
     return Watch(
-        *(days, periods, temperatures, last, days[first[-1] :], float(recent[-1])),
+        *(days, periods, temperatures, days[-1].name, days[first[-1] :], float(recent[-1])),
         *(outside_since, inside_since, forecast, interval, ageing),
     )
 
@@ -179,13 +176,11 @@ def _smoothed(day: Ints, ratio: Floats) -> tuple[Ints, Floats]:
     RMS of a week, perhaps of a disturbed day, is replaced by the second largest.
     """
     n = np.arange(len(day))
-    first = np.minimum(
-        np.searchsorted(day, day - _WINDOW_DAYS, side='right'), np.maximum(n - 1, 0)
-    )
+    first = np.searchsorted(day, day - _WINDOW_DAYS, side='right')
+    first = np.minimum(first, np.maximum(n - 1, 0))
     squares = [np.sort(ratio[i : k + 1] ** 2) for i, k in zip(first, n, strict=True)]
-    return first, np.sqrt(
-        [(values.sum() - np.diff(values[-2:]).sum()) / len(values) for values in squares]
-    )
+    means = [(values.sum() - np.diff(values[-2:]).sum()) / len(values) for values in squares]
+    return first, np.sqrt(means)
 
 
 def _forecasts(
@@ -211,9 +206,8 @@ def _forecasts(
     # of the limit. The ageing model may overestimate this variance after an earlier disturbance,
     # so the variance of the recent rests is used if it is smaller.
     scatter = ageing.turn_on**2 * float((of_levels[:, :3] ** 2).sum()) + ageing.rest**2
-    scatter = min(
-        scatter, float(share @ (recent.residual - recent.by_parameter @ solution.shift) ** 2)
-    )
+    left = recent.residual - recent.by_parameter @ solution.shift
+    scatter = min(scatter, float(share @ left**2))
     limit = tolerance or LIMIT * float(np.sqrt(share @ recent.claim**2))
     bound = float(np.sqrt(max(limit**2 - scatter, 0.0)))
     # Sd, by the delta method, of the logarithm of the variance by which the error grows per day.
@@ -222,10 +216,8 @@ def _forecasts(
     rate_sd = float(np.sqrt(slope @ of_walks @ slope))
     error = of_parameters @ solution.shift
     covariance = of_parameters @ solution.posterior @ of_parameters.T
-    now, updated_now = (
-        passage(mean, covariance, walk, bound, rate_sd) for mean in (error, np.zeros_like(error))
-    )
-    return now, updated_now
+    now = passage(error, covariance, walk, bound, rate_sd)
+    return now, passage(np.zeros_like(error), covariance, walk, bound, rate_sd)
 
 
 def _rows(

@@ -19,7 +19,7 @@ from .options import FitOptions, sets_of
 from .part_lags import find_parts
 from .priors import prior_model
 from .reduction import ReducedBag
-from .selection import Fit, Selected
+from .selection import Fit
 from .sensors import board_span, gradients_at_rest, learn_detector
 from .windows import PART, PRODUCTS, SET, Model, ThermalWindows, Track, thermal_windows
 
@@ -29,9 +29,7 @@ def model_of(
 ) -> Model:
     """
     Return the model of the prior or, without a prior, the model of `options` with all its columns
-    for which the bags have thermometers.
-
-    `parts`: the lag of each axis, or None for the bank of time constants
+    for which the bags have thermometers; `parts`: lag of each axis, or None for the bank of lags
     """
     prior, reference = options.prior, options.reference_temperature
     if prior is not None:
@@ -41,7 +39,13 @@ def model_of(
             detector=options.detector or prior.detector,
             reference_temperature=reference,
         )
-    detector, sensors = options.detector or learn_detector(bags), sensors_of(bags)
+    recorded = (
+        {name for name, readings in bag.temperatures.items() if len(readings.value)}
+        for bag in bags
+    )
+    # The case thermometer, recorded or not, then all others of every bag except that of the board.
+    sensors = 'case', *sorted(set.intersection(*recorded) - {'board', 'case'})
+    detector = options.detector or learn_detector(bags)
     columns: tuple[Column, ...] = ()
     if options.model != 'golovach':
         rests = gradients_at_rest(bags, sensors)
@@ -65,7 +69,17 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     fit = _with_lags(windows, problem)
     has_case = all(len(bag.case.value) for bag in bags)
     has_choice = has_case and options.prior is None and options.detector is None
-    if not has_choice or not _may_have_sets(fit.selected):
+    # The detector matters for two sets, if a model with two sets is chosen, or is at most one
+    # standard error worse and, on each axis, has less than 80 % of the chosen model's noise.
+    trials = fit.selected.trials
+    chosen = next(trial for trial in trials if trial.is_chosen)
+    limit = 0.8 * chosen.posterior.prior.sigma
+    may_have_sets = any(
+        SET in trial.groups
+        and (trial.is_chosen or (trial.is_near and (trial.posterior.prior.sigma < limit).all()))
+        for trial in trials
+    )
+    if not has_choice or not may_have_sets:
         return fit
     # The alternative detector ends the dynamic regime once the case temperature is constant, the
     # default detector once the board temperature is constant, too.
@@ -84,12 +98,7 @@ def windows_of(
     tracks: Sequence[Track] | None = None,
     undisturbed: Floats | None = None,
 ) -> ThermalWindows:
-    """
-    Return the windows of bags, with the stated |f| of the positions if not all are at 1 g.
-
-    `tracks`: thermal states of the bags, if computed before; `undisturbed`: factors of the weights
-    of the windows, or None if the fit estimates these factors
-    """
+    """Return the windows of bags; `tracks`: thermal states of the bags, if computed before."""
     windows = with_forces(thermal_windows(bags, model, tracks), options)
     return replace(windows, data=replace(windows.data, undisturbed=undisturbed))
 
@@ -115,26 +124,3 @@ def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
 def _better(fit: Fit | None, other: Fit) -> Fit:
     """Return `other` if it is better than `fit` on left-out data, or if `fit` is None."""
     return other if fit is None or is_better(fit.selected.score, other.selected.score) else fit
-
-
-def _may_have_sets(selected: Selected) -> bool:
-    """
-    Whether the chosen model has two sets, or a model with two sets is at most one standard error
-    worse than the chosen model and, on each axis, has less than 80 % of the chosen model's noise.
-    """
-    chosen = next(trial for trial in selected.trials if trial.is_chosen)
-    limit = 0.8 * chosen.posterior.prior.sigma
-    return any(
-        SET in trial.groups
-        and (trial.is_chosen or (trial.is_near and (trial.posterior.prior.sigma < limit).all()))
-        for trial in selected.trials
-    )
-
-
-def sensors_of(bags: Sequence[ReducedBag]) -> tuple[str, ...]:
-    """Return 'case', recorded or not, then all thermometers of every bag but board and case."""
-    recorded = (
-        {name for name, readings in bag.temperatures.items() if len(readings.value)}
-        for bag in bags
-    )
-    return 'case', *sorted(set.intersection(*recorded) - {'board', 'case'})

@@ -28,24 +28,15 @@ from ..unit.columns import Column
 from ..unit.nonlinearity import Kind, Nonlinearity
 from ..unit.posterior import posterior_of
 from ..unit.provenance import Provenance, ResidualSummary
+from . import thermal_ranges as ranges
 from .claim import Claim
 from .data_checks import Finding
 from .equations import as_vector
-from .evidence import ResidualRow, group_evidence
-from .lack_of_fit import lack_of_fit
+from .evidence import ResidualRow, group_evidence, lack_of_fit
 from .layout import Layout
 from .reduction import ReducedBag
 from .regression import Regression
 from .selection import Fit
-from .thermal_ranges import (
-    rest_gradient_range,
-    soak_gradient,
-    temperature_range,
-    union,
-    usable_board_lag,
-    valid_range,
-    with_unseen_axes,
-)
 from .unknowns import State
 from .windows import PART, Model, ThermalWindows
 
@@ -71,7 +62,7 @@ def build_calibration(
     values[-3:] = np.linalg.inv(state.inverse)[[1, 2, 2], [0, 0, 1]]
     static, dynamic = _regime_sets(fit, claim, known)
     columns = _valid_columns(windows, state, used, known)
-    lag_s = known.board_lag_s if known else usable_board_lag(windows)
+    lag_s = known.board_lag_s if known else ranges.usable_board_lag(windows)
     sensors = {*model.sensors[:1], *(column.sensor for column in columns)}
     window_s = windows.typical_count * float(np.median([bag.cycle_s for bag in bags]))
     blank = Calibration(
@@ -87,8 +78,8 @@ def build_calibration(
         sensors=tuple(name for name in model.sensors if name in sensors),
         response=blank_terms(columns),
         board_lag_s=lag_s,
-        rest_gradient_range_k=rest_gradient_range(windows, lag_s, known),
-        soak_gradient_k=soak_gradient(windows, known),
+        rest_gradient_range_k=ranges.rest_gradient_range(windows, lag_s, known),
+        soak_gradient_k=ranges.soak_gradient(windows, known),
         detector=model.detector,
         provenance=_provenance(fit, bags, residuals, findings),
         evidence=group_evidence(regression, posterior) if windows.was_measured else (),
@@ -108,24 +99,24 @@ def build_calibration(
 def _regime_sets(fit: Fit, claim: Claim, known: Calibration | None) -> list[RegimeSet]:
     """Return the static and the dynamic set with valid ranges, and all free coefficients 0."""
     windows, prior = fit.windows, fit.posterior.prior
-    temperatures = temperature_range(windows)
-    rates = valid_range(windows.rate * 60.0, 0.01 if windows.was_measured else 3.0, order=1)
+    temperatures = ranges.temperature_range(windows)
+    rates = ranges.valid_range(windows.rate * 60.0, 0.01 if windows.was_measured else 3.0, order=1)
     # The sd of mounting offset plus slow noise of each axis [m/s^2].
     slow = np.sqrt(claim.offset_sd**2 + prior.sigma**2 * prior.noise.variance).tolist()
     lacks: Sequence[tuple[LackOfFit, ...]] = ((), ())
     if fit.regression.gravity:
-        lacks = with_unseen_axes(fit, lack_of_fit(fit, claim), known)
+        lacks = ranges.with_unseen_axes(fit, lack_of_fit(fit, claim), known)
     result = []
     for k, (family, lack) in enumerate(zip(windows.model.sets.families, lacks, strict=True)):
         zero = (0.0,) * family.n_free
         bias, scale = (family.with_free(zero, reference) for reference in (0.0, 1.0))
         x, y, z = (AxisSet(bias, scale, residual_sd_m_s2=sd) for sd in slow)
         earlier = [known.regime_sets()[k]] if known else []
-        ranges = (
-            union((temperatures, *(regime.temperature_range_c for regime in earlier))),
-            union((rates, *(regime.rate_range_k_min for regime in earlier))),
+        valid = (
+            ranges.union((temperatures, *(regime.temperature_range_c for regime in earlier))),
+            ranges.union((rates, *(regime.rate_range_k_min for regime in earlier))),
         )
-        result.append(RegimeSet(*ranges, x, y, z, lack_of_fit=lack))
+        result.append(RegimeSet(*valid, x, y, z, lack_of_fit=lack))
     return result
 
 
@@ -133,7 +124,7 @@ def _valid_columns(
     windows: ThermalWindows, state: State, used: Sequence[int], known: Calibration | None
 ) -> list[Column]:
     """Return the response columns in use with their valid ranges."""
-    lower, upper = temperature_range(windows)
+    lower, upper = ranges.temperature_range(windows)
     is_weighed = np.any(state.weights != 0.0, axis=(0, 1))
     n_alone = windows.model.part_sums.shape[1]
     alone = is_weighed[len(windows.model.sets.groups) :]
@@ -145,19 +136,19 @@ def _valid_columns(
         valid = column.range
         if column.term.bounds is None:
             order = column.term.order
-            valid = valid_range(windows.raw[:, k], 0.01, order)
+            valid = ranges.valid_range(windows.raw[:, k], 0.01, order)
             if k not in weighed:
                 # A column with zero weight contributes only to the covariance, so all values that
                 # the temperature range allows are valid.
                 most = (upper - lower) ** order
-                valid = union((valid, (-most, most)))
+                valid = ranges.union((valid, (-most, most)))
         if k in of_parts and column.term.order % 2:
             # A part lags in cooling and in heating, so the range of an odd power of its lag is
             # extended to the same values of opposite sign.
-            valid = union((valid, (-valid[1], -valid[0])))
+            valid = ranges.union((valid, (-valid[1], -valid[0])))
         # A column whose weight is only that of curves over parts' temperatures is of group `part`.
         group = PART if k in weighed and not alone[k] else column.group
-        valid = valid if known is None else union((valid, column.range))
+        valid = valid if known is None else ranges.union((valid, column.range))
         result.append(replace(column, group=group, range=valid))
     return result
 
@@ -183,9 +174,10 @@ def _provenance(
     # the year 2000 (946684800 s after 1970) to now are taken for dates.
     is_date = 946684800.0 <= end_s <= now.timestamp()
     tested = datetime.fromtimestamp(end_s if is_date else 0.0, timezone.utc)
+    date_format = '%Y-%m-%dT%H:%M:%SZ'
     return Provenance(
-        created=_date_text(now),
-        tested=_date_text(tested) if is_date else '',
+        created=now.strftime(date_format),
+        tested=tested.strftime(date_format) if is_date else '',
         tool_version=__version__,
         model=fit.windows.model.name,
         sources=tuple(source for bag in bags for source in bag.sources),
@@ -203,10 +195,6 @@ def _provenance(
         ),
         notes=tuple(str(finding) for finding in findings if finding.level != 'good'),
     )
-
-
-def _date_text(date: datetime) -> str:
-    return date.strftime('%Y-%m-%dT%H:%M:%SZ')
 
 
 def blank_terms(columns: Iterable[Column]) -> tuple[ResponseTerm, ...]:
@@ -291,7 +279,7 @@ def file_jacobian(
     state: State,
     model: Model,
     used: Sequence[int],
-    kinds: Sequence[Kind] = (),
+    kinds: Sequence[Kind],
 ) -> Floats:
     """
     Return the derivatives of the file's parameters w.r.t. the regression's parameters.
@@ -312,8 +300,7 @@ def file_jacobian(
             (of_scale, 1.0, unknown[layout.kappa[axis]] / state.kappa[axis]),
         ):
             each = unknown[places] * (unit / regression.rms)[:, None]
-            # Add the weights of curves over the temperatures of parts to those of the columns of
-            # which these curves are sums.
+            # The curves over the temperatures of parts are sums of columns.
             each, of_parts = np.split(each, [sums.shape[1]])
             each = each + sums.T @ of_parts
             static, (delta,), dynamic, response = np.split(each, [n, n + 1, n + 1 + m])

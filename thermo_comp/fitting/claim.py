@@ -8,13 +8,16 @@ The standard deviation of mounting and turn-on offsets, unless the user states i
 the covariance is that of a mixture of fits on a grid of this standard deviation. The weight of a
 fit is the fit's evidence, limited by the evidence of the positions' norms, times a prior of the
 offset sd (half-Student [1]_ without a prior calibration). An error of local gravity, included in
-the covariance, changes all scale factors by the same ratio. `jackknife` adds variance for effects
-that the model lacks.
+the covariance, changes all scale factors by the same ratio.
+
+If the model lacks an effect, the best weights differ between sections of the chamber program, and
+the error in another program is as large as these differences: a jackknife [2]_ estimates them.
 
 References
 ----------
 .. [1] A. Gelman, Prior distributions for variance parameters in hierarchical models, Bayesian
    Analysis 1 (2006).
+.. [2] B. Efron, The jackknife, the bootstrap and other resampling plans, SIAM (1982), chapter 3.
 
 """
 
@@ -30,18 +33,10 @@ from ..typing import Floats, Ints
 from .equations import as_vector
 from .hyperparameters import CLEAR_GAIN, log_density, log_student
 from .initial_triad import within_positions
-from .jackknife import jackknife_covariance
 from .layout import Layout
 from .regression import PosteriorMode, Regression
 from .unknowns import InformativePrior, Prior, State
 from .windows import CURVE, LAGS, PART
-
-#: Largest usual sd of a bias offset, relative to `Prior.offset_scale`: of mountings within a
-#: turn-on, of a single turn-on, and ('both') of several turn-ons, or of mountings that each begin
-#: with a turn-on. By data sheets, the bias repeats to 0.3 .. 1 mg over turn-ons of tactical triads
-#: and to some mg over those of MEMS, 10 to 20 times `Prior.offset_scale`. The values for turn-ons
-#: are a compromise between data sheets and units whose bias repeats perfectly.
-LARGEST_USUAL = {'mounting': 1.0, 'turn-on': 2.0, 'both': 5.0}
 
 
 @dataclass(frozen=True)
@@ -78,7 +73,7 @@ def claim_of(
     [m/s^2]; `known_offset_sd`: sd of mounting and turn-on offsets by a prior calibration, or 0
     [m/s^2]; `informative`: priors from one calibration, for several amounts of ageing;
     `of_means`: state of a fit to the positions' means, or None; `lacks_effects`: whether noise
-    does not explain the left-out drift, so that `jackknife` adds variance
+    does not explain the left-out drift, so that the jackknife adds variance
     """
     # All rests of a mounting share an offset, but the regression has an offset for each rest: with
     # `n_rests` times the variance, the mean over a mounting's rests has the offset's variance.
@@ -91,11 +86,20 @@ def claim_of(
     layout, offset_sd = posterior.layout, chosen.prior.offset_sd
     offsets = _over_offsets(regression, posterior, offset_sd, known_offset_sd)
     covariance, offset_sd, turn_on_variance = offsets
-    covariance = covariance + _excess_over_priors(regression, posterior, informative)
+    if informative:
+        # Few rests do not show which constants have aged since the prior calibration: the mixture
+        # is of fits that assume different amounts of ageing.
+        priors = [replace(prior, informative=each) for each in informative]
+        fits = _fits(regression, posterior, priors, n_steps=3)
+        mixture, _ = _mixture(posterior, fits, np.array([log_density(fit) for fit in fits]))
+        covariance = covariance + _excess(mixture, posterior.covariance)
     if lacks_effects:
-        covariance = covariance + _excess(jackknife_covariance(regression, posterior), covariance)
+        covariance = covariance + _excess(_jackknifed(regression, posterior), covariance)
     if turn_on_variance:
-        covariance = covariance + turn_on_variance * _of_turn_on(regression, posterior)
+        # Derivatives of the unknowns by a bias offset on each axis that all positions share.
+        point = regression.at(posterior.state, prior)
+        by_offset = np.array([point.by_offset(axis) for axis in range(3)])
+        covariance = covariance + turn_on_variance * (by_offset.T @ by_offset)
     if candidates is not None:
         # `_widened` computes the covariance for the mounting sd of the mode, so the variance that
         # mixtures, jackknife and turn-ons have added is added to the result.
@@ -130,18 +134,22 @@ def _over_offsets(
         variance = offset_sd**2 * (1.0 - 1.0 / n_mountings) if is_single else 0.0
         return posterior.covariance, offset_sd, variance
     kind = 'mounting' if is_single or windows.has_turn_ons else 'both'
-    tried = _offsets_tried(scale, known_sd, kind)
-    covariance, offset_sd = _over_mountings(regression, posterior, *tried)
+    grid = _offsets_tried(scale, known_sd, kind)
+    covariance, offset_sd = _over_mountings(regression, posterior, *grid)
     if regression.has_turn_ons:
-        tried = _offsets_tried(scale, known_sd, 'both')
-        mixture, variance = _over_turn_ons(regression, posterior, *tried)
+        values, log_prior = _offsets_tried(scale, known_sd, 'both')
+        priors = [replace(posterior.prior, turn_on_sd=sd) for sd in values.tolist()]
+        fits = _fits(regression, posterior, priors)
+        evidence = np.array([fit.log_evidence for fit in fits])
+        mixture, weight = _mixture(posterior, fits, evidence + log_prior)
+        variance = float(weight @ values**2)
         covariance = covariance + _excess(mixture, posterior.covariance)
         return covariance, float(np.hypot(offset_sd, variance**0.5)), 0.0
     if not (is_single and regression.gravity):
         return covariance, offset_sd, 0.0
     # Bags of one turn-on do not show the sd of the bias over turn-ons: use the prior of this sd.
-    values, log_density = _offsets_tried(scale, known_sd, 'turn-on')
-    variance = float(np.average(values**2, weights=np.exp(log_density)))
+    values, log_prior = _offsets_tried(scale, known_sd, 'turn-on')
+    variance = float(np.average(values**2, weights=np.exp(log_prior)))
     return covariance, float(np.hypot(offset_sd, variance**0.5)), variance
 
 
@@ -151,7 +159,7 @@ def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Fl
     log prior density of the logarithm of this sd at these values.
 
     `scale`: `Prior.offset_scale` [m/s^2]; `known_sd`: offset sd by a prior calibration [m/s^2],
-    0 without a prior calibration; `kind`: kind of the offsets, a key of `LARGEST_USUAL`
+    0 without a prior calibration; `kind`: kind of the offsets, see `largest`
     """
     if known_sd:
         # A test of 12 positions determines the sd of mounting offsets within a factor of 1.5.
@@ -160,10 +168,16 @@ def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Fl
     # `least`: smallest usual sd, relative to `scale`. By data sheets, the bias of navigation-grade
     # triads repeats to 10 ug over turn-ons at best; over mountings within one turn-on, to less.
     least = 0.01 if kind == 'mounting' else min(1e-4 / scale, 1.0)
+    # Largest usual sd, relative to `scale`: of mountings within a turn-on, of a single turn-on,
+    # and ('both') of several turn-ons, or of mountings that each begin with a turn-on. By data
+    # sheets, the bias repeats to 0.3 .. 1 mg over turn-ons of tactical triads and to some mg over
+    # those of MEMS, 10 to 20 times `scale`. The values for turn-ons are a compromise between data
+    # sheets and units whose bias repeats perfectly.
+    largest = {'mounting': 1.0, 'turn-on': 2.0, 'both': 5.0}[kind]
     # The log evidence is smooth over the grid's step, a third of a decade of the sd.
     ratio = 10.0 ** np.linspace(-3.45, 2.25, 19)
     small = np.minimum(np.log(ratio / least), 0.0)
-    return scale * ratio, log_student(ratio / LARGEST_USUAL[kind]) + small
+    return scale * ratio, log_student(ratio / largest) + small
 
 
 def _places(layout: Layout, widened: Layout) -> Ints:
@@ -178,11 +192,7 @@ def _places(layout: Layout, widened: Layout) -> Ints:
 def _widened(
     regression: Regression, posterior: PosteriorMode, candidates: Floats, of_means: State | None
 ) -> tuple[Layout, Floats]:
-    """
-    Return layout and covariance, with the columns that the data do not determine.
-
-    `candidates`: prior sd of the columns, shape (2, m); `of_means`: fit to the positions' means
-    """
+    """Return layout and covariance with the columns that the data do not determine."""
     prior, state = _with_unseen(regression, posterior, candidates), posterior.state
     if of_means is None:
         with_unseen = regression.solve(state, prior, n_steps=0)
@@ -190,7 +200,11 @@ def _widened(
     # The chosen curve follows from drifts of warm-ups within the positions. A warm-up heats the
     # board in another way than a chamber does, so the curve of the positions' means is an
     # alternative: half of the squared difference of the two curves is added to the variance.
-    other = _with_curve(regression, state, of_means)
+    # Columns that change more within the positions than between them keep their weights.
+    within = within_positions(regression.columns, regression.windows.position)
+    is_of_means = np.mean(within**2, axis=0) < np.mean((regression.columns - within) ** 2, axis=0)
+    weights = np.where(is_of_means, of_means.weights, state.weights)
+    other = replace(of_means, weights=weights)
     # Columns that only the fit to the means has need rows in the covariance: give them a tiny sd.
     is_used = other.weights.any(axis=1) & (prior.column_sd == 0.0)
     prior = replace(prior, column_sd=np.where(is_used, 1e-9, prior.column_sd))
@@ -198,17 +212,6 @@ def _widened(
     layout = with_unseen.layout
     difference = (as_vector(other, layout) - as_vector(state, layout))[: layout.n_unit]
     return layout, with_unseen.covariance + 0.5 * np.outer(difference, difference)
-
-
-def _with_curve(regression: Regression, state: State, of_means: State) -> State:
-    """
-    Return the state of the fit to the means of the positions, with the weights of `state` for the
-    columns that change more within the positions than between them.
-    """
-    columns, position = regression.columns, regression.windows.position
-    within = within_positions(columns, position)
-    is_of_means = np.mean(within**2, axis=0) < np.mean((columns - within) ** 2, axis=0)
-    return replace(of_means, weights=np.where(is_of_means, of_means.weights, state.weights))
 
 
 def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floats) -> Prior:
@@ -245,11 +248,9 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
         square = np.mean(posterior.state.weights**2, axis=1) + sd**2
         slopes = np.sqrt(np.sum(square[:, is_curve] / kelvins[is_curve] ** 2, axis=1))
         of_curve = np.outer(slopes, kelvins)
-        typical = np.where(is_of_lags, np.minimum(typical, of_curve), typical)
+        typical = np.minimum(typical, of_curve)
         # A curve column that the data do not determine changes this slope by up to half the slope.
-        unseen = 0.5 * of_curve
-        typical = np.where(groups == CURVE, np.minimum(typical, unseen), typical)
-        sd = np.where(groups == CURVE, np.minimum(sd, unseen), sd)
+        sd = np.where(groups == CURVE, np.minimum(sd, 0.5 * of_curve), sd)
     # The variance of n lags is limited to that of one lag, so each lag gets 1 / n of the variance.
     is_lag = is_of_lags & (sd > 0.0)
     share = np.sqrt(np.maximum(is_lag.sum(axis=1, keepdims=True), 1))
@@ -263,7 +264,7 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
 
 
 def _over_mountings(
-    regression: Regression, posterior: PosteriorMode, tried: Floats, log_density: Floats
+    regression: Regression, posterior: PosteriorMode, tried: Floats, log_prior: Floats
 ) -> tuple[Floats, float]:
     """
     Return the covariance of the unit's unknowns, and the RMS of the offset sd [m/s^2], by a
@@ -272,52 +273,35 @@ def _over_mountings(
     prior, mounting = posterior.prior, regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
 
-    def solved(offset_sd: Floats) -> list[PosteriorMode]:
-        return [
-            regression.solve(posterior.state, replace(prior, offset_sd=float(sd)), n_steps=1)
-            for sd in offset_sd
-        ]
+    def fits_with(offset_sd: Floats) -> list[PosteriorMode]:
+        priors = [replace(prior, offset_sd=sd) for sd in offset_sd.tolist()]
+        return _fits(regression, posterior, priors)
 
-    fits = solved(tried)
+    fits = fits_with(tried)
     # With a large mounting sd the attitudes absorb errors of the model, which increases the log
     # evidence; at most the increase of the norms' log evidence plus `CLEAR_GAIN` counts.
     of_data = np.array([fit.log_evidence for fit in fits])
     of_norms = _norm_evidence(regression, posterior, tried, fits[-1].root)
     nearest = int(np.argmin(np.abs(np.log(tried * n_rests**0.5 / prior.offset_sd))))
     of_data, of_norms = of_data - of_data[nearest], of_norms - of_norms[nearest]
-    weight = np.minimum(of_data, of_norms + CLEAR_GAIN)
+    evidence = np.minimum(of_data, of_norms + CLEAR_GAIN)
     if n_rests > 1.0:
         # The rests of a mounting share its offset: only the means of mountings determine the sd.
-        fits, weight = solved(n_rests**0.5 * tried), of_norms
-    covariance, weight = _mixture(posterior, fits, weight + log_density)
+        fits, evidence = fits_with(n_rests**0.5 * tried), of_norms
+    covariance, weight = _mixture(posterior, fits, evidence + log_prior)
     return covariance, float(np.sqrt(weight @ tried**2))
 
 
-def _over_turn_ons(
-    regression: Regression, posterior: PosteriorMode, tried: Floats, log_density: Floats
-) -> tuple[Floats, float]:
-    """
-    Return the covariance of the mixture of fits over the sd of turn-on offsets, and the mean
-    variance of a turn-on offset, for the sds `tried`, (k,), and their log prior density.
-    """
-    fits = [
-        regression.solve(
-            posterior.state, replace(posterior.prior, turn_on_sd=float(sd)), n_steps=1
-        )
-        for sd in tried
-    ]
-    evidence = np.array([fit.log_evidence for fit in fits])
-    covariance, weight = _mixture(posterior, fits, evidence + log_density)
-    return covariance, float(weight @ tried**2)
+def _fits(
+    regression: Regression, posterior: PosteriorMode, priors: Sequence[Prior], n_steps: int = 1
+) -> list[PosteriorMode]:
+    return [regression.solve(posterior.state, prior, n_steps) for prior in priors]
 
 
 def _mixture(
     posterior: PosteriorMode, fits: Sequence[PosteriorMode], log_weight: Floats
 ) -> tuple[Floats, Floats]:
-    """
-    Return the covariance of the unit's unknowns by a mixture of fits, about the mode of the
-    posterior, and the weights of the fits, whose sum is 1.
-    """
+    """Return the unit's covariance by a mixture of fits, about the mode, and the weights."""
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
     n = posterior.layout.n_unit
@@ -329,41 +313,12 @@ def _mixture(
     return covariance, weight
 
 
-def _excess_over_priors(
-    regression: Regression, posterior: PosteriorMode, informative: Sequence[InformativePrior]
-) -> Floats:
-    """
-    Return the excess of the covariance of a mixture of fits over that of the most probable fit.
-    The fits assume different amounts of ageing since the prior calibration, because few rests do
-    not show which constants have aged.
-    """
-    n = posterior.layout.n_unit
-    if not informative:
-        return np.zeros((n, n))
-    fits = [
-        regression.solve(posterior.state, replace(posterior.prior, informative=each), n_steps=3)
-        for each in informative
-    ]
-    mixture, _ = _mixture(posterior, fits, np.array([log_density(fit) for fit in fits]))
-    return _excess(mixture, posterior.covariance)
-
-
 def _excess(covariance: Floats, other: Floats) -> Floats:
     """Return ``covariance - other``, with negative eigenvalues, in sds of `other`, set to 0."""
     sd = np.sqrt(np.diag(other))
     values, vectors = np.linalg.eigh((covariance - other) / np.outer(sd, sd))
     root = sd[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
     return np.asarray(root @ root.T)
-
-
-def _of_turn_on(regression: Regression, posterior: PosteriorMode) -> Floats:
-    """
-    Return the covariance of the unit's unknowns due to a bias offset of unit variance on each axis
-    that all positions share, shape (n_unit, n_unit).
-    """
-    point = regression.at(posterior.state, posterior.prior)
-    by_offset = np.array([point.by_offset(axis) for axis in range(3)])
-    return np.asarray(by_offset.T @ by_offset)
 
 
 def _norm_evidence(
@@ -404,3 +359,43 @@ def _norm_evidence(
     variances = np.maximum(variances, noise.min()) + offset_sd[:, None] ** 2
     square = np.sum((vectors.T @ errors) ** 2 / variances, axis=1)
     return np.asarray(-0.5 * (square + np.sum(np.log(variances), axis=1)))
+
+
+def _jackknifed(regression: Regression, posterior: PosteriorMode) -> Floats:
+    """
+    Return the covariance of the unit's unknowns by the jackknife over the sections of the test,
+    shape (n_unit, n_unit); 0 for one section, or if noise explains the changes of the unknowns.
+    """
+    n = posterior.layout.n_unit
+    last = int(regression.windows.section.max())
+    if not last:
+        return np.zeros((n, n))
+    products = regression.products(posterior.layout.used)
+    step, factor = regression.at(posterior.state, posterior.prior).solution
+    changes, ratios = [], []
+    for number in range(last + 1):
+        grams = products.without(np.array([number]))
+        other, remaining = regression.at(posterior.state, posterior.prior, grams).solution
+        changes.append(other[:n] - step[:n])
+        ratios.append(_ratios_to_noise(factor.T @ changes[-1], remaining.T @ posterior.root))
+    ratio, without = np.concatenate(ratios), np.array(changes)
+    # Under noise alone each ratio of a squared change to its variance has mean 1 and variance 2.
+    if ratio.sum() - len(ratio) < 2.0 * np.sqrt(2.0 * len(ratio)):
+        return np.zeros((n, n))
+    return np.asarray(last / (last + 1) * without.T @ without)
+
+
+def _ratios_to_noise(change: Floats, remaining: Floats) -> Floats:
+    """
+    Return the squared changes of k combinations of the unknowns if some windows are left out,
+    divided by the variances of these changes due to noise, shape (k,).
+
+    `change`: change of the unknowns, shape (n,), and `remaining`: root of the information of the
+    remaining windows, ``remaining.T @ remaining``, shape (n, n), both scaled so that the
+    covariance of the fit of all windows is the unit matrix
+    """
+    shares, directions = np.linalg.eigh(remaining.T @ remaining)
+    # Use combinations about which the left-out windows have more than 1e-6 of the information.
+    is_measured = shares < 1.0 - 1e-6
+    shares = np.maximum(shares[is_measured], 1e-12)
+    return np.asarray((change @ directions[:, is_measured]) ** 2 * shares / (1.0 - shares))

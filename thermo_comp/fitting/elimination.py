@@ -28,14 +28,13 @@ def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
     errors, shape (..., n, n).
 
     Each matrix is scaled to a unit diagonal, or by the root of a given `diagonal`, shape (..., n).
-    The smallest jitter for which a factor exists is then added to the scaled diagonal.
+    Jitters are then added to the scaled diagonal, one after the other, until a factor exists.
     """
     square = np.einsum('...ii->...i', matrix) if diagonal is None else diagonal
     root = np.sqrt(square)
     scaled = matrix / root[..., None, :]
     scaled /= root[..., :, None]
     index = np.arange(matrix.shape[-1])
-    # Jitters relative to the diagonal, added one after the other until a factor exists.
     jitters = 1e-13, 1e-11, 1e-9, 1e-7
     for jitter in jitters:
         scaled[..., index, index] += jitter
@@ -131,7 +130,7 @@ class Reduced:
 
     of_bag_prior: prior precision of the unknowns of bags, and this precision times their distance
         from the prior mean, shape (2, n_bags, r)
-    matrix: Hessian and, in the last column, gradient, shape (n + 1, n + 1)
+    matrix: Hessian, with the prior `common`, and, in the last column, gradient, (n + 1, n + 1)
     positions: the blocks of the positions, with columns for the bag's, then the unit's unknowns
     shares: contribution of each position to the block of its bag, with off-diagonal blocks and
         gradients, shape (n_positions, r, r + n + 1); and to the diagonal of this block before the
@@ -149,11 +148,6 @@ class Reduced:
     common: Blocks | None = None
 
     @property
-    def full_matrix(self) -> Floats:
-        """`matrix`, with the prior on the sum of the initial lag states added to the Hessian."""
-        return self.matrix if self.common is None else self.matrix + _square(self.common.whitened)
-
-    @property
     def log_determinant(self) -> float:
         """Sum of the log determinants of all eliminated blocks."""
         blocks = self.positions, self.bags, self.common
@@ -165,7 +159,8 @@ class Reduced:
         cross = self.bags.solved[:, :r].sum(axis=0, keepdims=True)
         cross[..., -1] += total
         block = self.bags.inverse[:, :r, :r].sum(axis=0, keepdims=True) + variance * np.eye(r)
-        return replace(self, common=Blocks.of(block, cross))
+        common = Blocks.of(block, cross)
+        return replace(self, common=common, matrix=self.matrix + _square(common.whitened))
 
     def follow(self, step: Floats) -> tuple[Floats, Floats]:
         """Return the steps of the unknowns of positions and bags, given the unit's step."""
@@ -192,14 +187,14 @@ class Reduced:
         return positions, starts
 
     def without(self, places: Ints, normal: Normal) -> Floats:
-        """Return `full_matrix` without the positions `places`, whose equations are `normal`."""
+        """Return `matrix` without the positions `places`, whose equations are `normal`."""
         bag, r = self.layout.bag, len(self.bags.root[0])
         at = np.unique(bag[places])
         others = (bag == at[:, None]) & ~np.isin(np.arange(len(bag)), places)
         rest = _of_bags(others.astype(np.float64), self.shares, self.of_bag_prior[:, at])
         left_out = _of_unit(normal.unit, self.layout)
         left_out -= _square(self.positions.whitened[places][..., r:])
-        remaining = self.full_matrix - left_out + _square(self.bags.whitened[at])
+        remaining = self.matrix - left_out + _square(self.bags.whitened[at])
         return np.asarray(remaining - _square(rest.whitened))
 
     def eliminate_from(self, rows: Floats) -> tuple[Floats, Floats]:

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -24,17 +23,17 @@ from ..typing import Bools, Floats
 from ..unit.calibration import Calibration, LackOfFit, RegimeSet
 from ..unit.gravity import MICRO_G
 from .coverage import distinct_directions
-from .data_checks import POSITIONS_NEEDED, Finding
+from .data_checks import POSITIONS_NEEDED, Finding, advice
+from .evidence import drift_variance
 from .initial_triad import within_positions
 from .initialisation import initial_state
-from .lack_of_fit import drift_variance
 from .left_out import Folds
 from .options import FitOptions
 from .priors import constants_of, informative_priors, offset_sd_of, prior_model, with_calibration
 from .reduction import ReducedBag
 from .regression import Regression
 from .selection import Fit
-from .unknowns import BIAS_SD, MISALIGNMENT_SD, SCALE_SD, Prior, State, Windows
+from .unknowns import Prior, State, Windows
 from .windows import ThermalWindows, thermal_windows
 
 
@@ -77,25 +76,16 @@ def _square_of_bags(fit: Fit) -> Floats:
     return Folds.of(folds.square, folds.windows, bag).square
 
 
-class Contradiction(NamedTuple):
-    """
-    Bags that contradict an earlier calibration of their unit.
-
-    bags: numbers of the bags whose drift the calibration does not explain with any lag states at
-        start; if these are more than half of the bags, numbers of all bags
-    may_update: whether the bags can update the calibration: ``|f| - g`` is far above the drift and
-        the claimed sd of |f|, so that bias or scale has changed, too, or the bags have the six
-        attitudes that determine bias and scale
-    """
-
-    bags: list[int]
-    may_update: bool
-
-
 def contradiction(
     windows: ThermalWindows, known: Calibration, options: FitOptions
-) -> Contradiction:
-    """Find the bags whose drift contradicts the calibration `known` of their unit."""
+) -> tuple[list[int], bool]:
+    """
+    Return the numbers of the bags whose drift the calibration `known` of their unit does not
+    explain with any lag states at start, or of all bags if these are more than half of the bags;
+    and whether the bags can update `known`: ``|f| - g`` is far above the drift and the claimed sd
+    of |f|, so that bias or scale has changed, too, or the bags have the six attitudes that
+    determine bias and scale.
+    """
     data = replace(windows.data, tilt=windows.data.tilt[:, :0])
     regression, state = _at_calibration(known, data, options.gravity)
     first = next(informative_priors(known, regression, state, windows.model, options))
@@ -103,9 +93,6 @@ def contradiction(
     window_s = windows.typical_count * known.unit.cycle_time_s
     sigma = np.array(known.noise_density_m_s2_sqrt_hz) / np.sqrt(window_s)
     prior = Prior(
-        bias_sd=np.full(3, BIAS_SD),
-        scale_sd=SCALE_SD,
-        misalignment_sd=MISALIGNMENT_SD,
         column_sd=data.parts.astype(np.float64),
         # Only drifts are compared: bias offsets of 1 mg, by turn-ons or ageing, are allowed.
         offset_sd=1e-2,
@@ -130,7 +117,7 @@ def contradiction(
         # All bags are of one environment, whose effect on drifts is small in some attitudes.
         is_far[:] = True
     may_update |= len(distinct_directions(state.up)) >= POSITIONS_NEEDED
-    return Contradiction(np.flatnonzero(is_far).tolist(), may_update)
+    return np.flatnonzero(is_far).tolist(), may_update
 
 
 def _at_calibration(
@@ -151,7 +138,7 @@ def _norm_errors(regression: Regression, state: State) -> Floats:
 
 
 def with_excluded_error(
-    calibration: Calibration, bags: Sequence[ReducedBag], others: str, *, is_updated: bool = False
+    calibration: Calibration, bags: Sequence[ReducedBag], others: str, *, is_updated: bool
 ) -> tuple[Calibration, Finding]:
     """
     Add the drift, and the error of |f|, that remain in `bags` after the correction to the lack of
@@ -185,8 +172,7 @@ def with_excluded_error(
             f'uncertainty includes. Bags over the whole temperature range allow a fit without '
             f'{others}'
         )
-    finding = Finding('environment', 'advice', text)
-    return replace(calibration, static=static, dynamic=dynamic), finding
+    return replace(calibration, static=static, dynamic=dynamic), advice('environment', text)
 
 
 def _widened(regime: RegimeSet, square: Floats) -> RegimeSet:

@@ -18,10 +18,7 @@ positions, |f| replaces g, and the nonlinear terms ``kappa sum_j (k_j + k'_j t) 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from functools import wraps
-from typing import Concatenate, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -30,46 +27,6 @@ from .layout import Layout, lay_out
 from .series import Base, Series
 from .tangent import Tangent
 from .unknowns import Prior, State, Windows
-
-_Self = TypeVar('_Self')
-_Given = ParamSpec('_Given')
-_Result = TypeVar('_Result')
-
-
-def last_result_kept(
-    method: Callable[Concatenate[_Self, _Given], _Result],
-) -> Callable[Concatenate[_Self, _Given], _Result]:
-    """Keep the last result of a method, and return it if the arguments are the same objects."""
-    name = f'_last_{method.__name__}'
-
-    @wraps(method)
-    def kept(self: _Self, /, *args: _Given.args, **kwargs: _Given.kwargs) -> _Result:
-        last: tuple[tuple[object, ...], _Result] | None = self.__dict__.get(name)
-        if last is None or any(a is not b for a, b in zip(last[0], args, strict=True)):
-            last = args, method(self, *args, **kwargs)
-            self.__dict__[name] = last
-        return last[1]
-
-    return kept
-
-
-class Effects(NamedTuple):
-    """
-    The parts of the readings that a state of the unknowns predicts at the reference temperature.
-
-    force: specific force along each axis in each position, shape (n_positions, 3)
-    by_rotation: derivative of the reading w.r.t. a rotation of the attitude, (n_positions, 3, 2)
-    without_bias: reading without the bias, shape (n_positions, 3)
-    nonlinear: sums of the nonlinear terms at the reference temperature and of their changes per
-        kelvin, shape (2, n_positions, 3)
-    slopes: derivatives of `nonlinear` w.r.t. the force, shape (2, n_positions, 3)
-    """
-
-    force: Floats
-    by_rotation: Floats
-    without_bias: Floats
-    nonlinear: Floats
-    slopes: Floats
 
 
 class Equations(Series):
@@ -92,6 +49,7 @@ class Equations(Series):
 
     def initial_state(self, bias: Floats, misalignment: Floats, up: Floats) -> State:
         """Return a state with nominal scale factors and no effect of temperature."""
+        poses = [up[self.windows.pose == k].mean(axis=0) for k in range(self.windows.n_poses)]
         return State(
             kappa=np.ones(3),
             bias=bias,
@@ -105,7 +63,7 @@ class Equations(Series):
             nonlinear=np.zeros((3, self.n_coefficients)),
             radius=np.zeros(1),
             stretch=np.zeros((len(up), 1)),
-            pose=_poses(up, self.windows.pose, self.windows.n_poses),
+            pose=_unit_vector(np.reshape(poses, (-1, 3))),
             pose_of=np.zeros(0, np.int64) if self.windows.pose is None else self.windows.pose,
         )
 
@@ -121,42 +79,44 @@ class Equations(Series):
         return np.asarray(self.forces.norms(state.radius, state.stretch)[:, None])
 
     def layout(self, used: Bools, nonlinear: Bools | None = None) -> Layout:
-        """
-        Assign an index to every unknown; return one `Layout` object for equal arguments.
-
-        `used`: active columns of bias and scale, shape (2, m); `nonlinear`: active nonlinear
-        coefficients, shape (2 k,); None for all
-        """
-        if nonlinear is None or self.forces is None:
+        """Return the same object of `lay_out` for equal arguments; `nonlinear`: None for all."""
+        if nonlinear is None:
             nonlinear = np.ones(self.n_coefficients, dtype=bool)
         key = used.tobytes() + nonlinear.tobytes()
         if key not in self._layouts:
             has_lags = bool((self.windows.lag[used.any(axis=0)] >= 0).any())
             n_tilts, n_starts = self.windows.tilt.shape[1], self.start_root.shape[1] * has_lags
             self._layouts[key] = lay_out(
-                *(used, self.bag_of_position, n_tilts, n_starts, nonlinear, self.forces),
-                pose_of=self.windows.pose,
-                has_turn_ons=self.has_turn_ons,
+                *(used, nonlinear, self.bag_of_position, self.windows.pose),
+                *(n_tilts, n_starts, self.has_turn_ons, self.forces),
             )
         return self._layouts[key]
 
-    @last_result_kept
-    def effects(self, state: State) -> Effects:
-        """Return the parts of the readings that `state` predicts at the reference temperature."""
-        force = np.asarray(self._norm(state) * state.up @ state.inverse.T)
+    def along(self, state: State) -> Floats:
+        """Return the specific force along each axis in each position, shape (n_positions, 3)."""
+        return np.asarray(self._norm(state) * state.up @ state.inverse.T)
+
+    def _effects(self, state: State) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+        """
+        Return the force `along` the axes; and, at the reference temperature: the derivative of the
+        reading by a rotation of the attitude, (n_positions, 3, 2); the reading without the bias,
+        (n_positions, 3); the sum of the nonlinear terms, and of their changes per kelvin, shape
+        (2, n_positions, 3); and the derivatives of these two sums by the force.
+        """
+        force = self.along(state)
         along_axes = np.einsum('ij,pjt->pit', state.inverse, state.tangents)
         sizes = np.reshape(self._norm(state), (-1, 1, 1))
         by_rotation = sizes * (state.kappa[:, None] * along_axes)
         if self.forces is None:
-            nonlinear = np.zeros((2, 2, *force.shape))
+            terms, slopes = np.zeros((2, 2, *force.shape))
         else:
-            terms = np.stack(self.forces.terms(force))
-            nonlinear = np.einsum('vpik,ijk->vjpi', terms, state.nonlinear.reshape(3, 2, -1))
-        return Effects(force, by_rotation, state.kappa * (force + nonlinear[0, 0]), *nonlinear)
+            each = np.stack(self.forces.terms(force))
+            terms, slopes = np.einsum('vpik,ijk->vjpi', each, state.nonlinear.reshape(3, 2, -1))
+        return force, by_rotation, state.kappa * (force + terms[0]), terms, slopes
 
     def tangent(self, state: State, layout: Layout, base: Base) -> Tangent:
         """Linearise the measurement equations about a state."""
-        force, by_rotation, without_bias, _, _ = self.effects(state)
+        force, by_rotation, without_bias, _, _ = self._effects(state)
         along = (state.kappa * force)[..., None]
         n_starts, n_stretches = layout.start.shape[1], layout.stretch.shape[1]
         scaled, by_kappa, by_force = (base.size + k for k in range(3))
@@ -195,7 +155,7 @@ class Equations(Series):
         Return the combinations of the base series that `Tangent` uses: 1 + S s; the derivatives
         w.r.t. kappa, the force along the axis and the initial lag states; and the residual.
         """
-        force, _, without_bias, (bend, bend_by_t), (slope, slope_by_t) = self.effects(state)
+        force, _, without_bias, (bend, bend_by_t), (slope, slope_by_t) = self._effects(state)
         on_bias, on_scale = state.weights[:, :, base.columns]
         result = np.zeros((*force.shape, base.size, 4 + n_starts))
         result[:, :, 0, :3] = 1.0
@@ -223,7 +183,7 @@ class Equations(Series):
         if self.forces is None or not len(active):
             return active, 1.0
         k = len(self.forces.kinds)
-        value, _ = self.forces.terms(self.effects(state).force)
+        value, _ = self.forces.terms(self.along(state))
         place = np.where(active < k, scaled, base.t[0])
         return place, state.kappa[:, None] * value[..., active % k]
 
@@ -238,7 +198,7 @@ class Equations(Series):
 
     def misfit(self, state: State, base: Base) -> Floats:
         """Return the residual as combinations of the base series, (n_positions, 3, n_base)."""
-        force, by_rotation, without_bias, (_, bend_by_t), _ = self.effects(state)
+        force, by_rotation, without_bias, (_, bend_by_t), _ = self._effects(state)
         on_bias, on_scale = state.weights[:, :, base.columns]
         result = np.zeros((*force.shape, base.size))
         result[:, :, 0] = self.level - (without_bias + state.bias + state.offset)
@@ -271,7 +231,6 @@ class Equations(Series):
         """Return the prior sd of the weights of each axis, shape (2, 3, m)."""
         return np.asarray(prior.column_sd[:, None] * self.windows.share)
 
-    @last_result_kept
     def precision(self, prior: Prior, layout: Layout) -> Floats:
         """Return inverse prior variances, (n,); 0 for unknowns with an informative prior."""
         result = np.zeros(layout.n)
@@ -351,12 +310,6 @@ def with_step(state: State, step: Floats, layout: Layout) -> State:
     up = _unit_vector(state.up + np.einsum('pij,pj->pi', state.tangents, turn))
     added = {name: getattr(state, name) + padded[getattr(layout, name)] for name in _added(layout)}
     return without_inactive(replace(state, up=up, pose=pose, **added), layout)
-
-
-def _poses(up: Floats, pose_of: Ints | None, n_poses: int) -> Floats:
-    """Return the mean attitude of the positions of each pose, shape (n_poses, 3)."""
-    means = [up[pose_of == k].mean(axis=0) for k in range(n_poses)]
-    return _unit_vector(np.array(means).reshape(-1, 3))
 
 
 def _by_poses(by_rotation: Floats, layout: Layout) -> Floats:

@@ -2,15 +2,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the statistics that a fit reports: residuals of each position; residuals after correction with
-constants, with curves and with the response; and the contribution of each group of columns.
+constants, with curves and with the response; the contribution of each group of columns; and the
+lack of fit, the excess of the left-out errors over the published covariance.
 
 Each position has two residuals: in sample, by the fit of all positions; and left out, by a fit
 without this position, which estimates the error in a new attitude.
+
+The lack of fit in a regime, near a temperature, is the mean square of the left-out drift less the
+noise and the published variance of this drift. The lack of fit covers effects that no column
+describes, such as a kink of the curve, a tilt of the support or a drift of the bias. For models
+whose score is at most one standard error worse than that of the chosen model, half of the largest
+squared difference between the drift of such a model and that of the chosen model is added.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -18,11 +24,14 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from ..typing import Bools, Floats
+from ..unit.calibration import LackOfFit
 from ..unit.metrics import ResidualStatistics, norm_residual, statistics_by_regime
 from ..unit.provenance import GroupEvidence
+from .claim import Claim
 from .equations import as_vector
 from .gains import log_bayes_factors
-from .left_out import Score
+from .initial_triad import within_positions
+from .layout import Layout
 from .regression import PosteriorMode, Regression
 from .selection import Fit
 from .unknowns import Noise, State
@@ -84,35 +93,15 @@ def residual_rows(fit: Fit) -> tuple[tuple[ResidualRow, ...], Floats, Floats]:
     ]
     sizes = regression.norms(state)[regression.windows.position]
     residuals = [norm_residual(regression.force(step), sizes) for step in steps]
-    left_out = left_out_error(selected.score, sizes)
+    # If other positions do not determine the norm, the left-out error is the drift, RMS of axes.
+    norm = norm_residual(selected.score.force, sizes)
+    drift = np.sqrt(np.mean(selected.score.drift**2, axis=1))
+    left_out = np.where(np.isfinite(norm), norm, drift)
     if not windows.model.sets.is_shared:
         residuals[1] = np.full_like(left_out, np.nan)
-    tables = tables_of((*residuals, left_out), windows.is_dynamic)
-    rows = tuple(
-        ResidualRow(section, *(table[section] for table in tables))
-        for section in ('static', 'dynamic', 'all')
-    )
-    return rows, residuals[-1], left_out
-
-
-def tables_of(
-    residuals: Iterable[Floats], is_dynamic: Bools
-) -> list[dict[str, ResidualStatistics]]:
-    """Return, for each array of residuals, (n,), statistics of finite values by regime."""
-    return [
-        statistics_by_regime(values[np.isfinite(values)], is_dynamic[np.isfinite(values)])
-        for values in residuals
-    ]
-
-
-def left_out_error(score: Score, gravity: float | Floats) -> Floats:
-    """
-    Return the error of each left-out window [m/s^2], shape (n,): ``|f| - g`` if the other
-    positions determine |f|, else the RMS of the drifts of the three axes.
-    """
-    norm = norm_residual(score.force, gravity)
-    drift = np.sqrt(np.mean(score.drift**2, axis=1))
-    return np.asarray(np.where(np.isfinite(norm), norm, drift))
+    tables = [statistics_by_regime(each, windows.is_dynamic) for each in (*residuals, left_out)]
+    rows = (ResidualRow(section, *(table[section] for table in tables)) for section in tables[0])
+    return tuple(rows), residuals[-1], left_out
 
 
 def _with_only(regression: Regression, chosen: PosteriorMode, groups: tuple[str, ...]) -> State:
@@ -133,11 +122,10 @@ def _with_only(regression: Regression, chosen: PosteriorMode, groups: tuple[str,
 
 def position_reports(fit: Fit, residual: Floats, left_out: Floats) -> tuple[PositionReport, ...]:
     """Return a report for each position, from the residuals of `residual_rows`, shape (n,)."""
-    windows, state = fit.windows, fit.posterior.state
     result = []
-    for number, (bag, interval) in enumerate(windows.rests):
-        rows = windows.data.position == number
-        x, y, z = state.up[number].tolist()
+    for number, (bag, interval) in enumerate(fit.windows.rests):
+        rows = fit.windows.data.position == number
+        x, y, z = fit.posterior.state.up[number].tolist()
         result.append(
             PositionReport(
                 source=bag.source.name,
@@ -181,7 +169,10 @@ def group_evidence(regression: Regression, posterior: PosteriorMode) -> tuple[Gr
             if of_prior is None:
                 weight_sd = regression.weight_sd(prior)[k][:, used].ravel()
             else:
-                weight_sd = np.full(len(places), _mean_sd(of_prior[places]))
+                # The geometric mean of the principal sds of the weights in the prior.
+                root = of_prior[places]
+                mean_sd = np.exp(np.linalg.slogdet(root @ root.T)[1] / (2.0 * len(root)))
+                weight_sd = np.full(len(places), mean_sd)
             cases = places[None], weight_sd[None]
             (gain,) = log_bayes_factors(change, posterior.covariance, *cases)
             result.append(
@@ -197,6 +188,53 @@ def group_evidence(regression: Regression, posterior: PosteriorMode) -> tuple[Gr
     return tuple(result)
 
 
-def _mean_sd(root: Floats) -> float:
-    """Return the geometric mean of the principal sds of the covariance ``root @ root.T``."""
-    return float(np.exp(np.linalg.slogdet(root @ root.T)[1] / (2.0 * len(root))))
+def lack_of_fit(fit: Fit, claim: Claim) -> tuple[tuple[LackOfFit, ...], tuple[LackOfFit, ...]]:
+    """Return the lack of fit in the static and the dynamic regime, at 0 to 5 temperatures each."""
+    windows, regression, selected = fit[:3]
+    prior, state, position = fit.posterior.prior, fit.posterior.state, windows.data.position
+    noise = prior.sigma**2 * (1.0 / regression.weight[:, None] + prior.noise.variance)
+    claimed = drift_variance(regression, state, claim.layout, claim.covariance)
+    excess = selected.score.drift**2 - noise - claimed
+    near = [trial.posterior.state for trial in selected.trials if trial.is_near]
+    drifts = [within_positions(regression.force(other), position) for other in (state, *near)]
+    model_error = 0.5 * np.max((np.array(drifts) - drifts[0]) ** 2, axis=0)
+    static, dynamic = (
+        _points(windows.temperature, excess, model_error, rows & np.isfinite(excess[:, 0]))
+        for rows in (~windows.is_dynamic, windows.is_dynamic)
+    )
+    return static, dynamic
+
+
+def drift_variance(
+    regression: Regression, state: State, layout: Layout, covariance: Floats
+) -> Floats:
+    """Return the variance of the drift of each window due to `covariance`, shape (n, 3)."""
+    position = regression.windows.position
+    columns = within_positions(regression.columns, position)
+    by_weights = layout.by_weights(columns, regression.along(state)[position])
+    variances = [
+        np.sum((along @ covariance[np.ix_(at, at)]) * along, axis=1) for along, at in by_weights
+    ]
+    return np.column_stack(variances)
+
+
+def _points(
+    temperature: Floats, excess: Floats, model_error: Floats, rows: Bools
+) -> tuple[LackOfFit, ...]:
+    """Average the excess of squared drifts in up to 5 temperature bins of 10 windows or more."""
+    n_bins = min(5, int(rows.sum()) // 10)
+    if not n_bins:
+        return ()
+    points: list[LackOfFit] = []
+    order = np.argsort(temperature, kind='stable')
+    for part in np.array_split(order[rows[order]], n_bins):
+        mean = excess[part].mean(axis=0)
+        # Errors of neighbouring windows are correlated: ten windows count as one observation. An
+        # excess below two standard errors is set to 0.
+        error = excess[part].std(axis=0) / np.sqrt(max(len(part) / 10.0, 1.0))
+        mean = np.where(mean > 2.0 * error, mean, 0.0)
+        x, y, z = np.sqrt(mean + model_error[part].mean(axis=0)).tolist()
+        celsius = float(temperature[part].mean())
+        if not points or celsius > points[-1].temperature_c:
+            points.append(LackOfFit(celsius, (x, y, z)))
+    return tuple(points) if any(any(point.sd_m_s2) for point in points) else ()

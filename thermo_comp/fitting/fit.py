@@ -27,7 +27,7 @@ from .alternatives import model_of, regressed, windows_of
 from .assembly import build_calibration
 from .claim import claim_of
 from .coverage import LeastKnown, least_known, rough_centre
-from .data_checks import Finding, enforce
+from .data_checks import Finding, advice, enforce
 from .environments import contradicting_bag, contradiction, is_better_without, with_excluded_error
 from .evidence import PositionReport, ResidualRow, position_reports, residual_rows
 from .gyroscope import RateRow, add_gyroscope
@@ -128,11 +128,8 @@ def _fit_without_code_offset(
         return _fit_one_environment(bags, options, progress)
     codes = ' '.join(f'{code:g}' for code in offset)
     how = 'estimated; --offset can state it' if options.offset is None else 'by --offset'
-    finding = Finding(
-        'offset',
-        'advice',
-        f'zero force reads {codes} counts (x y z), {how}: the fit subtracts this offset',
-    )
+    text = f'zero force reads {codes} counts (x y z), {how}: the fit subtracts this offset'
+    finding = advice('offset', text)
     prior = options.prior and with_code_offset(options.prior, -offset)
     centred_bags = [without_code_offset(bag, offset) for bag in bags]
     result = _fit_one_environment(centred_bags, replace(options, prior=prior), progress)
@@ -239,14 +236,21 @@ def _refined(
     """Repeat a fit if its bias at settled temperatures is uncertain, or if supports may tilt."""
     if options.prior is not None or options.model == 'golovach':
         return result
+
+    def tried(bags: Sequence[ReducedBag], **given: bool) -> FitResult | None:
+        try:
+            return _fit(bags, options, progress, **given)
+        except (FitError, np.linalg.LinAlgError):
+            return None
+
     if refit_checks.extrapolates(result.fit):
-        result = _tried(bags, options, progress, is_by_settled=True) or result
+        result = tried(bags, is_by_settled=True) or result
     if not refit_checks.may_have_slow_tilts(result.fit):
         return result
     pieces = [refit_checks.in_pieces(bag) for bag in bags]
     if sum(len(bag.intervals) for bag in pieces) == sum(len(bag.intervals) for bag in bags):
         return result
-    tilted = _tried(pieces, options, progress, has_pieces=True)
+    tilted = tried(pieces, has_pieces=True)
     if tilted is None or not refit_checks.is_better_with_tilts(result.fit, tilted.fit):
         return result
     return replace(
@@ -258,16 +262,6 @@ def _refined(
     )
 
 
-def _tried(
-    bags: Sequence[ReducedBag], options: FitOptions, progress: Progress, **given: bool
-) -> FitResult | None:
-    """Fit the bags with the assumptions `given` of `_fit`; return None if this fit is refused."""
-    try:
-        return _fit(bags, options, progress, **given)
-    except (FitError, np.linalg.LinAlgError):
-        return None
-
-
 def _fit(
     bags: Sequence[ReducedBag],
     options: FitOptions,
@@ -276,10 +270,7 @@ def _fit(
     is_by_settled: bool = False,
     has_pieces: bool = False,
 ) -> FitResult:
-    """
-    Fit a calibration to bags whose readings at zero force are near 0. `is_by_settled`: whether to
-    limit the bias error at settled temperatures; `has_pieces`: whether rests were divided.
-    """
+    """Fit a calibration to bags whose readings at zero force are near 0; flags: see `Problem`."""
     bags, findings = _judged(bags, options)
     windows = windows_of(bags, model_of(bags, options), options)
     if options.prior and windows.data.forces and options.prior.nonlinearity is None:
@@ -319,7 +310,7 @@ def _fit(
             calibration, rates = add_gyroscope(calibration, fit.windows, bags, options)
         elif fit.windows.angular_rate.shape[1]:
             text = 'the stated |f| differs between rests: no bias of the gyroscope was fitted'
-            findings.append(Finding('rate', 'advice', text))
+            findings.append(advice('rate', text))
     except ValueError as error:
         raise _unusable(error, fit.posterior.state.up) from error
     least = least_known(calibration, fit.posterior.state.up)

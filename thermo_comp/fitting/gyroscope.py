@@ -20,10 +20,9 @@ import numpy as np
 
 from ..unit.calibration import Calibration, gyroscope_of
 from ..unit.gravity import EARTH_RATE
-from ..unit.metrics import ResidualStatistics
+from ..unit.metrics import ResidualStatistics, statistics_by_regime
 from .assembly import build_calibration
 from .claim import claim_of
-from .evidence import tables_of
 from .hyperparameters import Candidates
 from .initial_triad import position_means, within_positions
 from .options import FitOptions
@@ -111,5 +110,6 @@ def _residual_rows(fit: Fit) -> tuple[RateRow, ...]:
         for rate in (windows.angular_rate, regression.force(fit.posterior.state))
     )
     residuals = raw, fitted, fit.selected.score.drift.ravel()
-    tables = tables_of(residuals, np.repeat(windows.is_dynamic, 3))
+    is_dynamic = np.repeat(windows.is_dynamic, 3)
+    tables = [statistics_by_regime(each, is_dynamic) for each in residuals]
     return tuple(RateRow(section, *(table[section] for table in tables)) for section in tables[0])

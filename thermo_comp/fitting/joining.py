@@ -1,29 +1,25 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the joining of bags that are successive parts of one recording, as split by a recorder.
+Owns the joining of bags that are successive parts of one recording, as split by a recorder, or
+recorded one after the other while the unit is turned to the next attitude.
 
-The unit stays switched on between the parts of a recording, so the parts have one turn-on, the
-lags do not restart, and a rest at the end of a part continues in the next part.
+Between the parts of a recording the unit may have stayed switched on, so the parts count as one
+turn-on: positions of one turn-on do not show how well the bias repeats from turn-on to turn-on.
+The lags do not restart, and a rest at the end of a part may continue in the next part.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 
 from ..recording.blocks import Block
 from .reduction import Readings, ReducedBag, StillInterval
 from .sources import FitSource
-
-#: Longest gap or overlap of two parts of one recording [s]; switching off and on takes longer.
-CONTINUED_S = 3.0
-#: Number of windows before the end of a part, and after it, whose steps are compared with the step
-#: between the two parts.
-_N_COMPARED = 20
 
 
 def joined(bags: Sequence[ReducedBag]) -> list[ReducedBag]:
@@ -44,13 +40,16 @@ def joined(bags: Sequence[ReducedBag]) -> list[ReducedBag]:
 def _continues(part: ReducedBag, bag: ReducedBag) -> bool:
     """Whether a bag, by its stamps, sample interval and serial, continues `part`."""
     gap_s = 1e-9 * (bag.start_ns - part.end_ns)
-    is_alike = _is_alike(part.cycle_s, bag.cycle_s)
+    is_alike = abs(bag.cycle_s - part.cycle_s) < 0.01 * part.cycle_s
     # A bag with known |f| is not joined, because times of |f| count from the start of the bag.
     is_at_1g = bag.source.force is None and part.source.force is None
     is_of_unit = bag.source.serial == part.source.serial
-    # The overlap is at most a tenth of a part: recordings whose stamps all begin at 0 exceed this.
-    overlap_s = min(CONTINUED_S, 1e-10 * (part.end_ns - part.start_ns))
-    is_next = -overlap_s < gap_s < max(CONTINUED_S, 2.0 * bag.cycle_s)
+    # The overlap is at most 3 s, and at most a tenth of a part: recordings whose stamps all begin
+    # at 0 exceed this. The gap is at most 60 s, the time to turn the unit by hand and to start the
+    # recorder again. If the unit is nevertheless switched off and on in the gap, the offsets of
+    # its turn-ons count as those of mountings.
+    overlap_s = min(3.0, 1e-10 * (part.end_ns - part.start_ns))
+    is_next = -overlap_s < gap_s < max(60.0, 2.0 * bag.cycle_s)
     return bool(is_next and is_alike and is_at_1g and is_of_unit)
 
 
@@ -59,11 +58,6 @@ def _step(part: ReducedBag, bag: ReducedBag) -> float:
     if not (part.intervals and bag.intervals):
         return 0.0
     return float(np.linalg.norm(bag.intervals[0].mean[0] - part.intervals[-1].mean[-1]))
-
-
-def _is_alike(before_s: float, after_s: float) -> bool:
-    """Whether two sample intervals, or two lengths of windows, differ by less than 1 %."""
-    return abs(after_s - before_s) < 0.01 * before_s
 
 
 def _one_recording(parts: Sequence[ReducedBag]) -> ReducedBag:
@@ -75,9 +69,6 @@ def _one_recording(parts: Sequence[ReducedBag]) -> ReducedBag:
         for source in sources:
             yield from source.blocks()
 
-    def total(name: str) -> int:
-        return sum(getattr(part, name) for part in parts)
-
     source = FitSource(
         f'{sources[0].name} .. {sources[-1].name}',
         blocks,
@@ -85,6 +76,8 @@ def _one_recording(parts: Sequence[ReducedBag]) -> ReducedBag:
         reader=sources[-1].reader,
     )
     rates = {part.angular_rate for part in parts}
+    names = {field.name for field in fields(first) if field.name.startswith('n_')}
+    totals = {name: sum(getattr(part, name) for part in parts) for name in names - {'n_spikes'}}
     torn = [f'{part.info.path}: {part.info.truncated}' for part in parts if part.info.truncated]
     return replace(
         first,
@@ -96,13 +89,6 @@ def _one_recording(parts: Sequence[ReducedBag]) -> ReducedBag:
             name: _readings([part.readings(name) for part in parts])
             for name in dict.fromkeys(name for part in parts for name in part.temperatures)
         },
-        n_samples=total('n_samples'),
-        n_dropped=total('n_dropped'),
-        n_saturated=total('n_saturated'),
-        n_cells=total('n_cells'),
-        n_still_cells=total('n_still_cells'),
-        n_glitches=total('n_glitches'),
-        n_repeated=total('n_repeated'),
         n_spikes=sum((Counter(part.n_spikes) for part in parts), Counter()),
         is_integer=all(part.is_integer for part in parts),
         middle=max(part.middle for part in parts),
@@ -110,6 +96,7 @@ def _one_recording(parts: Sequence[ReducedBag]) -> ReducedBag:
         max_abs=max(part.max_abs for part in parts),
         angular_rate=rates.pop() if len(rates) == 1 else 'part',
         info=replace(first.info, end_ns=last.info.end_ns, truncated='; '.join(torn) or None),
+        **totals,
     )
 
 
@@ -127,7 +114,7 @@ def _intervals(parts: Sequence[ReducedBag]) -> tuple[StillInterval, ...]:
     result: list[StillInterval] = []
     for part in parts:
         shift_s = 1e-9 * (part.start_ns - parts[0].start_ns)
-        is_alike = _is_alike(parts[0].window_s, part.window_s)
+        is_alike = abs(part.window_s - parts[0].window_s) < 0.01 * parts[0].window_s
         for number, rest in enumerate(part.intervals):
             # Windows of another length than in the first part, as in a short part, are not whole.
             n_whole = rest.n_whole if is_alike else 0
@@ -143,13 +130,14 @@ def _intervals(parts: Sequence[ReducedBag]) -> tuple[StillInterval, ...]:
 def _is_one_rest(before: StillInterval, after: StillInterval, window_s: float) -> bool:
     """
     Whether a rest continues in the next part: the gap is at most three windows long, and on each
-    axis the step between the parts is at most five times the RMS step from window to window, or at
-    most twice the largest step from window to window (most steps may be 0 by rounding).
+    axis the step between the parts is at most five times the RMS step between windows, or at most
+    twice the largest such step (most steps may be 0 by rounding), in the 20 windows before the end
+    of a part and after it; at least 10 steps must be known.
     """
     gap_s = 1e-9 * (after.start_ns - before.end_ns)
-    means = before.mean[: before.n_whole][-_N_COMPARED:], after.mean[:_N_COMPARED]
+    means = before.mean[: before.n_whole][-20:], after.mean[:20]
     steps = np.concatenate([np.diff(mean, axis=0) for mean in means])
-    if gap_s > 3.0 * window_s or not before.n_whole or len(steps) < _N_COMPARED // 2:
+    if gap_s > 3.0 * window_s or not before.n_whole or len(steps) < 10:
         return False
     usual = np.maximum(5.0 * np.sqrt(np.mean(steps**2, axis=0)), 2.0 * np.abs(steps).max(axis=0))
     return bool(np.all(np.abs(means[1][0] - means[0][-1]) <= usual))

@@ -20,8 +20,7 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class Layout:
     """
-    Indices of the unknowns in the vector of parameters; the unknowns of the unit come first. The
-    names are those of `State`.
+    Indices of the unknowns (named as in `State`) in the vector of parameters, the unit's first.
 
     axis: scale ratio kappa, bias, active weights and nonlinear coefficients of each axis, (3, k)
     weights, nonlinear: indices of the weights, shape (2, 3, m), and of the nonlinear coefficients,
@@ -75,9 +74,8 @@ class Layout:
     @cached_property
     def columns(self) -> Ints:
         """
-        Indices of the columns of a position's equations in the order of `Tangent`, for each axis,
-        shape (3, k). A position's equations have columns for the unknowns of the position, of its
-        bag and of the unit, and for the residual.
+        Indices of the columns of a position's equations (for unknowns of the position, its bag and
+        the unit, and for the residual) in the order of `Tangent`, for each axis, shape (3, k).
         """
         n_own, r = self.own.shape[1], self.start.shape[1]
         starts = np.tile(n_own + np.arange(r), (3, 1))
@@ -126,14 +124,13 @@ class Layout:
 
 def lay_out(
     used: Bools,
+    active: Bools,
     bag_of_position: Ints,
+    pose_of: Ints | None,
     n_tilts: int,
     n_starts: int,
-    active: Bools,
-    forces: Forces | None = None,
-    *,
-    pose_of: Ints | None = None,
-    has_turn_ons: bool = False,
+    has_turn_ons: bool,
+    forces: Forces | None,
 ) -> Layout:
     """
     Assign an index to every unknown, given the active columns of bias and scale, shape (2, m), and

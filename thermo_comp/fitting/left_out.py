@@ -36,7 +36,6 @@ from .elimination import inverse_root
 from .initial_triad import thermometer_error_of, white_noise_of
 from .regression import Point, PosteriorMode, Regression
 from .settled_bias import settled_error
-from .unknowns import State
 
 # Smallest number of windows of a position for a score of the position's drift.
 _FEWEST_WINDOWS = 8
@@ -93,8 +92,7 @@ class Folds:
         before, after = ((folds.square * folds.windows)[known] + 1e-300 for folds in (self, other))
         of_sums = float(np.log(before.sum() / after.sum()))
         if n == 1:
-            # The standard error of a single fold is unknown, and set to the smallest log ratio
-            # that is not negligible.
+            # The standard error of a single fold is unknown: the least log ratio that matters.
             return of_sums, _NEGLIGIBLE_LOG_RATIO
         each = np.log(before / after)
         others = (np.maximum(square.sum() - square, 1e-300) for square in (before, after))
@@ -126,8 +124,7 @@ class Score:
     halves: drift of left-out halves of the test, at temperatures that occur in the other half
     noise: white noise of a window, RMS of the axes [m/s^2]
     by_thermometer: error of a window due to a coarse board thermometer, RMS of the axes [m/s^2]
-    settled: expected error of the bias at settled temperatures [m/s^2], see `settled_bias`; 0 in a
-        fit that does not limit this error
+    settled: expected error of the bias at settled temperatures [m/s^2] (`settled_bias`), or 0
     """
 
     positions: Folds
@@ -148,8 +145,7 @@ class Score:
     @property
     def rms(self) -> float:
         """RMS of the left-out drift, the larger of the RMS over positions and over sections."""
-        known = [folds.rms for folds in (self.positions, self.sections) if np.isfinite(folds.rms)]
-        return max(known, default=float('nan'))
+        return float(np.fmax(self.positions.rms, self.sections.rms))
 
     @property
     def exceeds_noise(self) -> bool:
@@ -182,12 +178,11 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     left-out norms, if that exceeds two standard errors. `by_halves`: whether an increased error of
     left-out halves of the chamber program, a sign of too many columns, excludes a gain. Increased
     errors of left-out norms exclude a gain, and so does an increased expected error of the settled
-    bias, unless noise explains the drift. A drift that noise explains need not decrease.
+    bias, unless noise explains the drift. A drift that noise explains need not decrease: left-out
+    bags of soaks contain no effects of ramps.
     """
     *drifts, norms = _beyond_thermometer(before, after)
     drift = [gain for gain in drifts if gain]
-    # The drift of left-out positions or sections need not decrease if white noise explains it:
-    # left-out bags of soaks contain no effects of ramps.
     must_gain = [
         gain
         for gain, first, second in zip(drifts, before.kinds, after.kinds, strict=False)
@@ -203,10 +198,9 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     is_sure = bool(must_gain) and all(gain > error for gain, error in must_gain)
     if is_sure and total > _NEGLIGIBLE_LOG_RATIO * len(drift):
         return total
-    is_sure = norms is not None and norms[0] > max(2.0 * norms[1], _NEGLIGIBLE_LOG_RATIO)
-    if is_sure and norms and all(abs(gain) < _NEGLIGIBLE_LOG_RATIO for gain, _ in drift):
-        return norms[0]
-    return 0.0
+    if norms is None or not all(abs(gain) < _NEGLIGIBLE_LOG_RATIO for gain, _ in drift):
+        return 0.0
+    return norms[0] if norms[0] > max(2.0 * norms[1], _NEGLIGIBLE_LOG_RATIO) else 0.0
 
 
 def is_worse_by_norms(before: Score, after: Score) -> bool:
@@ -273,59 +267,38 @@ def _by_positions(
 ) -> tuple[Folds, Folds, Floats, Floats]:
     """Leave out each mounting; return folds of drift and norm, corrected force, and drift."""
     windows, share = regression.windows, regression.weight / regression.windows.weight
-    point = regression.at(posterior.state, posterior.prior)
-    edges = windows.edges
+    point, edges = regression.at(posterior.state, posterior.prior), windows.edges
     counts = np.diff(edges).astype(np.float64)
     force = np.full((len(windows.time), 3), np.nan)
     sizes = regression.norms(point.state)
     drift = np.full_like(force, np.nan)
     squares, norms = np.full((2, windows.n_positions), np.nan)
     for places, matrix in point.without_each():
-        state, root = _refitted(point, matrix)
+        step, factor = point.unit_step(matrix)
+        state = point.with_step(np.pad(step, (0, point.layout.n - len(step)))).state
+        root = inverse_root(factor)
         for p in places.tolist():
             rows = slice(edges[p], edges[p + 1])
             corrected, weight = regression.force(state, rows), share[rows]
             is_known = _is_drift_determined(point, posterior, root, rows)
             if counts[p] >= _FEWEST_WINDOWS and is_known:
-                drift[rows] = corrected - _mean(corrected, weight)
-                squares[p] = _mean(np.mean(drift[rows] ** 2, axis=1), weight)
+                drift[rows] = corrected - np.average(corrected, axis=0, weights=weight)
+                squares[p] = np.average(np.mean(drift[rows] ** 2, axis=1), weights=weight)
             if _is_norm_determined(point, posterior, root, p):
                 force[rows] = corrected
                 error = np.linalg.norm(corrected, axis=1) - sizes[p]
-                norms[p] = _mean(error**2, weight)
+                norms[p] = np.average(error**2, weights=weight)
     of_drift, of_norm = (Folds.of(square, counts, windows.mounting) for square in (squares, norms))
     return of_drift, of_norm, force, drift
-
-
-def _mean(values: Floats, weights: Floats) -> Floats:
-    """Average windows as `np.average` does, but without its checks, which are slow."""
-    share = weights.reshape(-1, *[1] * (values.ndim - 1))
-    return np.asarray(np.sum(values * share, axis=0) / np.sum(share, axis=0))
-
-
-def _refitted(point: Point, matrix: Floats) -> tuple[State, Floats]:
-    """
-    Return the state after a Gauss-Newton step of the unit's unknowns with the normal equations
-    `matrix` instead of those of `point`, and `PosteriorMode.root`, the root of the covariance.
-    """
-    step, factor = point.unit_step(matrix)
-    step = np.pad(step, (0, point.layout.n - point.layout.n_unit))
-    return point.with_step(step).state, inverse_root(factor)
-
-
-def _is_determined(by_others: float, by_all: float) -> bool:
-    """
-    Whether `by_others`, the variance of a position's norm or drift by a fit without this position,
-    is below ten times `by_all`, the sum of this variance by a fit of all positions and of the
-    variance of mounting offset or noise.
-    """
-    return by_others < 10.0 * by_all
 
 
 def _is_drift_determined(
     point: Point, posterior: PosteriorMode, root: Floats, rows: slice
 ) -> bool:
-    """Whether a fit of covariance ``root @ root.T`` determines the left-out drift in `rows`."""
+    """
+    Whether the variance of the left-out drift in `rows`, by a fit of covariance ``root @ root.T``,
+    is below ten times the sum of this variance by a fit of all positions and of the noise.
+    """
     regression, sigma = point.regression, point.prior.sigma
     if not point.layout.used[0].any():
         return True
@@ -333,19 +306,19 @@ def _is_drift_determined(
     some = regression.columns[rows][:: max((rows.stop - rows.start) // 50, 1)]
     some = some - some.mean(axis=0)
     p = regression.windows.position[rows.start]
-    force = regression.effects(point.state).force[p]
+    force = regression.along(point.state)[p]
     by_others = by_all = 0.0
     for along, at in point.layout.by_weights(some, force):
         by_others += float(np.sum((along @ root[at]) ** 2))
         by_all += float(np.sum((along @ posterior.root[at]) ** 2))
     noise = float(np.sum(sigma**2)) * len(some)
-    return _is_determined(by_others, by_all + noise)
+    return by_others < 10.0 * (by_all + noise)
 
 
 def _is_norm_determined(point: Point, posterior: PosteriorMode, root: Floats, p: int) -> bool:
     """
-    Whether a fit without position `p`, with the covariance ``root @ root.T`` of the unit,
-    determines the norm of `p`.
+    Whether the variance of the norm of position `p`, by a fit of covariance ``root @ root.T``, is
+    below ten times the sum of this variance by a fit of all positions and of the offsets.
     """
     if not point.regression.gravity:
         return False
@@ -353,7 +326,7 @@ def _is_norm_determined(point: Point, posterior: PosteriorMode, root: Floats, p:
     by_all = float(np.sum((along @ posterior.root) ** 2)) + point.prior.offset_sd**2
     if point.regression.has_turn_ons:
         by_all += point.prior.turn_on_sd**2
-    return _is_determined(float(np.sum((along @ root) ** 2)), by_all)
+    return float(np.sum((along @ root) ** 2)) < 10.0 * by_all
 
 
 def _by_sections(
@@ -368,8 +341,7 @@ def _by_sections(
     Score the drift of left-out sections, about the mean of those windows of the position that stay
     in the fit. Each fit without sections is `n_steps` Gauss-Newton steps from the fit of all data.
 
-    `folds`: each fold's sections, left out in all positions; `is_within`: score only windows at
-    temperatures that occur in the fit
+    `folds`: sections of each fold; `is_within`: score only temperatures that occur in the fit
     """
     windows, share = regression.windows, regression.weight / regression.windows.weight
     products = regression.products(posterior.layout.used)
@@ -388,11 +360,11 @@ def _by_sections(
             rows = np.arange(*windows.edges[p : p + 2])
             out, stayed = rows[judged[rows]], rows[~left_out[rows]]
             if len(out) and len(stayed) >= _FEWEST_WINDOWS:
-                level = _mean(force[stayed], share[stayed])
+                level = np.average(force[stayed], axis=0, weights=share[stayed])
                 drift[out] = force[out] - level
         known = judged & np.isfinite(drift[:, 0])
         if known.any():
             square = np.mean(drift[known] ** 2, axis=1)
-            squares[k] = _mean(square, share[known])
+            squares[k] = np.average(square, weights=share[known])
             counts[k] = known.sum()
     return Folds(squares, counts), drift

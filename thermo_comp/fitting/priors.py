@@ -106,52 +106,41 @@ def informative_priors(
             'the prior has no covariance: use a calibration that was fitted to bags; an imported '
             'calibration cannot be a prior'
         )
-    K = constants_of(calibration).scale
-    covariance = calibration.posterior.covariance()
-    places = parameter_layout(calibration)
-
-    def grown(bias_sd: float, scale_sd: float) -> Floats:
-        result: Floats = covariance.copy()
-        for axis in range(3):
-            blocks = (places.bias[axis], bias_sd * K[axis]), (places.scale[axis], scale_sd)
-            for block, sd in blocks:
-                levels = [block.static, block.dynamic]
-                result[np.ix_(levels, levels)] += sd * sd
-        return result
-
-    stated = options.ageing_bias, options.ageing_scale
-    # Stated ageing, with uncorrelated variances added: 0 to 1 times the variances of the prior.
-    tried = [(grown(*stated), share, 0.0) for share in (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)]
-    if not any(stated):
-        # Ageing to try: sd of the biases [g] and of the scale factors. Both sds are equal, as
-        # data sheets state similar numbers for both, and few rests do not separate bias and scale.
-        tried += [
-            (grown(ageing * options.gravity, ageing), 0.0, ageing)
-            for ageing in (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)
-        ]
+    # The priors to try: stated ageing, or ageing, the sd of the biases [g] and of the scale
+    # factors; and `share`, the ratio of uncorrelated variances to add to those of the prior.
+    tried = [(0.0, share) for share in (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)]
+    # The fit begins with the last, widest prior: in a first fit with a narrow prior, the noise
+    # would absorb changes of the unit.
+    if options.ageing_bias or options.ageing_scale:
+        tried.append(tried[-1])
+    else:
+        # The sds of bias and scale are equal, as data sheets state similar numbers for both, and
+        # few rests do not separate bias and scale.
+        tried += [(ageing, 0.0) for ageing in (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)]
         # Priors for a unit whose effects of temperature have changed, too: `share` multiplies the
         # sd of the prior by 1.4, 30 and 1000, because the sd of an effect of temperature may be a
         # thousandth of the effect. The sd is at most the effect itself: a few rests would
         # otherwise leave the effects at other temperatures unknown.
-        tried += [
-            (grown(ageing * options.gravity, ageing), share, ageing)
-            for share in (1.0, 1e3, 1e6)
-            for ageing in (3e-5, 3e-4, 3e-3)
-        ]
-    # The fit begins with the last, widest prior: in a first fit with a narrow prior, the noise
-    # would absorb changes of the unit.
-    if any(stated):
-        tried.append((tried[-1][0], 1.0, 0.0))
+        tried += [(ageing, share) for share in (1.0, 1e3, 1e6) for ageing in (3e-5, 3e-4, 3e-3)]
+    K, places = constants_of(calibration).scale, parameter_layout(calibration)
     layout = regression.layout(regression.windows.parts)
     kinds = regression.forces.kinds if regression.forces else ()
     used = range(len(calibration.response))
     to_file = file_jacobian(regression, layout, state, model, used, kinds)
     mean, sizes = as_vector(state, layout)[: layout.n_unit], _sizes(calibration)
-    for wide, share, ageing in tried:
+    for ageing, share in tried:
+        covariance = calibration.posterior.covariance()
+        bias_sd = ageing * options.gravity or options.ageing_bias
+        scale_sd = ageing or options.ageing_scale
+        for axis in range(3):
+            blocks = (places.bias[axis], bias_sd * K[axis]), (places.scale[axis], scale_sd)
+            for block, sd in blocks:
+                levels = [block.static, block.dynamic]
+                covariance[np.ix_(levels, levels)] += sd * sd
         density = float(log_student(np.array(ageing * options.gravity / usual_ageing)))
         # Changed effects of temperature are rare: the rests must show them clearly.
         density -= CLEAR_GAIN * (share >= 1.0)
-        root = _root(wide, share, sizes, to_file)
+        root = _root(covariance, share, sizes, to_file)
         yield InformativePrior(mean, root, density, is_changed=share > 1.0)
 
 

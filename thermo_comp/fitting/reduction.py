@@ -86,6 +86,8 @@ class ReducedBag:
     cycle_s: typical interval between samples [s]
     is_integer: whether all samples are integers
     middle: code at zero force if the samples are unsigned codes, else 0
+    step: smallest difference that the samples of the coarsest axis can have; 0 if none is seen
+        [input units]
     max_abs: largest magnitude of a sample, without the largest 1 % of the cells [input units]
     since_s: time from the bag's first sample to the part of the bag that was read [s]
     restless: reason why the bag cannot be used, such as no rests; '' if the bag can be used
@@ -110,6 +112,7 @@ class ReducedBag:
     cycle_s: float
     is_integer: bool
     middle: float = 0.0
+    step: float = 0.0
     max_abs: float = 0.0
     info: RecordingInfo = field(default_factory=lambda: RecordingInfo(Path(), '', {}, 0, 0))
     since_s: float = 0.0
@@ -272,6 +275,7 @@ def _reduced(
         cycle_s=_cycle_s(cells),
         is_integer=cells.is_integer,
         middle=cells.middle,
+        step=float(cells.quantum.max()),
         max_abs=_max_abs(cells),
         restless=restless,
         angular_rate='whole' if has_rate else 'part' if cells.rate.any() else 'none',

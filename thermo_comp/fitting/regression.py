@@ -24,7 +24,7 @@ from scipy.linalg import solve_triangular
 
 from ..typing import Bools, Floats, Ints
 from .elimination import Reduced, eliminate, factored_with_prior, inverse_root, solved
-from .equations import Equations, last_result_kept, with_step, without_inactive
+from .equations import Equations, with_step, without_inactive
 from .gains import Inactive
 from .layout import Layout
 from .tangent import Normal, Tangent
@@ -89,7 +89,7 @@ class Point:
         """The normal equations of the linearised measurement equations."""
         return self.regression.linearised(self.state, self.layout, self.grams)[1]
 
-    @property
+    @cached_property
     def precision(self) -> Floats:
         """Inverse prior variances of all unknowns, see `Equations.precision`, shape (n,)."""
         return self.regression.precision(self.prior, self.layout)
@@ -105,39 +105,27 @@ class Point:
         return self.normal.square
 
     @cached_property
-    def misfit(self) -> float:
-        """-2 times the log density of the data given the state, up to a constant."""
+    def energy(self) -> float:
+        """-2 times the log posterior density, without the normalisation of the prior."""
         n, sigma = len(self.regression.weight), self.prior.sigma
         each = self.square / sigma**2 + 2.0 * n * np.log(sigma)
-        return float((each + self.regression.noise_determinant).sum())
-
-    @cached_property
-    def prior_misfit(self) -> float:
-        """-2 times the log prior density of the state, without the prior's normalisation."""
-        size = float(self.precision @ self.deviation**2)
+        of_data = float((each + self.regression.noise_determinant).sum())
+        of_prior = float(self.precision @ self.deviation**2)
         if self.prior.informative is not None:
             # `precision` is 0 for unknowns with an informative prior, so add their term.
             root = self.prior.informative.root
-            size += float(np.sum((root @ self.deviation[: self.layout.n_unit]) ** 2))
-        if self._has_common_start:
-            size += float(np.sum(self.state.start.sum(axis=0) ** 2)) / self._common_variance
-        return size
-
-    @property
-    def energy(self) -> float:
-        """-2 times the log posterior density of the state, up to a constant."""
-        return self.misfit + self.prior_misfit
-
-    @property
-    def _has_common_start(self) -> bool:
-        return self.regression.n_bags > 1 and bool(self.layout.start.size)
+            of_prior += float(np.sum((root @ self.deviation[: self.layout.n_unit]) ** 2))
+        if self._common_variance:
+            of_prior += float(np.sum(self.state.start.sum(axis=0) ** 2)) / self._common_variance
+        return of_data + of_prior
 
     @property
     def _common_variance(self) -> float:
-        """Prior variance of the sum, over the bags, of an initial lag state."""
+        """Prior variance of the sum, over the bags, of an initial lag state; 0 if not used."""
         # The prior sd of the mean of a lag state over the bags is 0.1 times its sd in one bag: a
         # mean that differs from 0 is an effect of the unit.
-        return (0.1 * self.regression.n_bags) ** 2 * self.prior.start_variance_ratio
+        is_used = self.regression.n_bags > 1 and bool(self.layout.start.size)
+        return is_used * (0.1 * self.regression.n_bags) ** 2 * self.prior.start_variance_ratio
 
     @cached_property
     def reduced(self) -> Reduced:
@@ -165,10 +153,9 @@ class Point:
     def _reduced(self, normal: Normal, deviation: Floats) -> Reduced:
         in_sigmas = normal.scaled(self.prior.sigma**-2.0)
         reduced = eliminate(in_sigmas, self.layout, self.precision, deviation)
-        if self._has_common_start:
-            total = self.state.start.sum(axis=0)
-            reduced = reduced.with_prior_of_sum(total, self._common_variance)
-        return reduced
+        if not self._common_variance:
+            return reduced
+        return reduced.with_prior_of_sum(self.state.start.sum(axis=0), self._common_variance)
 
     def without_each(self) -> Iterator[tuple[Ints, Floats]]:
         """
@@ -190,14 +177,11 @@ class Point:
         """
         deviation = self.deviation.copy()
         deviation[self.layout.offset[:, axis]] -= 1.0
-        step, _ = self.unit_step(self._reduced(self.normal, deviation).full_matrix)
+        step, _ = self.unit_step(self._reduced(self.normal, deviation).matrix)
         return step - self.solution[0][: self.layout.n_unit]
 
     def unit_step(self, matrix: Floats) -> tuple[Floats, Floats]:
-        """
-        Return the step of the unit's unknowns, and the Cholesky factor of their Hessian, given
-        their normal equations, see `Reduced.matrix`.
-        """
+        """Return the unit's step and its Hessian's Cholesky factor, given `Reduced.matrix`."""
         n = self.layout.n_unit
         information, gradient, deviation = matrix[:n, :n], matrix[:n, n], self.deviation[:n]
         if not np.isfinite(information).all():
@@ -220,7 +204,7 @@ class Point:
         return self._solution(self.reduced)
 
     def _solution(self, reduced: Reduced) -> tuple[Floats, Floats]:
-        unit, factor = self.unit_step(reduced.full_matrix)
+        unit, factor = self.unit_step(reduced.matrix)
         step = np.empty(self.layout.n)
         step[: self.layout.n_unit] = unit
         step[self.layout.own], step[self.layout.of_bag] = reduced.follow(unit)
@@ -228,8 +212,16 @@ class Point:
 
     def linear_step(self) -> Floats:
         """Return the step in which damping keeps the nonlinear unknowns almost constant."""
-        reduced = self._reduced(_damped(self.normal, self.layout), self.deviation)
-        return self._solution(reduced)[0]
+        layout, local, unit = self.layout, self.normal.local.copy(), self.normal.unit.copy()
+        # A diagonal multiplied by 1e6 divides the step of these unknowns by about 1e6. With an
+        # informative prior, which correlates the unknowns, a factor far above 1e6 would cause
+        # errors of double precision.
+        at = [*range(2 + layout.stretch.shape[1]), *range(layout.of_axis.shape[1], layout.n_local)]
+        local[..., at, at] *= 1e6
+        end = unit.shape[-1] - 1
+        at = [0, *range(end - len(layout.shared), end)]
+        unit[..., at, at] *= 1e6
+        return self._solution(self._reduced(Normal(local, unit), self.deviation))[0]
 
     def with_step(self, step: Floats) -> Point:
         """Return the point at the state plus a step."""
@@ -278,7 +270,7 @@ class Point:
         if reduced.common is not None:
             of_prior += layout.start.shape[1] * float(np.log(prior.start_variance_ratio))
         log_hessian = 2.0 * float(np.log(np.diag(factor)).sum()) + reduced.log_determinant
-        evidence = -0.5 * (end.misfit + end.prior_misfit + log_hessian - of_prior)
+        evidence = -0.5 * (end.energy + log_hessian - of_prior)
         return PosteriorMode(
             *(prior, end.state, layout, determined, unit_root, variance, end.square, evidence)
         )
@@ -287,21 +279,24 @@ class Point:
 class Regression(Equations):
     """Gauss-Newton on the measurement equations; see `Equations` for the parameters."""
 
+    #: The arguments and results of the last call of `linearised`.
+    _linearised: tuple[State, Layout, Floats, Tangent, Normal] | None = None
+
     def at(self, state: State, prior: Prior, grams: Floats | None = None) -> Point:
         """Return the equations at a state without inactive weights, by default of all windows."""
         layout = self.layout(prior.column_sd > 0.0, prior.nonlinear_sd > 0.0)
         grams = self.products(layout.used).of_positions if grams is None else grams
         return Point(self, without_inactive(state, layout), prior, layout, grams)
 
-    @last_result_kept
     def linearised(self, state: State, layout: Layout, grams: Floats) -> tuple[Tangent, Normal]:
-        """
-        Return the equations linearised about a state, and the normal equations of the windows
-        whose sums of products are `grams`, see `Point`.
-        """
-        base = self.products(layout.used).base
-        tangent = self.tangent(state, layout, base)
-        return tangent, tangent.normal(self.products_at(grams, state, base))
+        """Return the equations linearised about a state, and their normal equations (`Point`)."""
+        last = self._linearised
+        if last is None or last[0] is not state or last[1] is not layout or last[2] is not grams:
+            base = self.products(layout.used).base
+            tangent = self.tangent(state, layout, base)
+            normal = tangent.normal(self.products_at(grams, state, base))
+            last = self._linearised = state, layout, grams, tangent, normal
+        return last[3:]
 
     def solve(self, state: State, prior: Prior, n_steps: int = 6) -> PosteriorMode:
         """Return the posterior after at most `n_steps` steps from `state` to the mode."""
@@ -334,7 +329,7 @@ class Regression(Equations):
         columns, at = np.unique(column, return_inverse=True)
         of_columns, with_base = self.products_of(columns, base, state)
         # Derivatives of the reading w.r.t. a column's contribution to the bias, and to the scale.
-        acts = np.stack((np.ones_like(state.up), state.kappa * self.effects(state).force))
+        acts = np.stack((np.ones_like(state.up), state.kappa * self.along(state)))
         acts /= sigma
         rows = point.tangent.of(self.at_starts(with_base, state, base))[:, :, at]
         rows *= (acts[part] / sigma).transpose(1, 2, 0)[..., None]
@@ -343,25 +338,10 @@ class Regression(Equations):
         S = -reduction.reshape(len(part), 3, len(part), 3)
         for axis in range(3):
             S[:, axis, :, axis] += sums[axis, part[:, None], part, at[:, None], at]
-        step, factor = point.unit_step(point.reduced.full_matrix)
+        step, factor = point.unit_step(point.reduced.matrix)
         S = S.reshape(reduction.shape) - cross[:n].T @ solved(factor, cross[:n])
         Q = cross[n] - cross[:n].T @ step
         if self.windows.acts_on is not None:
             absent = ~self.windows.acts_on[column].ravel()
             S[absent], S[:, absent], Q[absent] = 0.0, 0.0, 0.0
         return Inactive(part, column, S, Q)
-
-
-def _damped(normal: Normal, layout: Layout) -> Normal:
-    """
-    Multiply the diagonal of the normal equations of the nonlinear unknowns by 1e6, which divides
-    the step of these unknowns by about 1e6. With an informative prior, which correlates the
-    unknowns, a factor far above 1e6 would cause errors of double precision.
-    """
-    local, unit = normal.local.copy(), normal.unit.copy()
-    at = [*range(2 + layout.stretch.shape[1]), *range(layout.of_axis.shape[1], layout.n_local)]
-    local[..., at, at] *= 1e6
-    end = unit.shape[-1] - 1
-    at = [0, *range(end - len(layout.shared), end)]
-    unit[..., at, at] *= 1e6
-    return Normal(local, unit)

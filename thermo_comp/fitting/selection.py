@@ -123,6 +123,8 @@ class Growth:
         names = dict.fromkeys(self._names[may].tolist())
         #: Groups of columns that may be added to a model.
         self.free = [group for group in names if group not in self.forced]
+        #: Models to report, see `Selected.trials`.
+        self.tried: list[Trial] = []
 
     def fit(self, groups: tuple[str, ...], state: State, prior: Prior, typical: Floats) -> Trial:
         """Fit the model of `groups`, also with columns that the fit of a smaller model dropped."""
@@ -145,28 +147,40 @@ class Growth:
         self, before: Trial, groups: tuple[str, ...] = (), most: Floats | None = None
     ) -> Trial:
         """
-        Fit the model `before` with further groups, beginning from the fit of `before`.
-
-        `most`: largest typical prior sd of the new columns, shape (2, m), see `_typical`, or None
-        to use the typical sd of `before` for the new columns
+        Fit the model `before` with further groups, beginning from the fit of `before`. `most`:
+        largest typical prior sd of the new columns, (2, m); None for the typical sd of `before`
         """
-        typical = before.typical if most is None else self._typical(before, groups, most)
-        posterior = before.posterior
+        regression, posterior, typical = self.regression, before.posterior, before.typical
+        if most is not None:
+            kelvins, state = regression.windows.kelvins, posterior.state
+            square = float(np.mean(regression.residual(state, posterior.layout) ** 2))
+            if state.pose.size:
+                # Attitudes and offsets of rests in a pose absorb errors of the model: add the mean
+                # squares of both to that of the residual.
+                by_attitude = regression.gravity * state.from_pose
+                square += float(np.mean(state.offset**2) + np.mean(by_attitude**2))
+            # The typical weight of a new column explains the RMS residual.
+            slope = np.sqrt(square) / (float(kelvins[0]) or 1.0)
+            units = np.array([[1.0], [1.0 / (regression.gravity or 1.0)]])
+            new = np.minimum(slope * units * kelvins, most)
+            typical = np.where(np.isin(self._names, groups), new, typical)
         return self.fit((*before.groups, *groups), posterior.state, posterior.prior, typical)
 
-    def added(self, chosen: Trial, progress: Callable[[float], None]) -> tuple[Trial, list[Trial]]:
-        """Add groups while left-out errors decrease; return the final model and all trials."""
-        trials: list[Trial] = []
+    def added(self, chosen: Trial, progress: Callable[[float], None]) -> Trial:
+        """Add groups while left-out errors decrease; return the final model."""
         part = 1.0
         while True:
             larger = self.trials(chosen, self.free)
-            trials += larger
+            self.tried += larger
             better = [trial for trial in larger if is_better(chosen.score, trial.score)]
             part *= 0.6
             progress(1.0 - part)
             if not better:
-                return chosen, trials
-            chosen = simplest_of_the_best(chosen, better)
+                return chosen
+            # The smallest model that is not significantly worse than that of the largest gain.
+            best = max(better, key=lambda trial: gain(chosen.score, trial.score))
+            better.sort(key=lambda trial: len(trial.groups))
+            chosen = next(t for t in better if t is best or not is_better(t.score, best.score))
 
     def with_bends(self, before: Trial, groups: Sequence[str]) -> list[Trial]:
         """Fit `before` with further groups, then also with columns of `BEND`; return all fits."""
@@ -175,19 +189,16 @@ class Growth:
         return [smooth, *self.trials(smooth, [BEND])]
 
     def lowest_degree(self, constants: Trial) -> Trial:
-        """
-        Fit the curve with its first column, and with more columns if they increase the log density
-        by more than `CLEAR_GAIN`: curves of high degree fit the norms of few positions exactly.
-        """
-        prior = constants.posterior.prior
+        """Fit the curve with its first column, and with more if the log density clearly rises."""
+        prior, state = constants.posterior.prior, constants.posterior.state
         prior = replace(prior, offset_sd=prior.offset_scale or prior.offset_sd)
-        typical, state = self._candidates.typical, constants.posterior.state
         number = np.cumsum(self._names == CURVE)
         groups = *constants.groups, CURVE
         chosen, *larger = (
-            self.fit(groups, state, prior, np.where(number <= degree, typical, 0.0))
+            self.fit(groups, state, prior, self._candidates.typical * (number <= degree))
             for degree in range(1, int(number[-1]) + 1)
         )
+        # Curves of high degree fit the norms of few positions exactly.
         for curve in larger:
             if log_density(curve.posterior) - log_density(chosen.posterior) > CLEAR_GAIN:
                 chosen = curve
@@ -222,25 +233,6 @@ class Growth:
             tried.append((SET,))
         return [self.extended(chosen, groups, typical) for groups in tried]
 
-    def _typical(self, chosen: Trial, groups: tuple[str, ...], most: Floats) -> Floats:
-        """
-        Return the typical prior sd of the columns of the chosen model and of further groups. The
-        sd of a new column is the weight that explains the RMS residual, at most `most`.
-        """
-        regression, posterior = self.regression, chosen.posterior
-        kelvins = regression.windows.kelvins
-        state = posterior.state
-        square = float(np.mean(regression.residual(state, posterior.layout) ** 2))
-        if state.pose.size:
-            # Attitudes and offsets of rests in a pose absorb errors of the model: add the mean
-            # squares of both to that of the residual.
-            by_attitude = regression.gravity * state.from_pose
-            square += float(np.mean(state.offset**2) + np.mean(by_attitude**2))
-        slope = np.sqrt(square) / (float(kelvins[0]) or 1.0)
-        units = np.array([[1.0], [1.0 / (regression.gravity or 1.0)]])
-        new = np.minimum(slope * units * kelvins, most)
-        return np.where(np.isin(self._names, groups), new, chosen.typical)
-
 
 def better_start(fits: Sequence[Trial]) -> Trial:
     """
@@ -254,15 +246,6 @@ def better_start(fits: Sequence[Trial]) -> Trial:
     is_worse = is_better(large.score, small.score) or is_worse_by_norms(small.score, large.score)
     is_likelier = evidence_gain > CLEAR_GAIN and not is_worse
     return large if is_likelier or is_better(small.score, large.score) else small
-
-
-def simplest_of_the_best(before: Trial, better: Sequence[Trial]) -> Trial:
-    """Return the smallest model that is not significantly worse than that of the largest gain."""
-    best = max(better, key=lambda trial: gain(before.score, trial.score))
-    for trial in sorted(better, key=lambda trial: len(trial.groups)):
-        if trial is best or not is_better(trial.score, best.score):
-            return trial
-    return best
 
 
 def select(
@@ -282,7 +265,7 @@ def select(
         priors.append(replace(prior, offset_sd=large, turn_on_sd=large))
     fits = [growth.fit(growth.forced, state, initial, candidates.typical) for initial in priors]
     constants = first = better_start(fits)
-    trials = [constants]
+    growth.tried.append(constants)
     if CURVE in growth.free:
         # The curve is added without a test: it may improve the score only with further groups.
         if regression.windows.has_drifts:
@@ -291,38 +274,43 @@ def select(
             first = growth.extended(curve)
         else:
             first = growth.lowest_degree(constants)
-        trials.append(first)
+        growth.tried.append(first)
     parts = None
     if PART in growth.free:
         # Curves over the temperatures of parts replace the curve over the board temperature.
         parts = better_start([growth.extended(fit, (PART,)) for fit in fits])
-    chosen, tried = _grown(growth, first, parts, progress)
-    trials += tried
+    chosen = _grown(growth, first, parts, progress)
     if chosen is not constants and not is_better(constants.score, chosen.score):
         more_evidence = log_density(chosen.posterior) - log_density(constants.posterior)
         if not is_undecided(constants.score, chosen.score) or more_evidence < CLEAR_GAIN:
             chosen = constants
     candidates = replace(candidates, typical=chosen.typical)
     posterior, score = finish(regression, chosen, candidates)
-    return Selected(posterior, score, _marked(trials, chosen, score))
+    trials = tuple(
+        replace(trial, score=score, is_chosen=True)
+        if trial.groups == chosen.groups
+        else replace(trial, is_near=is_near(chosen.score, trial.score))
+        for trial in growth.tried
+    )
+    return Selected(posterior, score, trials)
 
 
 def _grown(
     growth: Growth, first: Trial, parts: Trial | None, progress: Callable[[float], None]
-) -> tuple[Trial, list[Trial]]:
-    """Add groups to `first` or, if better, to `parts`; return the best model and all trials."""
-    chosen, trials = first, []
+) -> Trial:
+    """Add groups to `first` or, if better, to `parts`; return the best model."""
+    chosen = first
     if parts is not None:
         trials = [parts, *growth.trials(parts, [BEND])]
         if 'gradient' in growth.free and not _best(chosen, trials).is_complete:
             trials.append(growth.extended(parts, ('gradient',)))
+        growth.tried += trials
         chosen = _best(chosen, trials)
     if growth.regression.windows.acts_on is not None and not chosen.is_complete:
-        tried = growth.with_bends(first, ('board', *PRODUCTS))
-        trials += tried
-        chosen = _best(chosen, tried)
-    chosen, tried = growth.added(chosen, progress)
-    trials += tried
+        trials = growth.with_bends(first, ('board', *PRODUCTS))
+        growth.tried += trials
+        chosen = _best(chosen, trials)
+    chosen = growth.added(chosen, progress)
     may_bend = BEND in growth.free and {*PRODUCTS} & {*chosen.groups}
     if may_bend and BEND not in chosen.groups and not chosen.is_complete:
         # A bend of the curve of a part is found only in a model with the lag of this part, not in
@@ -330,22 +318,9 @@ def _grown(
         # model with bends if its left-out error is below three times that of the chosen model.
         _, *with_bends = growth.with_bends(first, LAGS)
         if with_bends and with_bends[0].score.rms < 3.0 * chosen.score.rms:
-            last, tried = growth.added(with_bends[0], progress)
-            trials += [*with_bends, *tried]
-            if is_better(chosen.score, last.score):
-                chosen = last
-    return chosen, trials
-
-
-def _marked(trials: Sequence[Trial], chosen: Trial, score: Score) -> tuple[Trial, ...]:
-    """Mark the chosen model, and those at most one standard error worse than this model."""
-    marked = []
-    for trial in trials:
-        is_chosen = trial.groups == chosen.groups
-        near = not is_chosen and is_near(chosen.score, trial.score)
-        kept = replace(trial, score=score) if is_chosen else trial
-        marked.append(replace(kept, is_chosen=is_chosen, is_near=near))
-    return tuple(marked)
+            growth.tried += with_bends
+            chosen = _best(chosen, [growth.added(with_bends[0], progress)])
+    return chosen
 
 
 def fit_all(
@@ -364,12 +339,8 @@ def fit_all(
     downweigh(regression, posterior)
     posterior = settle(regression, posterior.state, posterior.prior, candidates)
     if informative:
-        fits = [
-            regression.solve(
-                posterior.state, replace(posterior.prior, informative=candidate), n_steps=3
-            )
-            for candidate in informative
-        ]
+        priors = [replace(posterior.prior, informative=candidate) for candidate in informative]
+        fits = [regression.solve(posterior.state, each, n_steps=3) for each in priors]
         best = max(fits, key=log_density)
         prior = replace(best.prior, offset_scale=scale)
         posterior = settle(regression, best.state, prior, candidates)
@@ -393,36 +364,22 @@ def finish(
     downweigh(regression, chosen.posterior)
     posterior = settle(regression, chosen.posterior.state, chosen.posterior.prior, candidates)
     posterior = pruned_fit(regression, posterior, candidates)
-    white = replace(chosen, posterior=posterior, score=score_of(regression, posterior))
-    white = better_start([white, *_with_large_offsets(regression, white, candidates)])
+    score, prior = score_of(regression, posterior), posterior.prior
+    white = replace(chosen, posterior=posterior, score=score)
+    large = LARGE_OFFSETS * prior.offset_scale
+    is_noise = score.rms <= 4.0 * float(np.hypot(score.noise, score.by_thermometer))
+    if prior.offset_sd < prior.offset_scale and is_noise:
+        # Nine constants explain the norms of nine positions, whatever the mounting offsets. The
+        # drift of a scale factor is proportional to the specific force along its axis, so drifts
+        # also determine mounting offsets, if the model explains the drifts.
+        prior = replace(prior, offset_sd=large, turn_on_sd=large)
+        posterior = settle(regression, posterior.state, prior, candidates)
+        score = score_of(regression, posterior)
+        white = better_start([white, replace(chosen, posterior=posterior, score=score)])
     slow = with_slow_noise(regression, white.posterior, candidates)
     if slow.prior.noise != white.posterior.prior.noise:
         slow = pruned_fit(regression, slow, candidates)
-        slow_score = score_of(regression, slow)
-        is_worse = is_worse_by_norms(white.score, slow_score)
-        if not (is_worse or is_better(slow_score, white.score)):
-            return slow, slow_score
+        score = score_of(regression, slow)
+        if not (is_worse_by_norms(white.score, score) or is_better(score, white.score)):
+            return slow, score
     return white.posterior, white.score
-
-
-def _with_large_offsets(
-    regression: Regression, fitted: Trial, candidates: Candidates
-) -> list[Trial]:
-    """
-    Repeat the fit of a model from a large sd of mounting offsets; return [] if the fitted sd is at
-    least `Prior.offset_scale`, or if the left-out drift exceeds four times the noise of a window.
-
-    Nine constants explain the norms of nine positions, whatever the mounting offsets. The drift of
-    a scale factor is proportional to the specific force along its axis, so drifts also determine
-    mounting offsets, if the model explains the drifts.
-    """
-    posterior = fitted.posterior
-    prior, scale = posterior.prior, posterior.prior.offset_scale
-    score = fitted.score
-    is_noise = score.rms <= 4.0 * float(np.hypot(score.noise, score.by_thermometer))
-    if prior.offset_sd >= scale or not is_noise:
-        return []
-    large = LARGE_OFFSETS * scale
-    prior = replace(prior, offset_sd=large, turn_on_sd=large)
-    posterior = settle(regression, posterior.state, prior, candidates)
-    return [replace(fitted, posterior=posterior, score=score_of(regression, posterior))]

@@ -47,26 +47,21 @@ class Windows:
     mean: mean raw samples, in input units, shape (n, 3)
     columns: values of the columns in their physical units, with the initial lag states at their
         prior mean, shape (n, m)
-    groups: group of each column
-    kelvins: temperature change that corresponds to the RMS of each column [K], 0 for a constant
-        column, shape (m,)
+    kelvins: temperature change that corresponds to each column's RMS [K]; 0: constant, shape (m,)
     lag: number of the lag of each column; -1 for none, shape (m,)
     start: derivative of each column w.r.t. the initial state of its lag, shape (n, m)
     start_covariance: prior covariance of the initial lag states [K^2], shape (n_lags, n_lags)
     in_scale: whether each column may act on the scale as well as on the bias, shape (m,)
     tilt: functions of temperature, of RMS 1, of which a support's tilt is a sum, shape (n, k)
     forces: known |f| and nonlinear terms, or None if |f| is gravity in all positions
-    undisturbed: factors of the weights, below 1 for disturbed windows, shape (n,), or None if the
-        fit estimates them
+    undisturbed: factors (< 1: disturbed) of the weights, (n,), or None: the fit estimates them
     acts_on: axes on which each column acts, shape (m, 3); None if on all axes
     pose: number of the pose of each position, -1 without a pose, shape (n_positions,), or None if
         the unit was never returned to an attitude
-    has_prior: whether the fit has a prior calibration
-    board: temperature of the board [degC] and the variance of its estimate [K^2], shape (n, 2), or
-        None if unknown
+    board: board temperature [degC] and the variance of its estimate [K^2], (n, 2); None: unknown
     board_noise: sd of the noise of a reading of the board's thermometer [K]
-    settled: values of the columns at k constant temperatures over the range of the windows, with
-        settled lags, shape (k, m), or None if the fit does not use them
+    settled: columns at k constant temperatures over the range of the windows, with settled lags,
+        shape (k, m), or None if the fit does not use them
     """
 
     position: Ints
@@ -233,7 +228,6 @@ class Prior:
     turn_on_sd: sd of the bias offset of a turn-on, common to the positions of a bag [m/s^2]
     sigma: sd of the white noise of a window of weight 1 [m/s^2], shape (3,)
     least_sigma: lower bound of sigma [m/s^2]; by default it is below the noise of any sensor
-    noise: slow noise
     offset_scale: scale of the half-Student priors of offset_sd and turn_on_sd, 0: constant [m/s^2]
     misalignment_scale: value of misalignment_sd before the data are used [rad]
     unseen_misalignment_sd: sd of the elements of M [rad] in the published covariance, if positions
@@ -241,18 +235,17 @@ class Prior:
     tilt_sd: sd of the coefficients of the tilts of a support [rad], see `Windows.tilt`
     pose_sd: sd of attitudes about their pose [rad]; the prior of attitudes without pose is flat
     start_variance_ratio: variance of the initial lag states, divided by that in the node's prior
-    nonlinear_sd: sd of the nonlinear coefficients, then of their changes per kelvin; 0 for an
-        inactive coefficient, shape (2 k,)
+    nonlinear_sd: sd of nonlinear coefficients, then of changes per kelvin; 0: inactive, (2 k,)
     informative: prior that replaces all sd of the unit's parameters; column_sd is then only used
         to mark the active columns by values above 0
     """
 
-    bias_sd: Floats
-    scale_sd: float
-    misalignment_sd: float
     column_sd: Floats
     offset_sd: float
     sigma: Floats
+    bias_sd: Floats = field(default_factory=lambda: np.full(3, BIAS_SD))
+    scale_sd: float = SCALE_SD
+    misalignment_sd: float = MISALIGNMENT_SD
     noise: Noise = field(default_factory=Noise)
     scale_mean: Floats = field(default_factory=lambda: np.ones(3))
     offset_scale: float = 0.0

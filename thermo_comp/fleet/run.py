@@ -9,7 +9,6 @@ import os
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -136,24 +135,21 @@ def _require_packages() -> None:
             )
 
 
-def _in_prior(row: Row) -> bool:
-    """Whether the prior may use a unit: its data are complete and its calibration is valid."""
-    return is_valid(row) and row['is_whole'] == 1
-
-
 def lacks_data(row: Row) -> bool:
     """
     Whether a unit's data are incomplete, so that the unit is fitted again with the prior of its
     type. False for data that contradict themselves or the fit: a prior would hide the fault.
     """
-    is_contradicted = str(row['verdict']) in _CONTRADICTIONS
-    return row['is_whole'] == 0 and not is_contradicted
+    return row['is_whole'] == 0 and row['verdict'] not in _CONTRADICTIONS
 
 
 def _common(rows: Sequence[Row], results: Results) -> tuple[Calibration | None, str]:
-    """Build and save the prior from the units of `_in_prior`; or return None and the reason."""
-    # Of the tests of one serial that `_in_prior` accepts, only the last test is used.
-    tests = sorted((row for row in rows if _in_prior(row)), key=lambda row: str(row['start']))
+    """
+    Build and save the prior, from the last test of each serial with complete data and a valid
+    calibration; or return None and the reason.
+    """
+    usable = (row for row in rows if is_valid(row) and row['is_whole'] == 1)
+    tests = sorted(usable, key=lambda row: str(row['start']))
     latest = {row['serial']: str(row['name']) for row in tests}
     if len(latest) < UNITS_NEEDED:
         return None, (
@@ -173,38 +169,23 @@ def render_fleet(
     rows: Sequence[Row], summary: Summary, certificate_of: Callable[[Row], str]
 ) -> str:
     """Render the fleet's page; `certificate_of` returns a certificate's relative path, or ''."""
-    from ..report.figures_unit import draw_distances, draw_shares
-    from ..report.html import render
-    from ..report.page import ReportFigure, drawn_figures
+    from ..report.figures import draw_distances, draw_shares
+    from ..report.page import drawn_figures, report_figure
+    from ..report.style import render
 
     fitted = [row for row in rows if is_fitted(row)]
     curves = {
         section: np.array([row[f'{section}_ug'] for row in fitted], np.float64)
         for section in ('raw', 'static', 'dynamic')
     }
-    shares = ReportFigure(
-        'residuals',
-        'How large are the residuals of |f| in the fleet?',
-        'Share of the units whose residual at rest is below a value: raw (corrected with the '
-        'constants at the reference temperature alone), and corrected with each unit’s '
-        'calibration. A steep curve means similar units; inspect those at a curve’s right end.',
-        partial(draw_shares, curves),
-    )
-    distances = ReportFigure(
-        'distances',
-        'Which units stand out, and in which quantity?',
-        'Each stroke is a unit, at its distance from the fleet’s median, divided by the root of '
-        'the sum of two variances: that over the units, and that of the unit’s fit. Diamonds '
-        'beyond the lines are the outliers in the table.',
-        partial(
-            draw_distances,
-            [spread.quantity.label for spread in summary.spreads],
-            [spread.z for spread in summary.spreads],
-            [spread.limit for spread in summary.spreads],
-        ),
-    )
     # A fleet of fewer than eight units is not searched for outliers: all limits are infinite.
-    is_comparable = any(np.isfinite(spread.limit) for spread in summary.spreads)
+    limits = [spread.limit for spread in summary.spreads]
+    is_comparable = any(map(np.isfinite, limits))
+    figures = [report_figure(draw_shares, curves)] if fitted else []
+    if is_comparable:
+        labels = [spread.quantity.label for spread in summary.spreads]
+        distances = [spread.z for spread in summary.spreads]
+        figures.append(report_figure(draw_distances, labels, distances, limits))
     return render(
         'fleet.html',
         title='Fleet report',
@@ -215,7 +196,7 @@ def render_fleet(
         n_fitted=len(fitted),
         refused=[row for row in rows if not is_fitted(row)],
         is_comparable=is_comparable,
-        figures=drawn_figures([shares] * bool(fitted) + [distances] * bool(is_comparable)),
+        figures=drawn_figures(figures),
         links={row['name']: quote(certificate_of(row)) for row in fitted},
     )
 

@@ -135,20 +135,14 @@ def find_units(storage: Storage) -> list[FoundUnit]:
 def folders_of_tables(storage: Storage) -> tuple[str, ...]:
     """Return the folders that have tables, which `convert` can make bags of, but no bag."""
     stored = storage.files()
-    with_bags = [f'{_folder(name)}/' for name in group_files(stored)]
+    with_bags = tuple(f'{_folder(name)}/' for name in group_files(stored))
     # fleet.csv is the result of an earlier run, not a table of samples.
     tables = {
         _folder(file.name)
         for file in stored
         if file.name.endswith(('.csv', '.mat')) and not file.name.endswith('/fleet.csv')
     }
-    return tuple(
-        sorted(
-            name
-            for name in tables
-            if name and not any(f'{name}/'.startswith(b) for b in with_bags)
-        )
-    )
+    return tuple(sorted(name for name in tables - {''} if not f'{name}/'.startswith(with_bags)))
 
 
 def group_files(files: Sequence[StoredFile]) -> Bags:

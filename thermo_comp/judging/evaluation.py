@@ -26,15 +26,14 @@ from ..unit.calibration import AXES, Calibration
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 from ..unit.prediction import in_a_soak
 from ..unit.provenance import Source
-from .judgement import Judgement, judge
+from .judgement import SIGNIFICANT_SDS, Judgement, judge
 from .windows import WINDOW_S, corrected_windows, sum_length
 
 # Largest accepted ratio of a unit's scatter at rest to the noise that its calibration states.
 _LARGEST_NOISE_RATIO = 4.0
-# Calibrated noise sd of a sample above which constant samples in a rest are a fault [counts].
+# Calibrated noise of a sample [sd / step of the samples] above which constant samples in a rest
+# are a fault.
 _DEAD_NOISE = 0.5
-# Smallest significant change of a constant between calibrations, in standard deviations.
-_SIGNIFICANT_SDS = 3.0
 
 
 @dataclass(frozen=True)
@@ -97,12 +96,15 @@ def open_bags(
 
 
 def _dead_axes(bag: ReducedBag, calibration: Calibration) -> str:
-    """Describe axes of counts that are constant in a rest in spite of their calibrated noise."""
+    """Describe axes that are constant in a rest, although the axis' noise exceeds the step."""
+    if not any(rest.sample_sd.any() for rest in bag.intervals):
+        return ''  # a converter without visible noise: its step is unknown
     unit, density = calibration.unit, np.array(calibration.noise_density_m_s2_sqrt_hz)
-    if unit.input != 'counts':
-        return ''
-    scale = np.array([axis.scale_factor for axis in calibration.axes])
-    usual = density * scale / np.sqrt(unit.cycle_time_s) > _DEAD_NOISE
+    noise, step = density / np.sqrt(unit.cycle_time_s), bag.step
+    if unit.input == 'counts':
+        noise *= [abs(axis.scale_factor) for axis in calibration.axes]
+        step = max(step, 1.0)
+    usual = noise > _DEAD_NOISE * step
     return '; '.join(axis.text for axis in constant_axes([bag], usual))
 
 
@@ -199,7 +201,7 @@ class Drift:
     @property
     def is_sure(self) -> bool:
         """Whether the change exceeds three standard deviations (`sd`)."""
-        return abs(self.change) > _SIGNIFICANT_SDS * self.sd
+        return abs(self.change) > SIGNIFICANT_SDS * self.sd
 
 
 def history_of(calibrations: Sequence[Calibration]) -> tuple[Epoch, ...]:

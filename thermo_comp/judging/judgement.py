@@ -22,8 +22,8 @@ from .windows import JudgedWindows
 
 # RMS of the claimed sd above which, without a tolerance, a valid calibration is wide [m/s^2].
 _WIDE_CLAIM = 1e3 * MICRO_G
-# Smallest significant shift of bias or scale, in standard deviations.
-_SIGNIFICANT_SDS = 3.0
+#: Smallest significant shift or change of a constant, in standard deviations.
+SIGNIFICANT_SDS = 3.0
 # Smallest sd assumed for a misalignment [rad]; smallest relative sd of a position's mean |f|, and
 # smallest claimed sd of a window [m/s^2].
 _SMALLEST_MISALIGNMENT_SD, _SMALLEST_NORM_SD = 1e-5, 1e-8
@@ -271,7 +271,7 @@ def change_texts(shifts: tuple[AxisShift, ...]) -> tuple[str, ...]:
             ('bias', shift.bias / MICRO_G, shift.bias_sd / MICRO_G, 'ug'),
             ('scale', 1e6 * shift.scale, 1e6 * shift.scale_sd, 'ppm'),
         ):
-            if abs(value) > _SIGNIFICANT_SDS * sd:
+            if abs(value) > SIGNIFICANT_SDS * sd:
                 # The sd is printed with two digits and without an exponent.
                 digits = max(0, 1 - int(np.floor(np.log10(sd)))) if sd > 0.0 else 3
                 collected.append(f'{axis} {name} {value:+.{digits}f} +- {sd:.{digits}f} {unit}')

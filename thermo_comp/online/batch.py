@@ -7,6 +7,7 @@ The compensator uses the temperature readings one by one. The segments between t
 collected, evaluated together and applied to all samples with the arithmetic of single samples.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from operator import itemgetter
 from typing import Final, TypeAlias
@@ -16,10 +17,8 @@ import numpy as np
 from ..recording.blocks import Block
 from ..thermal.reading_queue import DISORDER_NS, NEVER_NS, PENDING_LIMIT
 from ..typing import Bools, Floats, Ints, Stamps
-from ..unit.correction import Correction, is_sound
-from ..unit.nonlinearity import corrected_nonlinear
-from .compensator import TIME_JUMP_NS, Compensator, corrected, corrected_rate
-from .segments import EVER_NS, SEGMENT_NS, Segment
+from .compensator import TIME_JUMP_NS, Compensator, corrected_rate
+from .segments import EVER_NS, SEGMENT_NS, Model, Segment
 from .status import DROPPED
 
 #: Readings not queued yet, last reading first: number of samples before the reading, latest stamp
@@ -27,6 +26,8 @@ from .status import DROPPED
 _Arrivals: TypeAlias = list[tuple[int, int, str, int, float]]
 #: Segments of the correction, each with its number of samples.
 Segments: TypeAlias = list[tuple[Segment, int]]
+#: Arithmetic of samples: function of a line, time since the segment's start [s], and x, y, z.
+_Arithmetic: TypeAlias = Callable[..., Sequence[Floats]]
 #: Code of the reason for which a sample is dropped; the code 0 marks a published sample.
 _REASONS = {name: number for number, name in enumerate(DROPPED, 1)}
 _TOO_FAST, _REFUTED = _REASONS['n_too_fast'], _REASONS['n_refuted']
@@ -174,71 +175,59 @@ def _apply(
     angular_rate: Floats | None,
 ) -> CompensatedBlock:
     """Correct the samples of segments; return the published samples."""
-    correction, of_rate = compensator.thermal.correction, compensator.thermal.rate_correction
+    model = compensator.thermal.model
+    if model.rate_correction is None:
+        angular_rate = None
     line = rate_line = np.empty((0, 0))
     if segments:
-        slow, n_slow = _slow_rows(compensator, segments), correction.n_slow
-        line = _line(correction, segments, slow[:n_slow])
-        is_good = is_sound(line)
-        if of_rate is not None:
-            rate_line = _line(of_rate, segments, slow[n_slow:])
-            is_good &= is_sound(rate_line)
+        line, rate_line, is_good = _lines(model, segments)
         if not is_good.all():
             counts = [count for _, count in segments]
             compensator.counters.n_unsound += int(np.sum(counts, where=~is_good))
             index = index[np.repeat(is_good, counts)]
             segments = [segment for segment, good in zip(segments, is_good, strict=True) if good]
-            line, rate_line = line[:, is_good], rate_line[:, is_good[: rate_line.shape[1]]]
+            line, rate_line = line[:, is_good], rate_line[:, is_good]
     if len(index) < len(stamps):
         stamps, samples = stamps[index], samples[index]
         angular_rate = None if angular_rate is None else angular_rate[index]
+    correction = model.correction
+
+    def force_of(line: list[Floats], dt: Floats, x: Floats, y: Floats, z: Floats) -> list[Floats]:
+        row = compensator.evaluate(line, correction.misalignment, dt, x, y, z)
+        row = correction.beyond.widened(*row)
+        return [row[place] for place in _COLUMNS]
+
     force = rate = np.empty((12, 0))
-    has_rate = angular_rate is not None and of_rate is not None
     if segments:
-        force = _corrected(line, segments, stamps, samples, correction)
+        force = _corrected(force_of, line, segments, stamps, samples)
         is_kept = _judge(compensator, segments, stamps, samples, force)
-        if angular_rate is not None and of_rate is not None:
-            rate = _corrected(rate_line, segments, stamps, angular_rate)[:, is_kept]
+        if angular_rate is not None:
+            rate = _corrected(corrected_rate, rate_line, segments, stamps, angular_rate)[
+                :, is_kept
+            ]
         if not is_kept.all():
             index, stamps, force = index[is_kept], stamps[is_kept], force[:, is_kept]
-    rates = (rate[:3].T, rate[3:6].T) if has_rate else ()
+    rates = () if angular_rate is None else (rate[:3].T, rate[3:6].T)
     return CompensatedBlock(index, stamps, force[:3].T, force[3:].T, *rates)
 
 
-def _slow_rows(compensator: Compensator, segments: Segments) -> Floats:
-    """Evaluate the slowly varying variance of segments, once for each `SlowState`."""
-    held = {id(segment.slow): segment.slow for segment, _ in segments}
-    rows = compensator.thermal.model.slow_rows([*held.values()])
+def _lines(model: Model, segments: Segments) -> tuple[Floats, Floats, Bools]:
+    """Evaluate `Model.lines`, with the slowly varying variance once for each `SlowState`."""
+    each = [segment for segment, _ in segments]
+    held = {id(segment.slow): segment.slow for segment in each}
     places = {key: place for place, key in enumerate(held)}
-    return rows[:, [places[id(segment.slow)] for segment, _ in segments]]
-
-
-def _line(correction: Correction, segments: Segments, slow: Floats) -> Floats:
-    """Evaluate `Correction.line` for segments, with their slowly varying variance."""
-    start, end = (np.array([segment[at] for segment, _ in segments]).T for at in (4, 5))
-    excess = np.array([segment.noise_excess for segment, _ in segments])
-    return correction.line(start, end, slow, excess)
+    slow = model.slow_rows([*held.values()])[:, [places[id(segment.slow)] for segment in each]]
+    start, end = (np.array([segment[at] for segment in each]).T for at in (4, 5))
+    return model.lines(start, end, slow, np.array([segment.noise_excess for segment in each]))
 
 
 def _corrected(
-    table: Floats,
-    segments: Segments,
-    stamps: Stamps,
-    samples: Floats,
-    correction: Correction | None = None,
+    evaluate: _Arithmetic, table: Floats, segments: Segments, stamps: Stamps, samples: Floats
 ) -> Floats:
-    """
-    Return force and row-major covariance of segments, (12, n), or, without the correction of the
-    force, angular rates and their variances, (6, n).
-    """
-    each = [segment for segment, _ in segments]
-    start_ns = np.array([segment.start_ns for segment in each], dtype=np.int64)
+    """Apply the arithmetic of samples to segments, whose lines are the columns of `table`."""
+    start_ns = np.array([segment.start_ns for segment, _ in segments], dtype=np.int64)
     ends = np.cumsum([count for _, count in segments])
-    order = range(6) if correction is None else _COLUMNS
-    is_nonlinear = correction is not None and correction.of_force is not None
-    corrected_force = corrected_nonlinear if is_nonlinear else corrected
-    n = len(stamps)
-    result = np.empty((len(order), n))
+    n, parts = len(stamps), []
     # Samples that are not finite are corrected like all others; the caller drops them.
     with np.errstate(invalid='ignore', over='ignore'):
         for begin in range(0, n, PIECE):
@@ -248,16 +237,8 @@ def _corrected(
             counts = np.diff(np.minimum(ends[low:high], stop), prepend=begin)
             dt = (stamps[begin:stop] - np.repeat(start_ns[low:high], counts)) * 1e-9
             line = list(np.repeat(table[:, low:high], counts, axis=1))
-            x, y, z = samples[begin:stop].T
-            values: tuple[Floats, ...]
-            if correction is None:
-                values = corrected_rate(line, dt, x, y, z)
-            else:
-                values = corrected_force(line, correction.misalignment, dt, x, y, z)
-                values = correction.beyond.widened(*values)
-            for column, place in zip(result, order, strict=True):
-                column[begin:stop] = values[place]
-    return result
+            parts.append(np.array(evaluate(line, dt, *samples[begin:stop].T)))
+    return np.concatenate(parts, axis=1)
 
 
 def _judge(

@@ -27,6 +27,12 @@ STUCK_SAMPLES: Final = 50
 #: Change of both other axes [m/s^2] at which an axis that repeats its reading counts as stuck: the
 #: change in a turn by 1.2 degrees, above the noise and the steps of a converter at rest.
 MOTION: Final = 0.2
+#: An axis that repeats its reading although nothing moves is stuck if the other axes have changed
+#: `NOISY_CHANGES` times by `NOISY_SDS` sd of their noise from one sample to the next, and if its
+#: own noise [sd] is at least `VISIBLE_SDS` times the converter's step, which would show the noise.
+NOISY_CHANGES: Final = 20
+NOISY_SDS: Final = 1.5
+VISIBLE_SDS: Final = 2.0
 #: Largest accepted ratio of the long-term rate of samples to the calibrated rate.
 LARGEST_RATE: Final = 1.5
 #: Burst of samples accepted beyond `LARGEST_RATE`, as from a driver's buffer: number of samples,
@@ -59,8 +65,10 @@ REFUTING_SIGMAS: Final = 5.0
 
 
 #: Run of equal readings of an axis: its first sample with the stamp [ns], number of samples after
-#: the first, and the largest change since then that both other axes have made [input unit].
-Run: TypeAlias = tuple[tuple[float, float, float, int], int, float]
+#: the first, the largest change since then that both other axes have made [input unit], and, from
+#: the `STUCK_SAMPLES`th repeat on, the changes of the other axes from sample to sample: number of
+#: changes that noise explains and the smallest change, the converter's step [input unit].
+Run: TypeAlias = tuple[tuple[float, float, float, int], int, float, int, float]
 
 
 class StuckCheck:
@@ -68,14 +76,17 @@ class StuckCheck:
     Counts consecutive equal readings of each axis; `timeout_s` [s]: 0 = nothing is stuck.
 
     After the time-out samples are stuck if all three axes repeat their readings, or if an axis
-    repeats its reading while both other axes change by `motion` [input unit]. At rest one or two
-    axes may repeat their readings, if their noise is below the converter's step.
+    repeats its reading while both other axes change by `motion` [input unit], or while another
+    axis shows noise that this axis would show as well. `noise_sds`: sd of the noise of each axis
+    [input unit]. An axis whose noise is below the converter's step may repeat its reading.
     """
 
-    def __init__(self, timeout_s: float, motion: float) -> None:
+    def __init__(self, timeout_s: float, motion: float, noise_sds: Sequence[float]) -> None:
         self.is_on = timeout_s > 0.0
         self.limit_ns = round(timeout_s * 1e9) if self.is_on else NEVER_NS
         self.motion = motion
+        self._noisy = [NOISY_SDS * sd or math.inf for sd in noise_sds]
+        self._visible = [sd / VISIBLE_SDS for sd in noise_sds]
         self.last = (math.nan, math.nan, math.nan, 0)  # the last sample and its stamp
         #: Present run of equal readings of each axis; empty if the last sample changed all axes.
         self.runs: tuple[Run, ...] = ()
@@ -84,19 +95,44 @@ class StuckCheck:
         """Take a sample that repeats a reading of an axis; return whether the sample is stuck."""
         last = self.last
         self.last = sample = (x, y, z, stamp_ns)
-        runs = self.runs or ((last, 0, 0.0),) * 3
-        (xs, nx, mx), (ys, ny, my), (zs, nz, mz) = runs
-        new = sample, 0, 0.0
-        self.runs = (
-            (xs, nx + 1, _larger(mx, y - xs[1], z - xs[2])) if x == last[0] else new,
-            (ys, ny + 1, _larger(my, z - ys[2], x - ys[0])) if y == last[1] else new,
-            (zs, nz + 1, _larger(mz, x - zs[0], y - zs[1])) if z == last[2] else new,
+        of_x, of_y, of_z = self.runs or _begun(last)
+        new = sample, 0, 0.0, 0, math.inf
+        self.runs = runs = (
+            self._continued(of_x, sample, last, 1, 2) if x == last[0] else new,
+            self._continued(of_y, sample, last, 2, 0) if y == last[1] else new,
+            self._continued(of_z, sample, last, 0, 1) if z == last[2] else new,
         )
-        if max(nx, ny, nz) < STUCK_SAMPLES - 1:
+        if max(runs[0][1], runs[1][1], runs[2][1]) < STUCK_SAMPLES:
             return False
         latest_ns = stamp_ns - self.limit_ns
-        moved = [m for first, n, m in self.runs if n >= STUCK_SAMPLES and first[3] < latest_ns]
-        return len(moved) == 3 or max(moved, default=0.0) > self.motion
+        is_long = [n >= STUCK_SAMPLES and first[3] < latest_ns for first, n, *_ in runs]
+        return all(is_long) or any(
+            long and (moved > self.motion or (n_noisy >= NOISY_CHANGES and step <= visible))
+            for long, (*_, moved, n_noisy, step), visible in zip(
+                is_long, runs, self._visible, strict=True
+            )
+        )
+
+    def _continued(
+        self,
+        run: Run,
+        sample: tuple[float, float, float, int],
+        last: tuple[float, float, float, int],
+        j: int,
+        k: int,
+    ) -> Run:
+        """Return the run of an axis with a sample more; `j`, `k`: the other axes."""
+        first, n, moved, n_noisy, step = run
+        change, other = abs(sample[j] - first[j]), abs(sample[k] - first[k])
+        if change > moved and other > moved:
+            moved = min(change, other)
+        if n >= STUCK_SAMPLES:
+            for i in (j, k):
+                change = abs(sample[i] - last[i])
+                n_noisy += change >= self._noisy[i]
+                if 0.0 < change < step:
+                    step = change
+        return first, n + 1, moved, n_noisy, step
 
     def find(self, stamps: Ints, samples: Floats) -> Bools:
         """Find the samples (n > 0, 3) that `Compensator` drops as stuck or as three zeros."""
@@ -105,28 +141,31 @@ class StuckCheck:
         changes = np.empty((3, n), dtype=np.bool_)
         changes[:, 0] = columns[:, 0] != self.last[:3]
         changes[:, 1:] = columns[:, 1:] != columns[:, :-1]
-        runs = list(self.runs or ((self.last, 0, 0.0),) * 3)
+        runs = list(self.runs or _begun(self.last))
         are_long = np.zeros((3, n), dtype=np.bool_)
         is_stuck = np.zeros(n, dtype=np.bool_)
-        for axis, (begun, n_before, moved) in enumerate(runs):
-            begins = np.concatenate([[-1 - n_before], np.flatnonzero(changes[axis])])
+        for axis, run in enumerate(runs):
+            begins = np.concatenate([[-1 - run[1]], np.flatnonzero(changes[axis])])
             ends = np.append(begins[1:], n)
             is_judged = (ends - begins > STUCK_SAMPLES) & (ends > 0)
             is_judged[-1] = True
             spans = zip(begins[is_judged].tolist(), ends[is_judged].tolist(), strict=True)
             for begin, end in spans:
-                is_new = begin >= 0
-                first = (*samples[begin].tolist(), int(stamps[begin])) if is_new else begun
+                if begin >= 0:
+                    first = (*samples[begin].tolist(), int(stamps[begin]))
+                    begun: Run = first, 0, 0.0, 0, math.inf
+                else:
+                    begun = run
                 here = slice(max(begin, 0), end)
-                with np.errstate(invalid='ignore'):
-                    moved_by = np.abs(columns[:, here].T - first[:3])
-                both = np.minimum(moved_by[:, axis - 2], moved_by[:, axis - 1])
-                most = np.fmax.accumulate(np.append(0.0 if is_new else moved, both))[1:]
                 equal = np.arange(here.start - begin, end - begin)
-                is_long = (equal >= STUCK_SAMPLES) & (stamps[here] - first[3] > self.limit_ns)
+                is_long = (equal >= STUCK_SAMPLES) & (stamps[here] - begun[0][3] > self.limit_ns)
+                most, n_noisy, step = self._changes(begun, columns, here, equal, axis)
+                is_noisy = (n_noisy >= NOISY_CHANGES) & (step <= self._visible[axis])
                 are_long[axis, here] = is_long
-                is_stuck[here] |= is_long & (most > self.motion)
-                runs[axis] = first, end - 1 - begin, most.item(-1)
+                is_stuck[here] |= is_long & ((most > self.motion) | is_noisy)
+                runs[axis] = (
+                    begun[0], end - 1 - begin, most.item(-1), n_noisy.item(-1), step.item(-1)
+                )  # fmt: skip
         self.last, self.runs = (*samples[-1].tolist(), int(stamps[-1])), tuple(runs)
         is_stuck |= are_long.all(axis=0)
         if self.is_on:
@@ -134,11 +173,32 @@ class StuckCheck:
             is_stuck[zeros[~samples[zeros].any(axis=1)]] = True
         return is_stuck
 
+    def _changes(
+        self, run: Run, columns: Floats, here: slice, equal: Ints, axis: int
+    ) -> tuple[Floats, Ints, Floats]:
+        """
+        Continue the last three values of a run over the samples `here`: columns (3, n) of which
+        `equal` samples are equal to the first.
+        """
+        first, _, moved, n_noisy, step = run
+        # With the sample before, which the first difference needs.
+        before = self.last[:3] if here.start == 0 else columns[:, here.start - 1]
+        values = np.column_stack([before, columns[:, here]])[[axis - 2, axis - 1]]
+        with np.errstate(invalid='ignore'):
+            moved_by = np.abs(values[:, 1:].T - np.take(first[:3], [axis - 2, axis - 1]))
+            changes = np.abs(np.diff(values))
+        most = np.fmax.accumulate(np.append(moved, moved_by.min(axis=1)))[1:]
+        # The streaming check looks at changes from the repeat after the `STUCK_SAMPLES`th on.
+        changes[:, equal <= STUCK_SAMPLES] = 0.0
+        noisy = np.take(self._noisy, [axis - 2, axis - 1])[:, np.newaxis]
+        counts = n_noisy + np.cumsum(np.sum(changes >= noisy, axis=0))
+        steps = np.where(changes > 0.0, changes, math.inf).min(axis=0)
+        return most, counts, np.minimum.accumulate(np.append(step, steps))[1:]
 
-def _larger(most: float, change: float, other: float) -> float:
-    """Return the larger of `most` and the smaller of two changes; NaN is no change."""
-    change, other = abs(change), abs(other)
-    return min(change, other) if change > most and other > most else most
+
+def _begun(sample: tuple[float, float, float, int]) -> tuple[Run, ...]:
+    """Return the runs of the three axes that begin with a sample."""
+    return ((sample, 0, 0.0, 0, math.inf),) * 3
 
 
 class RateCheck:
@@ -155,10 +215,7 @@ class RateCheck:
 
     @property
     def noise_excess(self) -> float:
-        """
-        Excess of the noise variance of a sample over the calibrated variance, relative to the
-        calibrated variance, because of a sample rate above the calibrated rate.
-        """
+        """Relative excess of a sample's noise variance due to a rate above the calibrated rate."""
         excess = self.ratio - 1.0
         return excess if excess > RATE_TOLERANCE else 0.0
 
@@ -171,14 +228,10 @@ class RateCheck:
             return
         n, dt = n_seen - last[0], (stamp_ns - last[1]) * 1e-9
         level = self._level + n - LARGEST_RATE * dt / self._cycle_s
-        if level <= 0.0:
-            self._level = 0.0
-            self.is_too_fast = False
-        else:
-            # Excess samples are counted up to twice the allowance, so that the alarm ends soon
-            # after a long excess.
-            self._level = min(level, 2.0 * self._allowance)
-            self.is_too_fast = self._counts_cycles and self._level > self._allowance
+        # Excess samples are counted up to twice the allowance, so that the alarm ends soon after a
+        # long excess.
+        self._level = min(max(level, 0.0), 2.0 * self._allowance)
+        self.is_too_fast = self._counts_cycles and self._level > self._allowance
         n, dt = n_seen - self._window[0], (stamp_ns - self._window[1]) * 1e-9
         if dt >= _WINDOW_S:
             self.ratio = n * self._cycle_s / dt
@@ -223,10 +276,8 @@ class GravityCheck:
     ) -> None:
         """Take a force [m/s^2], its covariance (xx to zz), and the trace of its noise part."""
         self._watch_step(stamp_ns, force, covariance, noise)
-        if (
-            not 0 <= stamp_ns - self._begin_ns < LONGEST_WINDOW_NS
-            or not 0 <= stamp_ns - self._last_ns < 3 * WINDOW_NS
-        ):
+        since_ns, step_ns = stamp_ns - self._begin_ns, stamp_ns - self._last_ns
+        if not (0 <= since_ns < LONGEST_WINDOW_NS and 0 <= step_ns < 3 * WINDOW_NS):
             self._forces = []
         if not self._forces:
             self._begin_ns = stamp_ns
@@ -240,20 +291,14 @@ class GravityCheck:
     def _watch_step(
         self, stamp_ns: int, force: Sequence[float], covariance: Sequence[float], noise: float
     ) -> None:
-        """
-        Refute the calibration if |f| steps from its value at rest to a value out of the tolerance
-        and keeps the new value for `STEP_NS`; a step refutes sooner than means of windows do.
-        """
+        """Refute the calibration if |f| steps, at rest, beyond the tolerance for `STEP_NS`."""
         rests = self.result and self.result.is_still and self._last_mean
         if self.is_refuted or not (self._off or rests):
             self._off, self._is_resting = [], False
             return
         # Largest difference of two samples at rest, including four sd of the noise difference.
         near = LARGEST_CHANGE + 4.0 * math.sqrt(2.0 * noise / 3.0)
-        was_resting, reference = (
-            self._is_resting,
-            self._off[0] if self._off else self._last_mean or (),
-        )
+        was_resting, reference = self._is_resting, (self._off or [self._last_mean or ()])[0]
         is_near = max(abs(a - b) for a, b in zip(force, reference, strict=True)) <= near
         variance = max(variance_along(force, covariance), noise / 3.0)
         residual = math.hypot(*force) - self.gravity
@@ -280,40 +325,30 @@ class GravityCheck:
         mean = [math.fsum(values) / n for values in axes]
         squares = [(v - m) ** 2 for values, m in zip(axes, mean, strict=True) for v in values]
         scatter = math.fsum(squares) / (n - 1)
-        last, self._last_mean = self._last_mean, mean
+        last, self._last_mean = self._last_mean or [math.inf] * 3, mean
         # Largest difference of two means at rest, including four sd of the noise difference.
         change = LARGEST_CHANGE + 4.0 * math.sqrt(2.0 * noise_variance / (3.0 * n))
-        is_still = (
-            scatter <= SCATTER_FACTOR**2 * noise_variance
-            and last is not None
-            and max(abs(a - b) for a, b in zip(mean, last, strict=True)) <= change
-        )
-        if not is_still:
+        largest = max(abs(a - b) for a, b in zip(mean, last, strict=True))
+        if not (scatter <= SCATTER_FACTOR**2 * noise_variance and largest <= change):
             self.result = self.result and self.result._replace(is_still=False)
             return
         size = math.hypot(*mean)
         # The mean of a window reduces the noise of the samples, but not the calibration's error.
         noise = noise_variance / 3.0
         variance = max(variance_along(mean, covariance) - noise, 0.0) + noise / n
-        if self._judge(abs(size - self.gravity), math.sqrt(variance)):
+        limit = self._tolerance + REFUTING_SIGMAS * math.sqrt(variance)
+        is_against = abs(size - self.gravity) > limit
+        if is_against == self._is_against:
+            self._n_agreeing += 1
+        else:
             # The windows before a change of the verdict do not describe the present error.
-            self._weight = 0.0
+            self._is_against, self._n_agreeing, self._weight = is_against, 1, 0.0
+        if self._n_agreeing >= (REFUTING_WINDOWS if is_against else RESTORING_WINDOWS):
+            self.is_refuted = is_against
         decay = 1.0 - 1.0 / MEMORY_WINDOWS
         self._weight = self._weight * decay + 1.0
         gain = 1.0 / self._weight
         residual, sd, n, _ = self.result or (0.0, 0.0, 0, False)
         residual += gain * (size - self.gravity - residual)
         sd = math.sqrt(sd**2 + gain * (variance - sd**2))
-        self.result = GravityResidual(residual, sd, n + 1, is_still)
-
-    def _judge(self, residual: float, sd: float) -> bool:
-        """
-        Count consecutive windows with equal verdicts; return whether the verdict has changed.
-        """
-        was_against = self._is_against
-        is_against = residual > self._tolerance + REFUTING_SIGMAS * sd
-        self._n_agreeing = self._n_agreeing + 1 if is_against == self._is_against else 1
-        self._is_against = is_against
-        if self._n_agreeing >= (REFUTING_WINDOWS if is_against else RESTORING_WINDOWS):
-            self.is_refuted = is_against
-        return is_against != was_against
+        self.result = GravityResidual(residual, sd, n + 1, is_still=True)

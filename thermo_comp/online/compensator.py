@@ -16,16 +16,15 @@ import math
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
-from typing import Final, TypeVar
+from typing import Final
 
 from ..thermal.lags import BOARD_INPUT
 from ..thermal.plausibility import Fault
 from ..thermal.regime import Regime
 from ..thermal.state import GRADIENT
-from ..typing import Floats
 from ..unit.calibration import Calibration
-from ..unit.correction import SCALE_VARIANCES, VARIANCES, Excess, is_sound
-from ..unit.covariance import covariance_at
+from ..unit.correction import SCALE_VARIANCES, VARIANCES, Excess
+from ..unit.covariance import Real, covariance_at
 from ..unit.functions import TANGENT_SPANS
 from ..unit.nonlinearity import corrected_nonlinear
 from .checks import MOTION, GravityCheck, StuckCheck
@@ -54,8 +53,6 @@ CONTINUED: Final = (
 
 #: Specific force x, y, z [m/s^2] and the covariance xx, xy, xz, yy, yz, zz [m^2/s^4].
 Corrected = tuple[float, float, float, float, float, float, float, float, float]
-# Type of a quantity: the value of one sample, or an array of many samples.
-Real = TypeVar('Real', float, Floats)
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,16 +110,19 @@ class Compensator:
         self.calibration = calibration
         self._full_scale = self._limit = calibration.unit.full_scale
         self._edge = self.thermal.correction.beyond.edge
-        self.gravity = self._gravity_check()
-        self._corrected = corrected_nonlinear if calibration.nonlinearity else corrected
+        self.gravity = GravityCheck(*self._gravity_settings)
+        self.evaluate = corrected_nonlinear if calibration.nonlinearity else corrected
         self.leap_ns = max(LEAP_NS, round(LEAP_CYCLES * 1e9 * calibration.unit.cycle_time_s))
 
     def _stuck_check(self) -> StuckCheck:
         scales = [abs(axis.scale_factor) for axis in self.calibration.axes]
-        return StuckCheck(self.config.stuck_timeout_s, MOTION * max(scales))
-
-    def _gravity_check(self) -> GravityCheck:
-        return GravityCheck(*self._gravity_settings)
+        noise_sds = [
+            scale * density / math.sqrt(self.calibration.unit.cycle_time_s)
+            for scale, density in zip(
+                scales, self.calibration.noise_density_m_s2_sqrt_hz, strict=True
+            )
+        ]
+        return StuckCheck(self.config.stuck_timeout_s, MOTION * max(scales), noise_sds)
 
     @property
     def _gravity_settings(self) -> tuple[float, float]:
@@ -155,15 +155,13 @@ class Compensator:
             stuck.last = (x, y, z, stamp_ns)
             stuck.runs = ()
         limit = self._limit
+        is_stuck = is_stuck or (stuck.is_on and not (x or y or z))
         if is_stuck or not (-limit < x < limit and -limit < y < limit and -limit < z < limit):
             self._count_bad(x, y, z)
             return None
-        if not (x or y or z) and stuck.is_on:
-            self.counters.n_stuck += 1
-            return None
         self.counters.n_out += 1
         start_ns, line, misalignment = self._segment
-        row = self._corrected(line, misalignment, (stamp_ns - start_ns) * 1e-9, x, y, z)
+        row = self.evaluate(line, misalignment, (stamp_ns - start_ns) * 1e-9, x, y, z)
         edge = self._edge
         if -edge < row[0] < edge and -edge < row[1] < edge and -edge < row[2] < edge:
             return row
@@ -193,9 +191,7 @@ class Compensator:
             self.counters.n_saturated += 1
 
     def _process_first(self, stamp_ns: int, x: float, y: float, z: float) -> Corrected | None:
-        """
-        Correct the first sample after a reading or the end of a segment, and run the checks.
-        """
+        """Correct and check the first sample after a reading or the end of a segment."""
         if stamp_ns <= self.last_ns - TIME_JUMP_NS:
             self.jump_back(stamp_ns)
             self.reading_ns = EVER_NS
@@ -213,26 +209,22 @@ class Compensator:
             return None
         counters = self.counters
         segment = thermal.segment(stamp_ns, counters.n_in - counters.n_out_of_order)
-        start_ns, is_new, is_too_fast, excess, start, end, _ = segment
+        start_ns, is_new, is_too_fast, excess, start, end, state = segment
         self.event_ns = min(thermal.queue.next_ns, start_ns + SEGMENT_NS, fresh_ns + 1)
-        correction = thermal.correction
-        slow, n_slow = thermal.slow_rows(segment.slow), correction.n_slow
-        line = correction.line(start, end, slow[:n_slow], excess)
-        is_good = is_sound(line)
-        if thermal.rate_correction is not None:
-            rate_line = thermal.rate_correction.line(start, end, slow[n_slow:], excess)
-            is_good &= is_sound(rate_line)
-            self.rate_line = rate_line.tolist()
+        correction, slow = thermal.correction, thermal.slow_rows(state)
+        line, rate_line, is_good = thermal.model.lines(start, end, slow, excess)
+        self.rate_line = rate_line.tolist()
         if not is_good:
             # While the correction is not finite, each sample takes this path and is dropped.
             counters.n_unsound += 1
             self.event_ns, self.last_ns = EVER_NS, stamp_ns
             return None
         self._segment = (start_ns, line.tolist(), correction.misalignment)
-        if not is_new:
-            return self.process(stamp_ns, x, y, z)
-        self.is_refusing = is_too_fast
+        if is_new:
+            self.is_refusing = is_too_fast
         row = self.process(stamp_ns, x, y, z)
+        if not is_new:
+            return row
         if self.gravity.is_refuted and not is_too_fast:
             # The check of |f| also uses samples that it drops: later ones may agree with gravity.
             self.is_refusing = True
@@ -260,7 +252,10 @@ class Compensator:
         self.thermal.queue.keep(lambda entry: entry[0] <= stamp_ns)
         self.thermal.reset()
         self.stuck = self._stuck_check()
-        self.gravity = self._gravity_check()
+        is_refuted = self.gravity.is_refuted
+        self.gravity = GravityCheck(*self._gravity_settings)
+        # A jump of time does not mend a wrong calibration: windows that agree restore the output.
+        self.gravity.is_refuted = is_refuted
         self.counters.n_time_jumps += 1
         self.last_ns = stamp_ns - 1
 
@@ -285,7 +280,7 @@ class Compensator:
 
     def swap(self, calibration: Calibration) -> None:
         """Use `calibration` instead of the present calibration from the next sample on."""
-        vars(self).update(vars(self.successor(Model(calibration), self.config)))
+        self.take_over(Model(calibration), self.config)
 
     def successor(self, model: Model, config: CompensatorConfig) -> Compensator:
         """
@@ -301,8 +296,7 @@ class Compensator:
 
     def take_over(self, model: Model, config: CompensatorConfig) -> None:
         """Use `model` and `config` from now on; an object that `self` copies does not change."""
-        gravity, before = copy(self.gravity), self._gravity_settings
-        stuck = self.stuck
+        gravity, before, stuck = copy(self.gravity), self._gravity_settings, self.stuck
         self.config, self.thermal = config, copy(self.thermal)
         self.thermal.take_over(model, config, self.now_ns)
         is_same = self.calibration == model.calibration
@@ -340,6 +334,9 @@ class Compensator:
         usual_s = max(STALE_INTERVALS * tracker.board.interval_s, SHORTEST_STALE_S)
         state = thermal.sample(stamp_ns)
         loose_k = tracker.loose_k(state[GRADIENT])
+        for name, twin in tracker.copies.items():
+            if twin.is_copy and faults[name][0] is Fault.NONE:
+                faults[name] = Fault.COPY, 0.0
         if loose_k and faults[BOARD_INPUT][0] is Fault.NONE:
             faults[BOARD_INPUT] = Fault.LOOSE, loose_k
         return CompensatorStatus(

@@ -16,6 +16,7 @@ from math import sqrt
 from typing import Final, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from ..thermal.lags import BOARD_INPUT
 from ..thermal.reading_queue import NEVER_NS, ReadingQueue
@@ -23,9 +24,9 @@ from ..thermal.regime import Regime
 from ..thermal.settings import ThermalConfig
 from ..thermal.state import BOARD
 from ..thermal.tracker import ANY_RANGE, ThermalTracker
-from ..typing import Floats
+from ..typing import Bools, Floats
 from ..unit.calibration import Calibration, rate_triad
-from ..unit.correction import Correction
+from ..unit.correction import Correction, is_sound
 from ..unit.prediction import SlowUncertainty
 from .checks import RateCheck
 from .status import CompensatorConfig, Counters
@@ -83,12 +84,23 @@ class Model:
         self.inputs = (BOARD_INPUT, *calibration.sensors)
 
     def slow_rows(self, held: Sequence[SlowState]) -> Floats:
-        """
-        Evaluate the slowly varying variance of the force, `Correction.n_slow` rows, then that of
-        the angular rate, shape (rows, len(held)).
-        """
+        """Evaluate the slow variance of force (`n_slow` rows), then of angular rate, (rows, n)."""
         states, shares, rates = (np.array(part).T for part in zip(*held, strict=True))
         return np.concatenate([part.at(states, shares, rates) for part in self.uncertainty])
+
+    def lines(
+        self, start: npt.ArrayLike, end: npt.ArrayLike, slow: Floats, noise_excess: npt.ArrayLike
+    ) -> tuple[Floats, Floats, Bools]:
+        """
+        Evaluate `Correction.line` of force and angular rate (without a gyroscope: no rows), and
+        whether both are sound; `slow`: result of `slow_rows` for these segments.
+        """
+        n = self.correction.n_slow
+        line = self.correction.line(start, end, slow[:n], noise_excess)
+        if self.rate_correction is None:
+            return line, line[:0], is_sound(line)
+        rate_line = self.rate_correction.line(start, end, slow[n:], noise_excess)
+        return line, rate_line, is_sound(line) & is_sound(rate_line)
 
 
 class ThermalSide:
@@ -122,9 +134,8 @@ class ThermalSide:
         self._last_end: tuple[int, int, tuple[float, ...]] | None = None
 
     def _new_tracker(self) -> ThermalTracker:
-        return ThermalTracker(
-            self.calibration.detector, self.correction.memory, *self._tracker_config()
-        )
+        settings = self.calibration.detector
+        return ThermalTracker(settings, self.correction.memory, *self._tracker_config())
 
     def _tracker_config(self) -> tuple[ThermalConfig, float, tuple[float, float]]:
         gentle_s = self.correction.gentle_transition(self.config.transition_time_s)
@@ -212,9 +223,7 @@ class ThermalSide:
         return EVER_NS if board_ns is None else board_ns + timeout_ns
 
     def count_unmeasured(self, n_samples: int) -> None:
-        """
-        Count samples as dropped because the board temperature is missing or too old.
-        """
+        """Count samples dropped because the board temperature is missing or too old."""
         if self.tracker.board.stamp_ns is None:
             self.counters.n_no_temperature += n_samples
         else:

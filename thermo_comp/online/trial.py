@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the trial of a calibration: a few samples are corrected before the calibration is used.
-"""
+"""Owns the trial of a calibration: correction of a few samples before the calibration is used."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the parts of a certificate after ISO/IEC 17025: results, budget, conformity."""
+"""
+Owns the parts of a certificate after ISO/IEC 17025: results, bias and scale over temperature,
+budget, conformity.
+"""
 
 import math
 from typing import NamedTuple
@@ -9,17 +12,53 @@ import numpy as np
 
 from ..judging.verdicts import Verdict
 from ..typing import Floats
-from ..unit.calibration import AXES, Calibration
+from ..unit.calibration import AXES, Calibration, RegimeSet
 from ..unit.gravity import MICRO_G
-from ..unit.prediction import bias_and_scale, in_a_soak, nonlinear_coefficients, ramp_states
+from ..unit.prediction import (
+    bias_and_scale,
+    in_a_soak,
+    nonlinear_coefficients,
+    ramp_states,
+    sd_of_states,
+)
 from .evidence import Evidence
-from .html import minus, number, rounded
 from .statements import CertificateInfo
-from .temperature_curves import curves, evaluate, programs, slopes, table_temperatures
+from .style import minus, number, rounded
 
 #: Coverage factor of an expanded uncertainty: 95 % of a normal distribution.
 COVERAGE = 2.0
 _N_SLOPE = 33
+_N_CURVE = 61
+#: Steps of a table over temperature [K], and the largest number of temperatures in a table.
+_STEPS_K = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
+_MOST_TEMPERATURES = 8
+
+
+class Program(NamedTuple):
+    """A soak, or a ramp from a soak at one end of a set's temperatures to the other end."""
+
+    name: str  # soak, heating or cooling
+    regime: RegimeSet
+    rate_k_min: float
+
+    @property
+    def label(self) -> str:
+        """The name of the soak or ramp and, for a ramp, the rate."""
+        return f'{self.name} at {abs(self.rate_k_min):g} K/min' if self.rate_k_min else self.name
+
+
+class Curve(NamedTuple):
+    """
+    Bias [micro-g] and scale [ppm] of x, y, z in a soak or ramp, shape (n, 6), and their sd.
+
+    `value` is the difference from a soak at the reference temperature; `sd` is the sd of bias and
+    scale, not of the difference.
+    """
+
+    program: Program
+    temperature: Floats
+    value: Floats
+    sd: Floats
 
 
 class Contribution(NamedTuple):
@@ -40,31 +79,21 @@ class Result(NamedTuple):
     unit: str
 
 
-class StateResult(NamedTuple):
-    """
-    Bias and scale of one axis in a soak or a ramp, at one temperature of the board.
-
-    A deviation is the bias or scale less a straight line over temperature, which has the slope of
-    a line fitted to the soak and goes through the value in a soak at the reference temperature.
-    """
-
-    program: str
-    temperature: str  # [degC]
-    bias: str  # [micro-g]
-    bias_expanded: str
-    bias_deviation: str
-    scale: str  # relative to the scale at the reference temperature [ppm]
-    scale_expanded: str
-    scale_deviation: str
-
-
 class AxisOverTemperature(NamedTuple):
-    """Rows of bias and scale of one axis, and slopes of both lines [micro-g/K, ppm/K]."""
+    """
+    Bias and scale of one axis over the temperature of the board, and the slopes of lines fitted to
+    bias and scale in a soak [micro-g/K, ppm/K].
+
+    Cells of a row, as rounded texts: soak or ramp; temperature [degC]; bias, its expanded
+    uncertainty and its deviation [micro-g]; scale relative to that at the reference temperature,
+    its expanded uncertainty and its deviation [ppm]. A deviation is the bias or scale less a line
+    with the slope in a soak through the value in a soak at the reference temperature.
+    """
 
     axis: str
     bias_slope: float
     scale_slope: float
-    rows: list[StateResult]
+    rows: list[tuple[str, ...]]
 
 
 def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...]:
@@ -160,14 +189,6 @@ def results(
     return rows
 
 
-def own_heat(calibration: Calibration | None) -> str:
-    """Return the gradient in a soak, due to self-heating, as text; '' if not known."""
-    if calibration is None or calibration.soak_gradient_k is None:
-        return ''
-    gradient, sd = (minus(f'{part:.2f}') for part in calibration.soak_gradient_k)
-    return f' (T_{calibration.sensors[0]} − T_board: {gradient} ± {sd} K)'
-
-
 def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOverTemperature]:
     """Tabulate bias and scale of each axis in a soak and in ramps at temperatures of the board."""
     calibration = evidence.calibration
@@ -185,12 +206,15 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
         value, sd = evaluate(calibration, program, at)[2:]
         off = value - np.outer(at - calibration.reference_temperature_c, slope)
         value[:, :3] += bias_0 / MICRO_G
-        # If U is withheld, its part without gravity sets the digits of value and deviation.
-        digits = np.where(known * sd > 0.0, known * sd, _four_digits(value))
+        # If U is withheld, its part without gravity sets the digits of value and deviation; if the
+        # calibration states no uncertainty, the largest values are printed with 4 digits.
+        largest = np.maximum(np.abs(value).max(axis=0), 1e-3)
+        four_digits = 10.0 ** (np.floor(np.log10(largest)) - 2.0)
+        digits = np.where(known * sd > 0.0, known * sd, four_digits)
         sd[:, 3:] = np.hypot(sd[:, 3:], 1e6 * _gravity_part(evidence, info))
         for k, table in enumerate(tables):
             for row in range(len(at)):
-                cells: list[str] = []
+                cells = [program.name, minus(f'{at[row]:.1f}')]
                 for column in (k, k + 3):
                     expanded = float(known * sd[row, column])
                     place = expanded if math.isfinite(expanded) else float(digits[row, column])
@@ -198,15 +222,8 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
                         rounded(float(part[row, column]), place)[0] for part in (value, off)
                     )
                     cells += text, rounded(0.0, expanded)[1], deviation
-                celsius = minus(f'{at[row]:.1f}')
-                table.rows.append(StateResult(program.name, celsius, *cells))
+                table.rows.append(tuple(cells))
     return tables
-
-
-def _four_digits(value: Floats) -> Floats:
-    """Return uncertainties, (columns,), for which `rounded` gives 4 digits of largest values."""
-    largest = np.maximum(np.abs(value).max(axis=0), 1e-3)
-    return np.asarray(10.0 ** (np.floor(np.log10(largest)) - 2.0))
 
 
 def _gravity_part(evidence: Evidence, info: CertificateInfo) -> float:
@@ -215,19 +232,6 @@ def _gravity_part(evidence: Evidence, info: CertificateInfo) -> float:
     if sd is None or evidence.calibration is None:
         return np.nan
     return sd / evidence.calibration.gravity_m_s2
-
-
-def withheld_because(evidence: Evidence, info: CertificateInfo) -> str:
-    """Return the reason for withheld expanded uncertainties; empty if none is withheld."""
-    calibration = evidence.calibration
-    if calibration is not None and not calibration.has_uncertainty:
-        return 'U is withheld: the calibration states no uncertainty.'
-    if unclaimed_gravity_sd(evidence, info) is None:
-        return (
-            'U of the scale factors and of |f| − g is withheld: the uncertainty of local gravity, '
-            'a part of U, is not stated.'
-        )
-    return ''
 
 
 def conformity(evidence: Evidence) -> tuple[str, str]:
@@ -259,3 +263,52 @@ def _slope(calibration: Calibration) -> float:
 
 def _rms(values: Floats) -> float:
     return float(np.sqrt(np.mean(values**2)))
+
+
+def programs(calibration: Calibration) -> list[Program]:
+    """Return a soak and, if bias or scale depend on the rate, ramps at half the valid rates."""
+    static, dynamic = calibration.regime_sets()
+    result = [Program('soak', static, 0.0)]
+    if calibration.response or static != dynamic:
+        cooling, heating = (round(edge / 2.0, 1) for edge in dynamic.rate_range_k_min)
+        ramps = (Program('heating', dynamic, heating), Program('cooling', dynamic, cooling))
+        result += [ramp for ramp in ramps if ramp.rate_k_min]
+    return result
+
+
+def evaluate(calibration: Calibration, program: Program, temperature: Floats) -> Curve:
+    """Evaluate bias and scale in a soak or ramp at board temperatures, shape (n,)."""
+    rate = program.rate_k_min / 60.0
+    lower, upper = program.regime.temperature_range_c
+    begun = lower if rate > 0.0 else upper
+    lasted_s = (temperature - begun) / rate if rate else 0.0
+    states = ramp_states(calibration, temperature, rate, lasted_s)
+    bias, scale = bias_and_scale(calibration, states)
+    sd_bias, sd_scale = sd_of_states(calibration, states)
+    bias_0, _, scale_0, _ = in_a_soak(calibration)
+    value = np.hstack(((bias - bias_0) / MICRO_G, (scale / scale_0 - 1.0) * 1e6))
+    return Curve(program, temperature, value, np.hstack((sd_bias / MICRO_G, sd_scale * 1e6)))
+
+
+def curves(calibration: Calibration) -> list[Curve]:
+    """Evaluate soak and ramps over the temperature range of their sets."""
+    return [
+        evaluate(calibration, program, np.linspace(*program.regime.temperature_range_c, _N_CURVE))
+        for program in programs(calibration)
+    ]
+
+
+def slopes(soak: Curve) -> Floats:
+    """Fit a straight line to each column of a soak and give its slope per kelvin, shape (6,)."""
+    return np.asarray(np.polyfit(soak.temperature, soak.value, 1)[0])
+
+
+def table_temperatures(lowest: float, highest: float) -> Floats:
+    """Return the temperatures of a table: both ends of a range, and round numbers in between."""
+    span = highest - lowest
+    step = next((k for k in _STEPS_K if span <= k * (_MOST_TEMPERATURES - 2)), _STEPS_K[-1])
+    within = step * np.arange(math.ceil(lowest / step), math.floor(highest / step) + 1)
+    # Skip round temperatures within a quarter of a step from an end of the range: these rows would
+    # repeat the row of the end.
+    kept = within[(within - lowest > 0.25 * step) & (highest - within > 0.25 * step)]
+    return np.array([lowest, *kept, highest])

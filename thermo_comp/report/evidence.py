@@ -1,11 +1,16 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the data of a report of a fit, of bags, or of a calibration; nothing is drawn here."""
+"""
+Owns the data of a report of a fit, of bags, or of a calibration, and of the bag that figures over
+time show; nothing is drawn here.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal, TypeVar
+from itertools import groupby
+from operator import itemgetter
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -13,19 +18,22 @@ from ..fitting import FitResult, ResidualRow
 from ..fitting.coverage import LeastKnown, distinct_directions, least_known
 from ..fitting.data_checks import Finding
 from ..fitting.reduction import ReducedBag
-from ..fitting.sensors import learn_detector
+from ..fitting.sensors import learn_detector, readings_in_order
 from ..judging.evaluation import Epoch, history_of, judge_bags
 from ..judging.judgement import Judgement
 from ..judging.verdicts import Verdict
 from ..judging.windows import WINDOW_S, JudgedWindows, corrected_windows, usual_window
 from ..replay import check_unit
 from ..text import counted
+from ..thermal.lags import BOARD_INPUT
+from ..thermal.regime import Regime
+from ..thermal.settings import DetectorSettings
+from ..thermal.tracker import ThermalTracker
 from ..typing import Floats
 from ..unit.calibration import Calibration
 from ..unit.gravity import ug_text
 from ..unit.metrics import means_by, norm_residual
 from ..unit.provenance import Source
-from .trace import ShownBag, shown_bag, widest
 
 _T = TypeVar('_T')
 
@@ -38,6 +46,8 @@ LEFT_OUT = 'left out'
 _SLOWEST_RAMP_K_MIN = 0.05
 #: Key of a bag's metadata in which the simulator stores the truth.
 _SIMULATED = 'truth'
+# Largest number of points of a line; a figure has fewer pixels in a row.
+_MOST_POINTS = 4000
 
 
 @dataclass(frozen=True)
@@ -49,6 +59,35 @@ class Position:
     duration_s: float
     up: tuple[float, ...]
     residual_rms: dict[str, float]
+
+
+class Stretch(NamedTuple):
+    """An interval [s since start] of one regime and direction (-1 cooling, +1 heating, 0 none)."""
+
+    start: float
+    stop: float
+    regime: Regime
+    direction: int
+
+
+@dataclass(frozen=True)
+class ShownBag:
+    """Rates, second derivative (NaN until settled) and regimes of a bag over time [K, s]."""
+
+    index: int
+    bag: ReducedBag
+    start_ns: int
+    duration_s: float
+    time: Floats
+    board_rate: Floats
+    case_rate: Floats
+    acceleration: Floats
+    stretches: tuple[Stretch, ...]
+
+    @property
+    def leader(self) -> str:
+        """The leading sensor: the case's if the bag has a case thermometer, else the board's."""
+        return 'case' if len(self.bag.case.value) else 'board'
 
 
 @dataclass(frozen=True)
@@ -106,8 +145,6 @@ class Evidence:
             if self.bags:
                 return 'not judged: no recording has a rest of the length of a window'
             return 'the calibration alone: no recording was judged'
-        if not self.bags:
-            return 'nothing to show yet: no file could be read'
         return 'a thermal record: no calibration was judged'
 
     @property
@@ -285,3 +322,60 @@ def _against(calibration: Calibration) -> tuple[str, ...]:
         notes.append('the calibration states no uncertainty')
     notes += [note for note in calibration.provenance.notes if not note.startswith('positions: ')]
     return tuple(dict.fromkeys(notes))
+
+
+def span_of(bag: ReducedBag) -> tuple[int, float]:
+    """Return start [ns] and length [s] of a bag's samples or, without samples, of its readings."""
+    start_ns, end_ns = bag.start_ns, bag.end_ns
+    if not bag.n_samples:
+        start_ns, end_ns = bag.board.stamp_ns[[0, -1]].tolist()
+    return start_ns, (end_ns - start_ns) * 1e-9
+
+
+def widest(bags: Sequence[ReducedBag]) -> int:
+    """Return the index of the bag with the widest range of T_board; if several, the longest."""
+    spans = [float(np.ptp(bag.board.value)) if len(bag.board.value) else 0.0 for bag in bags]
+    # Spans within 5 % and lengths within a minute count as equal; of equal bags take the first.
+    candidates = [i for i, span in enumerate(spans) if span >= 0.95 * max(spans)]
+    return max(candidates, key=lambda i: (round((bags[i].end_ns - bags[i].start_ns) / 60e9), -i))
+
+
+def shown_bag(bag: ReducedBag, index: int, detector: DetectorSettings) -> ShownBag:
+    """Run thermometers and detector over a bag's readings, as the node would."""
+    tracker = ThermalTracker(detector)
+    start_ns, end = span_of(bag)
+    readings = readings_in_order(bag, (BOARD_INPUT, 'case'))
+    rows, flags = [], []
+    for reading in readings:
+        tracker.read(*reading)
+        b, c = tracker.board, tracker.case
+        lead = b if c.stamp_ns is None else c
+        rows.append((b.rate, b.var_rate, c.rate, c.var_rate, *lead.acceleration))
+        flags.append((tracker.detector.regime, tracker.detector.direction))
+    time: Floats = np.array([stamp_ns - start_ns for _, stamp_ns, _ in readings]) * 1e-9
+    # Of several regimes at one time the last applies; equal successive regimes are joined.
+    state_at = {
+        0.0: (Regime.UNKNOWN, 0),
+        **dict(zip(np.clip(time, 0.0, end).tolist(), flags, strict=True)),
+    }
+    changes = [next(run) for _, run in groupby(state_at.items(), key=itemgetter(1))]
+    begins = [begin for begin, _ in changes]
+    stretches = (
+        Stretch(begin, stop, *state)
+        for (begin, state), stop in zip(changes, [*begins[1:], end], strict=True)
+        if stop > begin
+    )
+    every = slice(None, None, len(time) // _MOST_POINTS + 1)
+    columns = np.array(rows).reshape(-1, 3, 2)[every]
+    board, case, bend = (_settled(*columns[:, k].T) for k in range(3))
+    return ShownBag(index, bag, start_ns, end, time[every], board, case, bend, tuple(stretches))
+
+
+def _settled(value: Floats, variance: Floats) -> Floats:
+    """Set an estimate to NaN until its sd has fallen to three times the median sd."""
+    known = np.isfinite(value) & np.isfinite(variance)
+    if not known.any():
+        return np.full(len(value), np.nan)
+    usual = float(np.median(variance[known]))
+    first = int(np.argmax(known & (variance <= 9.0 * usual)))
+    return np.where(known & (np.arange(len(value)) >= first), value, np.nan)

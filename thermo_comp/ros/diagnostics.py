@@ -63,6 +63,7 @@ _FAULTS = {
     Fault.STILL: 'stands still (equal readings), its standard deviation grows',
     Fault.FROZEN: 'frozen (equal readings) while the other temperature changes: not used',
     Fault.STEP: 'jumped by {:+.2f} K; its readings are not used',
+    Fault.COPY: 'repeats the readings of the board: is one topic given for both?',
     Fault.LOOSE: 'is {:.1f} K farther from that of the case than in the fit: thermometer loose?',
 }
 
@@ -309,6 +310,9 @@ def findings_of(
     if status.is_lead_reversed:
         yield _ERROR, SWAPPED
     gravity = status.gravity
+    if gravity is None and status.is_refuted:
+        before = '|f| at rest differed from gravity before the stamps jumped back'
+        yield _ERROR, f'{before}: nothing is published until |f| at rest agrees with gravity'
     if gravity is not None:
         missed = f'|f| at rest differs from gravity by {gravity.residual:+.2e}'
         missed += f' +- {gravity.residual_sd:.1e} m/s^2'

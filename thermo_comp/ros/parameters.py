@@ -111,8 +111,8 @@ class NodeConfig:
     stuck_timeout: float = _parameter(
         _DEFAULTS.stuck_timeout_s,
         'Time after which samples that repeat their values on all axes, or on one axis while the '
-        'other two change, are not published [s]; samples of three zeros are dropped at once; '
-        '0: repeated values and zeros are published.',
+        'others change or show their noise, are not published [s]; samples of three zeros are '
+        'dropped at once; 0: repeated values and zeros are published.',
         (0.0, 3600.0),
     )
     local_gravity: float = _parameter(

@@ -1,16 +1,16 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the plan of a thermal test: the program of the chamber, and the attitudes of the unit."""
+"""Owns the plan of a thermal test: program of the chamber, attitudes and rotations of the unit."""
 
 import math
 import re
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
 from ..typing import Floats
 from ..unit.gravity import STANDARD_GRAVITY
-from .spin import Spin, steps
 from .unit import Stream, generator
 
 _STEP = re.compile(
@@ -157,11 +157,38 @@ def positions(n: int, seed: int = 0) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
+class Spin:
+    """
+    A rotation about a vertical axis: `rate` [rad/s], linear between the times [s]; `radius` [m];
+    `inward`: horizontal direction from the unit to the axis, in the frame of the unit.
+    """
+
+    time_s: tuple[float, ...]
+    rate: tuple[float, ...]
+    radius: float
+    inward: Floats
+
+    def rate_at(self, time: Floats) -> Floats:
+        """Return the rotation rate [rad/s] at times [s]."""
+        return np.interp(time, self.time_s, self.rate)
+
+    def forces(self, upward: Floats, time: Floats) -> Floats:
+        """Return the specific force of rotation and gravity at times [s], shape (n, 3)."""
+        return np.asarray(upward + (self.rate_at(time) ** 2 * self.radius)[:, None] * self.inward)
+
+    def sections(self, gravity: float) -> list[tuple[float, float, float]]:
+        """List the intervals of constant rotation rate: begin [s], end [s], |f| [m/s^2]."""
+        knots = zip(self.time_s, self.rate, strict=True)
+        return [
+            (begin, end, math.hypot(gravity, rate * rate * self.radius))
+            for (begin, rate), (end, after) in pairwise(knots)
+            if rate == after
+        ]
+
+
+@dataclass(frozen=True, eq=False)
 class Position:
-    """
-    A position of a test: the chamber's program, the direction of the specific force at rest, and a
-    rotation whose centripetal acceleration adds to the specific force.
-    """
+    """A position of a test: chamber program, direction of the force at rest, and a rotation."""
 
     program: Cyclogram
     up: Floats
@@ -199,17 +226,30 @@ def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
     return (*bench, *_positions(parse_cyclogram('three-hours'), ups))
 
 
+def steps(
+    begins_s: tuple[float, ...], rates: tuple[float, ...], dwell_s: float, ramp_s: float
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return times and rates of runs from `begins_s` [s] on: all `rates`, with ramps between."""
+    time, rate = [0.0], [0.0]
+    for begin in begins_s:
+        now = begin
+        for wanted in (*rates, 0.0):
+            time += [now, now + ramp_s]
+            rate += [rate[-1], wanted]
+            now += ramp_s + dwell_s
+    time.append(math.inf)
+    rate.append(0.0)
+    return tuple(time), tuple(rate)
+
+
 def _spinning(radius: float, rates: tuple[float, ...], seed: int) -> tuple[Position, ...]:
     program = parse_cyclogram('three-soaks')
     begins = tuple(end - _LEAD_S for end in _SOAK_ENDS_S)
     time, rate = steps(begins, rates, _DWELL_S, _RAMP_S)
-    across = np.roll(positions(12, seed), 1, axis=1)
-    result = []
-    for inward, other in zip(positions(12, seed), across, strict=True):
-        up = np.cross(inward, other)
-        spin = Spin(time, rate, radius, inward)
-        result.append(Position(program, up / np.linalg.norm(up), spin))
-    return tuple(result)
+    inward = positions(12, seed)
+    ups = np.cross(inward, np.roll(inward, 1, axis=1))
+    pairs = zip(ups, (Spin(time, rate, radius, direction) for direction in inward), strict=True)
+    return tuple(Position(program, up / np.linalg.norm(up), spin) for up, spin in pairs)
 
 
 def _positions(program: Cyclogram, ups: Floats) -> tuple[Position, ...]:

@@ -125,9 +125,7 @@ class ThermalNetwork:
         return self.settled(air)[: len(self.nodes)]
 
     def air_for(self, node: str, temperature: float) -> float:
-        """
-        Return the air temperature that brings a part to a given temperature in an endless soak.
-        """
+        """Return the air temperature at which a part has a temperature after an endless soak."""
         i = self.nodes.index(node)
 
         def error(air: Floats) -> float:
@@ -151,8 +149,7 @@ class ThermalResponse:
         self.network, self._time = network, time
         heat = network.thermostat
         if heat is not None:
-            n = len(network.nodes)
-            watts = [network.settled(float(a))[n] for a in (air.max(), air.min())]
+            watts = [network.settled(float(a))[-1] for a in (air.max(), air.min())]
             if watts[0] < 0.0 or watts[1] > heat.max_power:
                 raise ValueError(
                     f'air of {air.min():g}..{air.max():g} degC needs {watts[0]:.2f}..'

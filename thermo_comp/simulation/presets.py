@@ -161,16 +161,9 @@ def _mems(draw: Specimen) -> UnitModel:
         PartEffect('board', 'package', bias=draw.normal(300.0)),
         CreepEffect('package', 4.0 * 3600.0, bias=draw.normal(2.0)),
     )
-    unit = draw.unit(
-        network,
-        drift,
-        full_scale_g=16.0,
-        bias_ug=20000.0,
-        spread=0.02,
-        misalignment_sd=1e-2,
-        noise_density=(120.0, 120.0, 150.0),
-        converter=rounded,
-    )
+    noise: dict[str, Any] = {'noise_density': (120.0, 120.0, 150.0), 'converter': rounded}
+    spreads = {'bias_ug': 20000.0, 'spread': 0.02, 'misalignment_sd': 1e-2}
+    unit = draw.unit(network, drift, full_scale_g=16.0, **spreads, **noise)
     rate = (
         PartEffect('die', bias=draw.signed(5.0, 20.0), bias_curvature=draw.normal(0.1)),
         PartEffect('board', 'package', bias=draw.normal(30.0)),

@@ -15,10 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from ..typing import Bools, Floats, Ints
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 from ..unit.rate_bias import MILLIDEGREE
-from .campaign import Cyclogram, Position
+from .campaign import Cyclogram, Position, Spin
 from .drift import PartHistory, drift_of
 from .network import ThermalResponse
-from .spin import Spin
 from .unit import REFERENCE_C, Stream, SwitchedLoad, UnitModel, first_charge, generator, white
 
 START_NS = 1_767_225_600_000_000_000  # 2026-01-01T00:00:00Z
@@ -95,18 +94,11 @@ def arrays(
     unit: UnitModel, stations: Sequence[Position], seed: int = 0, *, rate_hz: float = 4.0
 ) -> list[SimulatedRun]:
     """Simulate all positions of a test in memory, each with another seed, stamps from 0."""
-    return [
-        simulate(
-            unit,
-            station.program,
-            station.up,
-            rate_hz=rate_hz,
-            seed=1000 * seed + k,
-            start_ns=0,
-            spin=station.spin,
-        )
-        for k, station in enumerate(stations)
-    ]
+    runs = []
+    for number, station in enumerate(stations, 1000 * seed):
+        options: dict[str, Any] = {'seed': number, 'spin': station.spin, 'start_ns': 0}
+        runs.append(simulate(unit, station.program, station.up, rate_hz=rate_hz, **options))
+    return runs
 
 
 def simulate_blocks(
@@ -152,10 +144,8 @@ def simulate_blocks(
     read = unit
     if temperature_rate_hz is not None:
         read = unit.with_thermometers(rate_hz=temperature_rate_hz)
-    readings = (
-        read.board.read(truth.response, duration, seed, Stream.BOARD_NOISE),
-        read.case.read(truth.response, duration, seed, Stream.CASE_NOISE),
-    )
+    sensors = (read.board, Stream.BOARD_NOISE), (read.case, Stream.CASE_NOISE)
+    readings = [each.read(truth.response, duration, seed, noise) for each, noise in sensors]
     return _blocks(truth, readings, spin, (n_cycles, block_size, rate_hz), seed, start_ns)
 
 

@@ -14,11 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..typing import Floats, Ints
-from ..unit.gravity import EARTH_RATE, MICRO_G
+from ..unit.gravity import EARTH_RATE, MICRO_G, STANDARD_GRAVITY
 from ..unit.rate_bias import MILLIDEGREE
 from .drift import ZERO, Effect, PartHistory, Triple, drift_of
 from .network import ThermalNetwork, ThermalResponse
-from .spin import Bend
 
 _NS = 1_000_000_000
 REFERENCE_C = 20.0  # board temperature, in a soak, at which K and bias are stated [degC]
@@ -147,6 +146,24 @@ class GyroModel:
         north = rng.standard_normal(3)
         turn_on = self.turn_on * MILLIDEGREE * rng.standard_normal(3)
         return np.asarray(EARTH_RATE * north / np.linalg.norm(north) + turn_on)
+
+
+@dataclass(frozen=True)
+class Bend:
+    """
+    Nonlinear terms ``K2 f^2 + K3 f^3`` of the axes: K2 [ug/g^2] and K3 [ug/g^3] at the reference
+    temperature, and the relative change of K2 and K3 per kelvin of the board.
+    """
+
+    square: Triple = ZERO
+    cube: Triple = ZERO
+    per_kelvin: float = 0.0
+
+    def added(self, force: Floats, t: Floats) -> Floats:
+        """Return the nonlinear terms [m/s^2], shape (n, 3), t [K] above the reference."""
+        f = force / STANDARD_GRAVITY
+        terms = np.array(self.square) * f**2 + np.array(self.cube) * f**3
+        return np.asarray(MICRO_G * (1.0 + self.per_kelvin * t)[:, None] * terms)
 
 
 @dataclass(frozen=True)

@@ -55,6 +55,10 @@ LEAD_SHARE: Final = 0.15
 LEAD_READINGS: Final = 5
 LEAD_RATE_SHARE: Final = 0.3
 DOUBTFUL_RATE_SHARE: Final = 0.03
+#: Number of changed readings in a row equal to the board's after which a sensor counts as a copy
+#: of the board's, and the largest time between two readings that are compared [ns].
+COPIED_READINGS: Final = 10
+_TOGETHER_NS: Final = 10_000_000
 _NOISE_SDS: Final = 6.0  # largest deviation of a temperature due to noise, in sd
 #: Time [ns] for which the rates of both sensors must be low before the temperatures count as
 #: constant: estimates of rates start at 0, also in a unit that heats itself after switch-on.
@@ -74,6 +78,9 @@ class Fault(Enum):
     #: A board temperature that differs from the case's by more than ramp and self-heating explain,
     #: as with a loose thermometer: its readings are used, with a larger variance.
     LOOSE = 'apart'
+    #: Readings equal to the board's, as if both inputs had one topic: they are used, and the
+    #: gradient that a lost sensor would have adds to the variance.
+    COPY = 'copy of the board'
 
 
 class SensorCheck:
@@ -251,6 +258,34 @@ def still_readings(settings: ThermometerSettings) -> int:
     if not 0.0 < same < 1.0:
         return STILL_READINGS
     return max(STILL_READINGS, round(log(STILL_PROBABILITY) / log(same)))
+
+
+class CopyCheck:
+    """
+    Finds out whether a sensor repeats the readings of the board, as when one topic is given for
+    both. The gradients of such a sensor would be 0 in each ramp.
+    """
+
+    def __init__(self) -> None:
+        self.is_copy = False
+        self._n_equal = 0
+        self._compared = nan
+        #: The last reading [degC] and its stamp [ns] that has not been compared, and whether it is
+        #: the board's.
+        self._waiting: tuple[bool, int, float] | None = None
+
+    def update(self, is_board: bool, stamp_ns: int, celsius: float) -> None:
+        """Take a reading of the board or of the sensor."""
+        before, self._waiting = self._waiting, (is_board, stamp_ns, celsius)
+        if before is None or before[0] is is_board or abs(stamp_ns - before[1]) > _TOGETHER_NS:
+            return
+        self._waiting = None
+        if celsius != before[2]:
+            self._n_equal, self.is_copy = 0, False
+        elif celsius != self._compared:
+            self._n_equal += 1
+            self.is_copy = self._n_equal >= COPIED_READINGS
+        self._compared = celsius
 
 
 class LeadCheck:

@@ -14,7 +14,7 @@ from typing import Final
 
 from .lags import BOARD_INPUT, MemorySpec, start_covariance
 from .memory import ThermalMemory
-from .plausibility import Fault, LeadCheck, SensorCheck
+from .plausibility import CopyCheck, Fault, LeadCheck, SensorCheck
 from .regime import Regime, RegimeDetector
 from .settings import DetectorSettings, ThermalConfig
 from .state import BOARD, GRADIENT, MEMORY_SETTLED_SD, USUAL_BOARD_LAG_S
@@ -55,6 +55,7 @@ class ThermalTracker:
             BOARD_INPUT: SensorCheck(self.board, self.case, board_lag_s),
             **{name: SensorCheck(sensor, self.board, 0.0) for name, sensor in others.items()},
         }
+        self.copies = {name: CopyCheck() for name in others}
         self.memory = ThermalMemory(self.spec)
         #: Stamp of the newest reading that was used, or None before the first reading.
         self.updated_ns: int | None = None
@@ -109,6 +110,7 @@ class ThermalTracker:
     def read(self, name: str, stamp_ns: int, celsius: float) -> bool:
         """Take a reading [degC]; return False if it is old, an outlier or implausible."""
         sensor, check = self.thermometers[name], self.checks[name]
+        self._compare(name, stamp_ns, celsius)
         if not self._use(name, sensor, check, stamp_ns, celsius):
             return False
         if sensor is self.board:
@@ -130,6 +132,12 @@ class ThermalTracker:
                 self._decide(stamp_ns, sensor)
             self.lead.update(self.detector.regime is Regime.STATIC)
         return True
+
+    def _compare(self, name: str, stamp_ns: int, celsius: float) -> None:
+        """Compare a reading of the board or of a sensor with the other's."""
+        is_board = name == BOARD_INPUT
+        for other in self.copies if is_board else (name,):
+            self.copies[other].update(is_board, stamp_ns, celsius)
 
     def _follow_board(self, stamp_ns: int) -> None:
         board, memory = self.board, self.memory
@@ -247,7 +255,11 @@ class ThermalTracker:
         for name in self.spec.sensors:
             gradient, variance = self._gradient(name, stamp_ns, board, rate)
             gradients.append(gradient)
-            pairs += [gradient, variance + self.checks[name].extra_variance(stamp_ns)]
+            variance += self.checks[name].extra_variance(stamp_ns)
+            if self.copies[name].is_copy:
+                true, unknown = self._lost_gradient(name, stamp_ns, rate)
+                variance += true * true + unknown
+            pairs += [gradient, variance]
         for name in self.spec.rates:
             sensor = self.thermometers[name]
             is_live = self.is_live(stamp_ns, sensor)

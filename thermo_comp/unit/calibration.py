@@ -32,7 +32,7 @@ from .nonlinearity import Nonlinearity
 from .posterior import ParameterLayout, Posterior, lay_out
 from .provenance import GroupEvidence, Provenance
 from .rate_bias import LARGEST_RATE, NIL, Gyroscope, RateCurve, RateSet, RateTerm
-from .schema import Vector, check_ranges
+from .schema import Vector, broken, check_ranges
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -83,10 +83,8 @@ class AxisReference:
     def __post_init__(self) -> None:
         bounds = QUANTITIES['scale factor']
         if bounds.fault(abs(self.scale_factor)):
-            raise ValueError(
-                f'`scale_factor` must be {bounds.at_least:g} to {bounds.at_most:g} in magnitude, '
-                f'got {self.scale_factor:g}'
-            )
+            rule = f'be {bounds.at_least:g} to {bounds.at_most:g} in magnitude'
+            raise broken('scale_factor', rule, self.scale_factor)
 
 
 @dataclass(frozen=True)
@@ -158,10 +156,8 @@ class RegimeSet:
         at = [point.temperature_c for point in self.lack_of_fit]
         for k, (before, after) in enumerate(pairwise(at)):
             if not before < after:
-                raise ValueError(
-                    f'`lack_of_fit[{k + 1}].temperature_c` must be above the previous entry '
-                    f'({before:g}), got {after:g}'
-                )
+                rule = f'be above the previous entry ({before:g})'
+                raise broken(f'lack_of_fit[{k + 1}].temperature_c', rule, after)
 
     def axes(self) -> tuple[AxisSet, AxisSet, AxisSet]:
         """Return the curves of the axes x, y, z."""
@@ -246,14 +242,17 @@ class Calibration:
 
     def __post_init__(self) -> None:
         if (version := self.format_version) != FORMAT_VERSION:
-            raise ValueError(f'`format_version` must be {FORMAT_VERSION}, got {version}')
+            raise broken('format_version', f'be {FORMAT_VERSION}', version)
         self._check_misalignment()
         self._check_sensors()
         if self.rest_gradient_range_k is not None:
             check_ranges(self, rest_gradient_range_k=QUANTITIES['temperature span'])
         check_limits(self, parameter_layout(self))
         if self.gyroscope is not None:
-            self._check_gyroscope()
+            try:
+                rate_triad(self)  # the rules for the three accelerometers apply
+            except ValueError as error:
+                raise ValueError(str(error).replace('`', '`gyroscope.', 1)) from error
 
     def _check_misalignment(self) -> None:
         for (row, column), value in np.ndenumerate(np.array(self.misalignment)):
@@ -263,28 +262,17 @@ class Calibration:
             elif column < row:
                 is_good, rule = abs(value) < 0.5, 'below 0.5 in magnitude'
             if not is_good:
-                raise ValueError(f'`misalignment[{row}][{column}]` must be {rule}, got {value:g}')
+                raise broken(f'misalignment[{row}][{column}]', f'be {rule}', value)
 
     def _check_sensors(self) -> None:
         names = self.sensors
         if not names or len(set(names)) != len(names) or not all(names) or 'board' in names:
-            raise ValueError(
-                '`sensors` must be one or more different names, none of them board, '
-                f'got {list(names)}'
-            )
+            rule = 'be one or more different names, none of them board'
+            raise broken('sensors', rule, list(names))
         for k, term in enumerate(self.response):
             if term.is_of_sensor and term.sensor not in names:
-                raise ValueError(
-                    f'`response[{k}].sensor` must be one of sensors {list(names)}, '
-                    f'got {term.sensor!r}'
-                )
-
-    def _check_gyroscope(self) -> None:
-        """Check the gyroscope by the rules for the three accelerometers."""
-        try:
-            rate_triad(self)
-        except ValueError as error:
-            raise ValueError(str(error).replace('`', '`gyroscope.', 1)) from error
+                rule = f'be one of sensors {list(names)}'
+                raise broken(f'response[{k}].sensor', rule, repr(term.sensor))
 
     def correct(
         self, time_s: ArrayLike, counts: ArrayLike, *, board: Temperature = ([], []), **others: Any
@@ -301,41 +289,41 @@ class Calibration:
     @property
     def needs_temperature(self) -> bool:
         """Whether any parameter of the correction depends on the temperature or on the regime."""
-        weights: list[float] = []
-        for axis in (axis for part in self.regime_sets() for axis in part.axes()):
-            weights += (axis.delta, *axis.bias_function.free_coefficients)
-            weights += axis.scale_function.free_coefficients
         gyroscope = self.gyroscope
-        for rate in (*gyroscope.static.axes(), *gyroscope.dynamic.axes()) if gyroscope else ():
-            weights += (rate.delta, *rate.bias_function.free_coefficients)
+        sets = (*self.regime_sets(), *((gyroscope.static, gyroscope.dynamic) if gyroscope else ()))
+        weights: list[float] = []
+        for axis in (axis for part in sets for axis in part.axes()):
+            weights += (axis.delta, *axis.bias_function.free_coefficients)
+            if isinstance(axis, AxisSet):
+                weights += axis.scale_function.free_coefficients
         for term in self.nonlinearity.terms if self.nonlinearity else ():
             weights += term.per_kelvin
-        return any(weights) or bool(self.response or (gyroscope and gyroscope.response))
+        return any(weights) or bool(self.columns)
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """The columns of the specific force, then those of the angular rate."""
+        return (*self.response, *(self.gyroscope.response if self.gyroscope else ()))
 
     @property
     def needs_case(self) -> bool:
         """Whether `detector.case` is not the default, or a column depends on one of `sensors`."""
-        columns = (*self.response, *(self.gyroscope.response if self.gyroscope else ()))
-        return self.detector.case != ThermometerSettings() or any(
-            column.is_of_sensor for column in columns
-        )
+        is_default = self.detector.case == ThermometerSettings()
+        return not is_default or any(column.is_of_sensor for column in self.columns)
 
     @property
     def has_uncertainty(self) -> bool:
         """Whether a posterior, misalignment sd, residual sd or lack of fit is given."""
-        return (
-            self.posterior is not None
-            or any(self.misalignment_sd)
-            or any(axis.residual_sd_m_s2 for part in self.regime_sets() for axis in part.axes())
-            or any(part.lack_of_fit for part in self.regime_sets())
-        )
+        sets = self.regime_sets()
+        sds = (axis.residual_sd_m_s2 for part in sets for axis in part.axes())
+        has_lacks = any(part.lack_of_fit for part in sets)
+        return self.posterior is not None or has_lacks or any((*self.misalignment_sd, *sds))
 
 
 def parameter_layout(calibration: Calibration) -> ParameterLayout:
     """Return the indices in the posterior of all parameters of a calibration."""
-    axes = zip(calibration.static.axes(), calibration.dynamic.axes(), strict=True)
     pairs: list[tuple[TemperatureFunction, TemperatureFunction]] = []
-    for static, dynamic in axes:
+    for static, dynamic in zip(*(part.axes() for part in calibration.regime_sets()), strict=True):
         pairs.append((static.bias_function, dynamic.bias_function))
         pairs.append((static.scale_function, dynamic.scale_function))
     blocks = lay_out(pairs, len(calibration.response))
@@ -351,10 +339,9 @@ def rate_triad(calibration: Calibration) -> Calibration:
         raise ValueError('`calibration` must have a gyroscope')
 
     def regime(shared: RegimeSet, curves: RateSet) -> RegimeSet:
-        x, y, z = (
-            AxisSet(curve.bias_function, Polynomial((1.0,)), curve.delta, sd)
-            for curve, sd in zip(curves.axes(), gyroscope.residual_sd_rad_s, strict=True)
-        )
+        one = Polynomial((1.0,))
+        pairs = zip(curves.axes(), gyroscope.residual_sd_rad_s, strict=True)
+        x, y, z = (AxisSet(curve.bias_function, one, curve.delta, sd) for curve, sd in pairs)
         # The lack of fit of the unit is an error of the specific force, not of the angular rate.
         return replace(shared, x=x, y=y, z=z, lack_of_fit=())
 
@@ -392,9 +379,7 @@ def gyroscope_of(triad: Calibration) -> Gyroscope:
         for regime_set in triad.regime_sets()
     )
     sx, sy, sz = (axis.residual_sd_m_s2 for axis in triad.static.axes())
-    terms = [vars(term).copy() for term in triad.response]
-    for keys in terms:
-        del keys['scale']
+    terms = [{k: v for k, v in vars(term).items() if k != 'scale'} for term in triad.response]
     posterior = triad.posterior
     if posterior is not None:
         rows = _bias_rows(triad)

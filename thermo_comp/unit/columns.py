@@ -9,13 +9,9 @@ dynamic regime. u is limited to the column's range, and t to the calibrated temp
 the calibrated temperatures the curves of the sets first continue along tangents, but t^power is
 constant, because no recording determines the weights of columns at these temperatures.
 
-The function `bank` makes the columns in groups. A group has the columns of the kind with the
-group's name, except for the following groups. Group *product* has the kind board, and group
-*gradient_x_temperature* the kinds gradient and gradient_lag, times a power of temperature, for
-coefficients that change with temperature. Group *square* also has the kind cube, and group
-*gradient_even* also the kinds size and square. Group *gradient_even_about_rest* has the kinds of
-*gradient_even*, for the gradient less its rest value. The fit makes group *part* of board, square
-and cube: their sum with a curve over the board temperature is a curve over a part's temperature.
+The function `bank` makes the columns in groups, which have one kind or more. The fit makes group
+*part* of board, square and cube: their sum with a curve over the board temperature is a curve over
+a part's temperature.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -32,7 +28,7 @@ from ..thermal.quantity import Quantity
 from ..thermal.state import BOARD, WEIGHT, Gradient, Rate, StateLayout
 from ..typing import Floats
 from .functions import by_element, hold
-from .schema import check_ranges
+from .schema import broken, check_ranges
 from .terms import GROUPS, LINE, TERMS, Term
 
 UNBOUNDED: Final = (-1e9, 1e9)
@@ -60,6 +56,8 @@ if TYPE_CHECKING:
 else:
     _Group, _Kind = Literal[tuple(GROUPS)], Literal[tuple(TERMS)]
 _Value = Annotated[float, QUANTITIES['value of a column']]
+_Lag = Annotated[float, QUANTITIES['lag']]
+_Kelvin = Annotated[float, QUANTITIES['gradient']]
 
 
 class Part(NamedTuple):
@@ -94,14 +92,10 @@ class Column:
     ]
     sensor: Annotated[str, 'Thermometer s of the gradient g_s = T_s - T_board.'] = 'case'
     tau_s: Annotated[
-        float,
-        QUANTITIES['lag'],
-        'Time constant of the lag; 0 = no lag (not in kinds board, gradient_lag and cube).',
+        _Lag, 'Time constant of the lag; 0 = no lag (not in kinds board, gradient_lag and cube).'
     ] = 0.0
     second_tau_s: Annotated[
-        float,
-        QUANTITIES['lag'],
-        'Time constant of a second stage of the lag, in series with the first; 0 = none.',
+        _Lag, 'Time constant of a second stage of the lag, in series with the first; 0 = none.'
     ] = 0.0
     sensor_share: Annotated[
         float,
@@ -109,8 +103,7 @@ class Column:
         'The part lags T_board + sensor_share * g_s (kinds board, square, cube, play, bend).',
     ] = 0.0
     lead_s: Annotated[
-        float,
-        QUANTITIES['lag'],
+        _Lag,
         'Lag of the board thermometer behind the temperature that drives the part, if '
         '`sensor_share` is 0; 0 = none.',
     ] = 0.0
@@ -118,14 +111,11 @@ class Column:
         float, QUANTITIES['width'], 'Width of kind gradient_even, half-width of a play.'
     ] = 0.0
     rest_k: Annotated[
-        float,
-        QUANTITIES['gradient'],
+        _Kelvin,
         'Gradient g_s in a soak, for the kinds gradient_even, size, and square without lag.',
     ] = 0.0
     knee_k: Annotated[
-        float,
-        QUANTITIES['gradient'],
-        'Temperature of the part less T_ref at which the slope of a bend changes.',
+        _Kelvin, 'Temperature of the part less T_ref at which the slope of a bend changes.'
     ] = 0.0
     power: Annotated[int, QUANTITIES['power'], 'Exponent of the factor T_board - T_ref.'] = 0
     during: Annotated[
@@ -140,21 +130,15 @@ class Column:
     def __post_init__(self) -> None:
         check_ranges(self, range=QUANTITIES['span of a column'])
         if self.kind not in TERMS:
-            raise ValueError(f'`kind` must be one of {tuple(TERMS)}, got {self.kind}')
+            raise broken('kind', f'be one of {tuple(TERMS)}', self.kind)
         for key in self.term.positive:
             if not getattr(self, key) > 0.0:
-                raise ValueError(
-                    f'`{key}` must be greater than 0 for {self.kind}, got {getattr(self, key):g}'
-                )
+                raise broken(key, f'be greater than 0 for {self.kind}', float(getattr(self, key)))
         if self.second_tau_s > 0.9 * self.tau_s:
-            raise ValueError(
-                f'`second_tau_s` must be at most 0.9 of `tau_s`, got {self.second_tau_s:g}'
-            )
+            raise broken('second_tau_s', 'be at most 0.9 of `tau_s`', float(self.second_tau_s))
         if self.lead_s and (self.sensor_share or not self.tau_s):
-            raise ValueError(
-                '`lead_s` must be 0 in a column without `tau_s` or with '
-                f'`sensor_share`, got {self.lead_s:g}'
-            )
+            rule = 'be 0 in a column without `tau_s` or with `sensor_share`'
+            raise broken('lead_s', rule, float(self.lead_s))
 
     @property
     def term(self) -> Term:
@@ -217,20 +201,15 @@ def bank(
     # The load of a heat pump is an even function of the gradient; an effect that is equal in
     # heating and cooling is an even function of the gradient less its value at rest.
     rest = at_rest or {}
-    columns += even + [
-        replace(column, group='gradient_even_about_rest', rest_k=rest[column.sensor])
-        for column in even
-        if rest.get(column.sensor)
-    ]
+    about_rest = partial(replace, group='gradient_even_about_rest')
+    columns += even
+    columns += [about_rest(c, rest_k=rest[c.sensor]) for c in even if rest.get(c.sensor)]
     columns += _family('play', ['play'], lags=of_plays, widths=PLAY_WIDTHS)
     least_k = LEAST_KNEE_K * MOST_KNEES / most_knees
     n_knees = min(int((span_k[1] - span_k[0]) / least_k), most_knees)
     knees = np.linspace(*span_k, n_knees + 2)[1:-1].round(3).tolist()
-    columns += [
-        replace(column, knee_k=knee)
-        for column in _family('bend', ['bend'], lags=of_bends)
-        for knee in knees
-    ]
+    bends = _family('bend', ['bend'], lags=of_bends)
+    columns += [replace(column, knee_k=knee) for column in bends for knee in knees]
     return tuple(columns)
 
 
@@ -243,12 +222,9 @@ def _family(
     widths: Sequence[float] = (0.0,),
 ) -> list[Column]:
     """Return the columns of a group: one for each combination of the listed values."""
+    ranges = {kind: TERMS[kind].bounds or UNBOUNDED for kind in kinds}
     return [
-        Column(
-            *(group, kind, sensor, *part, width),
-            power=power,
-            range=TERMS[kind].bounds or UNBOUNDED,
-        )
+        Column(group, kind, sensor, *part, width, power=power, range=ranges[kind])
         for sensor, kind, power, part, width in product(sensors, kinds, powers, lags, widths)
     ]
 
@@ -275,15 +251,8 @@ def memory_of(columns: Iterable[Column], sensors: Sequence[str] = ('case',)) -> 
 _DURING: Final = ('always', 'static', 'dynamic')
 
 
-def _root(order: int, x: float) -> float:
-    return float(x ** (1.0 / order))
-
-
 class ColumnTable:
-    """
-    Evaluates columns at thermal states (width, n), with results (n_columns, n). The result of a
-    state does not depend on the other states.
-    """
+    """Evaluates columns at thermal states (width, n), each state by itself: (n_columns, n)."""
 
     def __init__(
         self,
@@ -297,35 +266,19 @@ class ColumnTable:
         self._reference = reference_temperature
         lower, upper = temperature_range_c
         self._t_range = lower - reference_temperature, upper - reference_temperature
-        self._range = (
-            np.array([column.range for column in columns]).reshape(-1, 2).T[:, :, np.newaxis]
-        )
+        ranges = np.array([column.range for column in columns])
+        self._range = ranges.reshape(-1, 2).T[:, :, np.newaxis]
         self._power = np.array([column.power for column in columns], np.int64)
-        self._lowered = np.maximum(self._power - 1, 0)
         self._during = np.array([_DURING.index(column.during) for column in columns], np.int64)
-        orders = np.array([column.term.order for column in columns], np.int64)
-        self._roots = [
-            (np.flatnonzero(orders == order), partial(_root, order))
-            for order in set(orders.tolist()) - {1}
-        ]
+        self._orders = np.array([column.term.order for column in columns], np.int64)
         #: Whether any column applies in only one regime.
         self.differs = bool(self._during.any())
-        # The value u of columns that differ only in power, range or regime is evaluated once.
-        of = [
-            (layout.places[c.source], c.term, c.term.centre(c), c.term.width(c)) for c in columns
-        ]
-        sources = list(dict.fromkeys(of))
-        self._source = np.array([sources.index(source) for source in of], np.int64)
-        self._places = np.array([source[0] for source in sources], np.int64)
-        self._centres, self._widths = (
-            np.array([source[k] for source in sources])[:, np.newaxis] for k in (2, 3)
-        )
-        terms = np.array([source[1] for source in sources], object)
-        self._terms = [
-            (np.flatnonzero(terms == term), term)
-            for term in dict.fromkeys(terms.tolist())
-            if term.form is not LINE
-        ]
+        self._places = np.array([layout.places[c.source] for c in columns], np.int64)
+        self._centres = np.array([c.term.centre(c) for c in columns])[:, np.newaxis]
+        self._widths = np.array([c.term.width(c) for c in columns])[:, np.newaxis]
+        terms = np.array([c.term for c in columns], object)
+        bent = [term for term in dict.fromkeys(terms.tolist()) if term.form is not LINE]
+        self._terms = [(np.flatnonzero(terms == term), term) for term in bent]
         # The temperature of a part is the board temperature less the lag of the part.
         self._parts = np.flatnonzero([term.is_temperature for term in terms])
         self._is_lagging = self._places[self._parts][:, np.newaxis] != BOARD
@@ -335,7 +288,7 @@ class ColumnTable:
         u = self._scaled(states)
         for rows, term in self._terms:
             u[rows] = term.form.value(u[rows])
-        return np.asarray(u[self._source])
+        return u
 
     def _scaled(self, states: Floats) -> Floats:
         numbers = states[self._places]
@@ -349,13 +302,11 @@ class ColumnTable:
         return hold(raw, *self._range)
 
     def excess(self, raw: Floats) -> Floats:
-        """
-        Return how far the value of each column is outside the column's range, in half ranges; for
-        a power of a quantity, how far the quantity is outside its range.
-        """
+        """Return the excess over the range [half ranges]; for a power, that of its base."""
         lower, upper = self._range
         excess = np.asarray(np.abs(raw - self.held(raw)) / ((upper - lower) / 2.0))
-        for rows, root in self._roots:
+        for order in {*self._orders.tolist()} - {1}:
+            rows, root = self._orders == order, partial(pow, exp=1.0 / order)
             excess[rows] = by_element(root, 1.0 + excess[rows]) - 1.0
         return excess
 
@@ -365,7 +316,7 @@ class ColumnTable:
         n_powers = int(self._power.max(initial=0))
         powers = np.multiply.accumulate([np.ones_like(t), *[t] * n_powers])
         shares = np.array([np.ones_like(weight), 1.0 - weight, weight])[self._during]
-        lowered = self._power[:, np.newaxis] * powers[self._lowered] if n_powers else 0.0
+        lowered = self._power[:, np.newaxis] * powers[np.maximum(self._power - 1, 0)]
         return powers[self._power] * shares, lowered * shares
 
     def values(self, states: Floats) -> Floats:
@@ -383,8 +334,8 @@ class ColumnTable:
             slopes[rows] = term.form.slope(scaled[rows])
         slopes /= self._widths
         if not len(self._parts):
-            return np.asarray(slopes[self._source]), None
+            return slopes, None
         by_board = np.zeros_like(slopes)
         by_board[self._parts] = slopes[self._parts]
         slopes[self._parts] *= np.where(self._is_lagging, -1.0, 1.0)
-        return np.asarray(slopes[self._source]), np.asarray(by_board[self._source])
+        return slopes, by_board

@@ -82,11 +82,9 @@ class Correction:
         self.K = np.array(K)[:, np.newaxis]
         self._full_scale = calibration.unit.full_scale
         self._gravity = calibration.gravity_m_s2
-        response = calibration.response
+        response, reference = calibration.response, calibration.reference_temperature_c
         self.memory = memory or memory_of_unit(calibration)
-        self.table = ColumnTable(
-            response, self.memory, calibration.reference_temperature_c, self._span
-        )
+        self.table = ColumnTable(response, self.memory, reference, self._span)
         weights = np.array([(*term.bias, *term.scale) for term in response])
         self._W = weights.reshape(-1, 6).T[:, :, np.newaxis]
         self._is_present = (self._W[:3] != 0.0) | (self._W[3:] != 0.0)
@@ -96,10 +94,9 @@ class Correction:
         bends = slopes.std(axis=2, keepdims=True)
         self._bends = np.concatenate((bends * of_bias, bends * ~of_bias))
         rounding = ROUNDING_VARIANCE if calibration.unit.input == 'counts' else 0.0
-        self.noise = tuple(
-            density * density / calibration.unit.cycle_time_s + rounding / (k * k)
-            for density, k in zip(calibration.noise_density_m_s2_sqrt_hz, K, strict=True)
-        )
+        cycle_s, densities = calibration.unit.cycle_time_s, calibration.noise_density_m_s2_sqrt_hz
+        pairs = zip(densities, K, strict=True)
+        self.noise = tuple(d * d / cycle_s + rounding / (k * k) for d, k in pairs)
         self.noise_trace = sum(self.noise, 0.0)
         self._noise = np.array(self.noise)[:, np.newaxis]
         M = calibration.misalignment
@@ -114,9 +111,7 @@ class Correction:
         self.n_slow = N_ROWS if self.of_force is None else N_ROWS + 15
 
     def _find_columns_of_pairs(self) -> None:
-        """
-        Find the columns that depend on each quantity of the state whose variance is propagated.
-        """
+        """Find the columns of each quantity of the state whose variance is propagated."""
         self.layout = layout = StateLayout(self.memory)
         pair = np.array([layout.pairs.get(c.source, -1) for c in self.table.columns], np.int64)
         columns = np.argsort(pair, kind='stable')
@@ -151,12 +146,10 @@ class Correction:
     def gentle_transition(self, given_s: float) -> float:
         """Lengthen a transition [s], at most 10 times, to let the force change at GENTLE_RATE."""
         board = np.linspace(*self._span, _GAP_TEMPERATURES)
-        static, dynamic = self.curves.values(board)
-        gap = dynamic - static
+        gap = np.diff(self.curves.values(board), axis=0)[0]
         scale = np.abs(gap[3:]).max(axis=0)
-        largest = float(
-            (np.sqrt(((gap[:3] / self.K) ** 2).sum(axis=0)) + self._gravity * scale).max()
-        )
+        bias = np.sqrt(((gap[:3] / self.K) ** 2).sum(axis=0))
+        largest = float((bias + self._gravity * scale).max())
         return min(max(given_s, largest / GENTLE_RATE), LONGEST_TRANSITION * given_s)
 
     def excess(self, state: Sequence[float], *, is_dynamic: bool) -> Excess:
@@ -171,9 +164,8 @@ class Correction:
         columns = zip(beyond, self.table.columns, strict=True)
         gradients = [0.0, *(excess for excess, column in columns if column.is_gradient)]
         of_columns = float(self.table.excess(raw).max(initial=0.0))
-        return Excess(
-            over[is_dynamic], too_fast[is_dynamic], max(gradients, key=abs), curves + of_columns
-        )
+        gradient = max(gradients, key=abs)
+        return Excess(over[is_dynamic], too_fast[is_dynamic], gradient, curves + of_columns)
 
     def by_pairs(self, slopes: Floats) -> Floats:
         """
@@ -284,9 +276,8 @@ class Correction:
         parts = np.concatenate((board[np.newaxis], board - states[self._lagged]))
         parts_out = np.abs(parts - hold(parts, *self._span)).max(axis=0)
         if is_beyond or outside.any() or parts_out.any():
-            columns_out = np.where(self._is_present, self.table.excess(raw), 0.0).max(
-                axis=1, initial=0.0
-            )
+            columns_out = np.where(self._is_present, self.table.excess(raw), 0.0)
+            columns_out = columns_out.max(axis=1, initial=0.0)
             # Outside the calibrated range the curves are extrapolated. Add two errors: the slope
             # at the edge of the range times the board's distance from the edge, and the sd of the
             # slopes within the range times the larger distance: the board's or that of a part.
@@ -302,9 +293,8 @@ class Correction:
         if not (is_beyond or of_gap.any()):
             return v, growth
         if self.table.differs:
-            of_static, of_dynamic = (
-                self.table.factors(board, np.full_like(weight, w))[0] for w in (0.0, 1.0)
-            )
+            both = (np.full_like(weight, w) for w in (0.0, 1.0))
+            of_static, of_dynamic = (self.table.factors(board, w)[0] for w in both)
             gap = self._weigh(held * (of_dynamic - of_static), gap)
         held_back = self._weigh(beyond_range * factors[0], np.zeros_like(gap))
         of_gaps = np.array([of_gap, np.ones_like(of_gap)])
@@ -325,9 +315,7 @@ class Correction:
 
 def memory_of_unit(calibration: Calibration) -> MemorySpec:
     """Return the lags, plays and rates that the columns of force and angular rate need."""
-    gyroscope = calibration.gyroscope
-    columns = (*calibration.response, *(gyroscope.response if gyroscope else ()))
-    return memory_of(columns, calibration.sensors)
+    return memory_of(calibration.columns, calibration.sensors)
 
 
 def is_sound(line: Floats) -> npt.NDArray[np.bool_]:

@@ -18,13 +18,12 @@ array of the covariance of the errors u has the rows a, b, c of each axis, whose
 """
 
 from collections.abc import Sequence
-from functools import lru_cache
 from itertools import combinations_with_replacement
 from typing import Final, TypeVar
 
 import numpy as np
 
-from ..typing import Floats, Ints
+from ..typing import Floats
 from .functions import in_order
 
 # Type of a quantity: the value of one sample, or an array of many samples.
@@ -53,44 +52,36 @@ class CovarianceMap:
 
     def __init__(self, misalignment: Sequence[float]) -> None:
         yx, zx, zy = misalignment
-        self._places, self._factors = _sums(yx, zx, zy)
+        # Derivative of the force w.r.t. errors u: coefficients of 1, x, y, z, shape (axis, 4, u).
+        J = np.zeros((3, 4, 9))
+        J[0, 0, 0] = J[0, 1, 1] = J[1, 0, 2] = J[1, 2, 3] = J[2, 0, 4] = J[2, 3, 5] = 1.0
+        J[2] += zx * J[0] + zy * J[1]
+        J[1] += yx * J[0]
+        J[1, 1, 6] = J[2, 1, 7] = J[2, 2, 8] = 1.0
+        sums = np.zeros((N_COEFFICIENTS, 9, 9))
+        elements = zip(combinations_with_replacement(range(3), 2), _TERMS, strict=True)
+        places = [(*axes, *term) for axes, terms in elements for term in terms]
+        for place, (k, m, i, j) in enumerate(places):
+            products = np.outer(J[k, i], J[m, j]) + np.outer(J[k, j], J[m, i]) * (i != j)
+            sums[place] = products + np.tril(products, -1).T
+        u, w = np.array([*_OF_AXES, *BETWEEN]).T
+        factors = sums[:, u, w]
+        # The row b of an axis is twice the covariance of its constant error and its scale error.
+        factors[:, 1:9:3] /= 2.0
+        # In each sum few rows have a factor other than 0: keep these rows' indices and factors.
+        n = int((factors != 0.0).sum(axis=1).max())
+        self._places = np.argsort(factors == 0.0, axis=1, kind='stable')[:, :n]
+        self._factors = np.take_along_axis(factors, self._places, axis=1)[:, :, np.newaxis]
 
     def coefficients(self, rows: Floats) -> Floats:
         """Return the coefficients of xx, xy, ..., zz, (40, n), for rows of shape (45, n)."""
         return in_order(self._factors * rows[self._places], 1)
 
 
-@lru_cache(maxsize=16)
-def _sums(yx: float, zx: float, zy: float) -> tuple[Ints, Floats]:
-    """Return, for each coefficient, rows of the covariance of u and the weights of their sum."""
-    # Derivative of the force w.r.t. the errors u: coefficients of 1, x, y, z, shape (axis, 4, u).
-    J = np.zeros((3, 4, 9))
-    J[0, 0, 0] = J[0, 1, 1] = J[1, 0, 2] = J[1, 2, 3] = J[2, 0, 4] = J[2, 3, 5] = 1.0
-    J[2] += zx * J[0] + zy * J[1]
-    J[1] += yx * J[0]
-    J[1, 1, 6] = J[2, 1, 7] = J[2, 2, 8] = 1.0
-    sums = np.zeros((N_COEFFICIENTS, 9, 9))
-    elements = zip(combinations_with_replacement(range(3), 2), _TERMS, strict=True)
-    places = [(*axes, *term) for axes, terms in elements for term in terms]
-    for place, (k, m, i, j) in enumerate(places):
-        products = np.outer(J[k, i], J[m, j]) + np.outer(J[k, j], J[m, i]) * (i != j)
-        sums[place] = products + np.tril(products, -1).T
-    u, w = np.array([*_OF_AXES, *BETWEEN]).T
-    factors = sums[:, u, w]
-    # The row b of an axis is twice the covariance of its constant error and its scale error.
-    factors[:, 1:9:3] /= 2.0
-    # In each sum few rows have a factor other than 0: keep the indices and factors of these rows.
-    n = int((factors != 0.0).sum(axis=1).max())
-    used = np.argsort(factors == 0.0, axis=1, kind='stable')[:, :n]
-    return used, np.take_along_axis(factors, used, axis=1)[:, :, np.newaxis]
-
-
 def grown(between: Floats, growth: Floats) -> Floats:
     """Increase the rows `BETWEEN` (36, n) by the growth factors (3, n) of the axes' variances."""
     # The misalignment does not depend on the temperature, so its errors have the factor 1.
-    roots = np.repeat(
-        np.concatenate((np.sqrt(growth), np.ones_like(growth))), [2] * 3 + [1] * 3, 0
-    )
+    roots = np.concatenate((np.repeat(np.sqrt(growth), 2, 0), np.ones_like(growth)))
     return np.asarray(between * roots[_FIRST] * roots[_SECOND])
 
 

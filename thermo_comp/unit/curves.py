@@ -6,14 +6,12 @@ Owns the curves of static and dynamic set over board temperature, within and bey
 n thermal states are the columns of an array; results have the rows bias x, y, z, scale x, y, z.
 """
 
-from functools import cached_property
-
 import numpy as np
 
 from ..thermal.state import BOARD, RATE, WEIGHT
 from ..typing import Floats
 from .calibration import Calibration
-from .functions import TANGENT_SPANS, Functions, basis_slopes, hold
+from .functions import TANGENT_SPANS, basis_slopes, hold
 
 
 class Curves:
@@ -34,11 +32,10 @@ class Curves:
         # Edges of each set's range, shape (2, 2, 1): the lower edges, then the upper edges.
         self._t_range = (edges[:, 0].T - self._reference)[:, :, np.newaxis]
         self._rate_range = (edges[:, 1].T / 60.0)[:, :, np.newaxis]
-        rows = [
+        self._rows = [
             [axis.bias_function for axis in axes] + [axis.scale_function for axis in axes]
             for axes in (part.axes() for part in sets)
         ]
-        self._functions, self._others = Functions(rows), Functions(rows[::-1])
         # Index of the set whose tangent each set follows at the lower and at the upper end, shape
         # (2, 2).
         regimes, (lower, upper) = np.arange(2), self._t_range[:, :, 0]
@@ -48,27 +45,15 @@ class Curves:
         biases = [axis.bias for axis in calibration.axes]
         deltas = [[axis.delta for axis in part.axes()] for part in sets]
         self._levels = np.add(biases, deltas)[:, :, np.newaxis]
-        self._residuals = np.array(
-            [[[axis.residual_sd_m_s2**2] for axis in part.axes()] for part in sets]
-        )
-        self._lacks = [
-            (
-                np.array([point.temperature_c for point in part.lack_of_fit]),
-                np.array([point.sd_m_s2 for point in part.lack_of_fit]).T ** 2,
-            )
-            for part in sets
-        ]
-        self._has_lacks = any(part.lack_of_fit for part in sets)
+        residuals = [[axis.residual_sd_m_s2**2 for axis in part.axes()] for part in sets]
+        self._residuals = np.array(residuals)[:, :, np.newaxis]
+        lacks = ([(p.temperature_c, *p.sd_m_s2) for p in part.lack_of_fit] for part in sets)
+        self._lacks = [np.array(points).reshape(-1, 4).T for points in lacks]
 
     def excess(self, states: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """
-        Return the distances outside the ranges of each set, shapes (2, n): temperature [K], rate
-        [K/s], then temperature and rate in half ranges.
-        """
+        """Return excess of temperature [K] and rate [K/s], then of both in half ranges, (2, n)."""
         t, rate = states[BOARD] - self._reference, states[RATE]
         over, too_fast = t - hold(t, *self._t_range), rate - hold(rate, *self._rate_range)
-        if not (over.any() or too_fast.any()):
-            return over, too_fast, np.zeros_like(over), np.zeros_like(over)
         span, rate_span = (edges[1] - edges[0] for edges in (self._t_range, self._rate_range))
         return over, too_fast, np.abs(over) / (span / 2.0), np.abs(too_fast) / (rate_span / 2.0)
 
@@ -76,33 +61,20 @@ class Curves:
         """Evaluate bias [input units] and relative scale at board temperatures, (2, 6, n)."""
         t = board - self._reference
         held = hold(t, *self._t_range)
-        result = self._functions.evaluate(held)
+        result = self._evaluate(held)
         result[:, :3] += self._levels
         if (held != t).any():
             here, edge = (hold(at, *self._t_range[:, ::-1]) for at in (t, held))
-            result += self._others.evaluate(here) - self._others.evaluate(edge)
-            for slopes, beyond in zip(self._tangents, self._beyond(t), strict=True):
-                result += slopes * beyond[:, np.newaxis]
+            result += (self._evaluate(here[::-1]) - self._evaluate(edge[::-1]))[::-1]
+            ends = zip(self._t_range, self._leads, self._beyond(t), strict=True)
+            for end, leads, beyond in ends:
+                result += self._evaluate(end, 'slope')[leads] * beyond[:, np.newaxis]
         return result
 
-    @cached_property
-    def _tangents(self) -> Floats:
-        """
-        Slopes of the curves at the lower and upper end, in the layout of `slopes`, (2, 2, 6, 1).
-        """
-        ends = zip(self._t_range, self._leads, strict=True)
-        return np.array([self._functions.evaluate(t, 'slope')[leads] for t, leads in ends])
-
-    @cached_property
-    def _basis_slopes(self) -> list[list[list[Floats]]]:
-        """
-        Derivatives of each function's slope at both ends of its range w.r.t. free coefficients.
-        """
-        rows = zip(self._functions.rows, self._t_range[:, :, 0].T.tolist(), strict=True)
-        return [
-            [[np.reshape(basis_slopes(curve, end), (-1, 1)) for end in ends] for curve in row]
-            for row, ends in rows
-        ]
+    def _evaluate(self, t: Floats, what: str = 'value') -> Floats:
+        """Evaluate values or slopes of both sets at t [K from T_ref] of each set, (2, n)."""
+        pairs = zip(self._rows, t, strict=True)
+        return np.array([[getattr(function, what)(at) for function in row] for row, at in pairs])
 
     def _beyond(self, t: Floats) -> tuple[Floats, Floats]:
         """Return how far each set follows its lower and its upper tangent [K], (2, n)."""
@@ -110,13 +82,14 @@ class Curves:
         return hold(t - lower, -below, 0.0), hold(t - upper, 0.0, above)
 
     def unexplained(self, board: Floats) -> Floats:
-        """Evaluate ``residual_sd_m_s2 ** 2`` plus lack of fit, shape (2, 3, n) or (2, 3, 1)."""
-        return self._residuals + self.lack_of_fit(board) if self._has_lacks else self._residuals
+        """Evaluate ``residual_sd_m_s2 ** 2`` plus lack of fit, shape (2, 3, n)."""
+        return self._residuals + self.lack_of_fit(board)
 
     def lack_of_fit(self, board: Floats) -> Floats:
         """Evaluate the variance of the lack of fit by set and axis [m^2/s^4], shape (2, 3, n)."""
         result = np.zeros((2, 3, len(board)))
-        for regime, (at, variance) in enumerate(self._lacks):
+        for regime, points in enumerate(self._lacks):
+            at, variance = points[0], points[1:] ** 2
             if len(at) == 1:
                 result[regime] += variance
             elif len(at):
@@ -128,57 +101,37 @@ class Curves:
         return result
 
     def slopes(self, board: Floats) -> Floats:
-        """
-        Differentiate bias and scale of both sets w.r.t. the board temperature [per K], (2, 6, n).
-        """
+        """Differentiate bias and scale of both sets w.r.t. T_board [per K], (2, 6, n)."""
         held = hold(board - self._reference, *self._t_range)
-        return self._functions.evaluate(held, 'slope')
+        return self._evaluate(held, 'slope')
 
     def regressors(self, states: Floats, phi: Floats) -> list[Floats]:
-        """
-        Differentiate bias and scale of each axis w.r.t. all parameters of a `posterior.Block`.
-        """
+        """Differentiate bias and scale of each axis w.r.t. all parameters of a `Block`."""
         t, weight = states[BOARD] - self._reference, states[WEIGHT]
         held, shares = hold(t, *self._t_range), np.array([1.0 - weight, weight])
         is_outside = bool((held != t).any())
-        made: dict[int, Floats] = {}
-        for place in self._families:
-            if place in made:
-                continue
+        result = []
+        for place in range(6):
             derivatives = []
-            for regime, row in enumerate(self._functions.rows):
+            for regime, row in enumerate(self._rows):
                 basis = row[place].basis(held[regime])
                 basis = shares[regime] * np.reshape(basis, (-1, len(t)))
                 if is_outside:
                     basis += self._followed(regime, place, t, shares)
                 derivatives += [shares[regime], *basis]
-            made[place] = np.array([*derivatives, *phi])
-        return [made[place] for place in self._families]
-
-    @cached_property
-    def _families(self) -> list[int]:
-        """For each of the six curves, the index of the first curve with equal basis functions."""
-        bases = [
-            tuple(function.with_free((0.0,) * function.n_free, 0.0) for function in functions)
-            for functions in zip(*self._functions.rows, strict=True)
-        ]
-        return [bases.index(basis) for basis in bases]
+            result.append(np.array([*derivatives, *phi]))
+        return result
 
     def _followed(self, regime: int, place: int, t: Floats, shares: Floats) -> Floats:
-        """
-        Differentiate values beyond the ranges w.r.t. a function's free coefficients, (n_free, n).
-        Beyond its range a curve is a constant plus either a tangent or the other set's curve.
-        """
-        function = self._functions.rows[regime][place]
-        own_range, other_range = (
-            edges for edges in np.moveaxis(self._t_range, 1, 0)[[regime, 1 - regime]]
-        )
-        here, edge = (
-            np.reshape(function.basis(hold(at, *own_range)), (-1, len(t)))
-            for at in (t, hold(t, *other_range))
-        )
+        """Differentiate values beyond the ranges w.r.t. free coefficients, (n_free, n)."""
+        # Beyond its range a curve is a constant plus either a tangent or the other set's curve.
+        function = self._rows[regime][place]
+        own_range, other_range = self._t_range[:, regime], self._t_range[:, 1 - regime]
+        bases = (function.basis(hold(at, *own_range)) for at in (t, hold(t, *other_range)))
+        here, edge = (np.reshape(basis, (-1, len(t))) for basis in bases)
         result = shares[1 - regime] * (here - edge)
-        ends = zip(self._basis_slopes[regime][place], self._leads, self._beyond(t), strict=True)
-        for slopes, leads, beyond in ends:
+        ends = zip(own_range[:, 0].tolist(), self._leads, self._beyond(t), strict=True)
+        for end, leads, beyond in ends:
+            slopes = np.reshape(basis_slopes(function, end), (-1, 1))
             result += slopes * (shares * beyond)[leads == regime].sum(axis=0)
         return np.asarray(result)

@@ -13,10 +13,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import zip_longest
 from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
@@ -24,6 +23,7 @@ import numpy.typing as npt
 
 from ..quantities import QUANTITIES
 from ..typing import Floats
+from .schema import broken
 
 #: One temperature difference [K], or an array of temperature differences.
 Kelvins: TypeAlias = float | Floats
@@ -46,9 +46,7 @@ def hold(value: Floats, lower: npt.ArrayLike, upper: npt.ArrayLike) -> Floats:
 
 
 def by_element(function: Callable[[float], float], x: Kelvins) -> Floats:
-    """
-    Apply a function number by number: numpy's rounding may depend on the length of the array.
-    """
+    """Apply a function to each number: numpy's rounding may depend on the array's length."""
     return np.array([function(v) for v in np.ravel(x).tolist()]).reshape(np.shape(x))
 
 
@@ -101,11 +99,14 @@ class Polynomial(_Family):
         return replace(self, coefficients=(at_reference, *values))
 
     def _evaluate(self, t: Floats, *, is_slope: bool = False) -> Floats:
-        return _horner(self.slopes if is_slope else self.coefficients, t)
+        coefficients = self._slopes if is_slope else self.coefficients
+        result = t * 0.0 + coefficients[-1]
+        for coefficient in coefficients[-2::-1]:
+            result = result * t + coefficient
+        return np.asarray(result)
 
-    @property
-    def slopes(self) -> tuple[float, ...]:
-        """The coefficients of the polynomial's derivative."""
+    @cached_property
+    def _slopes(self) -> tuple[float, ...]:
         return tuple(k * c for k, c in enumerate(self.coefficients))[1:] or (0.0,)
 
     def basis(self, t: Kelvins) -> list[Floats]:
@@ -126,12 +127,10 @@ class CubicSpline(_Family):
 
     def __post_init__(self) -> None:
         if len(self.knots_k) < 3:
-            raise ValueError(f'`knots_k` must hold at least 3 knots, got {len(self.knots_k)}')
+            raise broken('knots_k', 'hold at least 3 knots', len(self.knots_k))
         if len(self.values) != len(self.knots_k):
-            raise ValueError(
-                f'`values` must have one number per knot ({len(self.knots_k)}), '
-                f'got {len(self.values)}'
-            )
+            rule = f'have one number per knot ({len(self.knots_k)})'
+            raise broken('values', rule, len(self.values))
         if any(b - a < _KNOT_STEP for a, b in zip(self.knots_k, self.knots_k[1:], strict=False)):
             raise ValueError(f'`knots_k` must rise strictly, by {_KNOT_STEP} K or more')
         if max(map(abs, self.knots_k)) > _FARTHEST_KNOT:
@@ -141,9 +140,7 @@ class CubicSpline(_Family):
 
     @property
     def free_coefficients(self) -> tuple[float, ...]:
-        """
-        Values of the spline at all knots except t = 0 (the reference), less the value at t = 0.
-        """
+        """Values of the spline at all knots except t = 0, less the value at t = 0."""
         at = self.knots_k.index(0.0)
         return tuple(v - self.values[at] for v in self.values[:at] + self.values[at + 1 :])
 
@@ -196,10 +193,8 @@ class Exponential(_Family):
         if not self.amplitudes:
             raise ValueError('`amplitudes` must hold at least one number')
         if len(self.amplitudes) != len(self.e_fold_k):
-            raise ValueError(
-                f'`e_fold_k` must have one number per amplitude ({len(self.amplitudes)}), '
-                f'got {len(self.e_fold_k)}'
-            )
+            rule = f'have one number per amplitude ({len(self.amplitudes)})'
+            raise broken('e_fold_k', rule, len(self.e_fold_k))
         if any(abs(e_fold) < 1.0 for e_fold in self.e_fold_k):
             # With a shorter e-fold exp(t / e_fold) may overflow within a useful range of t.
             raise ValueError('`e_fold_k` must be at least 1 K in magnitude')
@@ -229,46 +224,12 @@ class Exponential(_Family):
 TemperatureFunction = Polynomial | CubicSpline | Exponential
 
 
-class Functions:
-    """A table of functions of temperature; row k is evaluated at the temperatures ``t[k]``."""
-
-    def __init__(self, rows: Sequence[Sequence[TemperatureFunction]]) -> None:
-        self.rows = rows
-        places = [(i, j, function) for i, row in enumerate(rows) for j, function in enumerate(row)]
-        self._others = [place for place in places if not isinstance(place[2], Polynomial)]
-        flat = [f if isinstance(f, Polynomial) else Polynomial((0.0,)) for *_, f in places]
-        shape = -1, len(rows), len(rows[0]), 1
-        self._tables = {
-            name: np.array(list(zip_longest(*many, fillvalue=0.0))).reshape(shape)
-            for name, many in (
-                ('value', [function.coefficients for function in flat]),
-                ('slope', [function.slopes for function in flat]),
-            )
-        }
-
-    def evaluate(self, t: Floats, name: str = 'value') -> Floats:
-        """
-        Evaluate values or slopes, (n_rows, n_functions, n), at `t` [K], shape (n_rows, n).
-        """
-        result = _horner(self._tables[name], t[:, np.newaxis])
-        for row, place, function in self._others:
-            result[row, place] = getattr(function, name)(t[row])
-        return result
-
-
-def _horner(coefficients: Floats | tuple[float, ...], t: Floats) -> Floats:
-    result = t * 0.0 + coefficients[-1]
-    for coefficient in coefficients[-2::-1]:
-        result = result * t + coefficient
-    return np.asarray(result)
-
-
 def check_reference(name: str, function: TemperatureFunction, expected: float) -> None:
     """Raise ValueError, with the key's name, if a function is not `expected` at t = 0."""
     with np.errstate(all='ignore'):
         value = function.value(0.0)
     if not abs(value - expected) <= NORMALISATION_TOLERANCE:
-        raise ValueError(f'`{name}` must be {expected:g} at t = 0 (T_ref), got {value:g}')
+        raise broken(name, f'be {expected:g} at t = 0 (T_ref)', float(value))
 
 
 def basis_slopes(function: TemperatureFunction, t: float) -> list[float]:

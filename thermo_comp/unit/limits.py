@@ -20,6 +20,7 @@ import numpy as np
 from ..quantities import QUANTITIES
 from .functions import TANGENT_SPANS, TemperatureFunction
 from .posterior import ParameterLayout
+from .schema import broken
 
 if TYPE_CHECKING:
     from .calibration import Calibration
@@ -48,17 +49,13 @@ def check_limits(calibration: Calibration, layout: ParameterLayout) -> None:
         calibration.nonlinearity.check_slope(force, outermost)
     response = calibration.response
     farthest_k = max(map(abs, outermost))
-    sizes = [
-        min(max(map(abs, term.range)), term.term.largest(term)) * farthest_k**term.power
-        for term in response
-    ]
+    largest = (min(max(map(abs, term.range)), term.term.largest(term)) for term in response)
+    sizes = [u * farthest_k**term.power for u, term in zip(largest, response, strict=True)]
     for k, (term, size) in enumerate(zip(response, sizes, strict=True)):
         effect = size * max(map(abs, term.bias))
         if not effect <= WORST * most:
-            raise ValueError(
-                f'`response[{k}].bias` must keep the largest effect of the column within '
-                f'{WORST * most:g} input units, got {effect:g}'
-            )
+            rule = f'keep the largest effect of the column within {WORST * most:g} input units'
+            raise broken(f'response[{k}].bias', rule, effect)
     for regime, part, ends in zip(('static', 'dynamic'), sets, edges, strict=True):
         at_work = [term.during in ('always', regime) for term in response]
         for k, (name, axis) in enumerate(zip('xyz', part.axes(), strict=True)):
@@ -80,19 +77,16 @@ def check_limits(calibration: Calibration, layout: ParameterLayout) -> None:
             sd = np.sqrt(variances[block.rows])
             worst = np.max(sd * [*_regressors(functions, edges), *sizes])
             if not worst <= WORST * bound:
-                raise ValueError(
-                    "`posterior.factor` must keep the effect of each parameter's sd at most "
-                    f'{WORST * bound:g} (bias: input units; scale: relative), got {worst:g}'
-                )
+                rule = f"keep the effect of each parameter's sd at most {WORST * bound:g} "
+                rule += '(bias: input units; scale: relative)'
+                raise broken('posterior.factor', rule, worst)
 
 
 def _check_axes(calibration: Calibration, most: float) -> None:
     for name, axis in zip('xyz', calibration.axes, strict=True):
         if abs(axis.bias) > most:
-            raise ValueError(
-                f'`axes.{name}.bias` must be within twice unit.full_scale, {most:g}, '
-                f'got {axis.bias:g}'
-            )
+            rule = f'be within twice unit.full_scale, {most:g}'
+            raise broken(f'axes.{name}.bias', rule, float(axis.bias))
         force = calibration.unit.full_scale / abs(axis.scale_factor)
         if fault := QUANTITIES['full-scale force'].fault(force):
             raise ValueError(
@@ -103,9 +97,8 @@ def _check_axes(calibration: Calibration, most: float) -> None:
 
 def _check_bias(key: str, level: float, reached: tuple[float, float], most: float) -> None:
     if abs(level) > most:
-        raise ValueError(
-            f'`{key}.delta` must keep bias plus delta within {most:g} input units, got {level:g}'
-        )
+        rule = f'keep bias plus delta within {most:g} input units'
+        raise broken(f'{key}.delta', rule, float(level))
     least, largest = reached
     if not math.isfinite(largest - least):
         raise ValueError(f'`{key}.bias_function` must be finite over its {_AROUND}')
@@ -117,9 +110,7 @@ def _check_bias(key: str, level: float, reached: tuple[float, float], most: floa
 
 
 def _check_scale(key: str, reached: tuple[float, float], gain: float) -> None:
-    """
-    Refuse a relative scale that exceeds its limits when the columns add up to `gain` or -`gain`.
-    """
+    """Refuse a relative scale beyond its limits with `gain` or -`gain` from the columns."""
     for word, value, is_kept, limit in (
         ('above', reached[0] - gain, operator.gt, SMALLEST_RELATIVE_SCALE),
         ('below', reached[1] + gain, operator.lt, LARGEST_RELATIVE_SCALE),

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns statistics of residuals: of corrected less true force, or of ``|f| - g``.
-"""
+"""Owns statistics of residuals: of corrected less true force, or of ``|f| - g``."""
 
 from dataclasses import dataclass
 

@@ -14,16 +14,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple
 
 import numpy as np
 
 from ..quantities import QUANTITIES
 from ..typing import Floats
-from .covariance import N_COEFFICIENTS, covariance_at
+from .covariance import N_COEFFICIENTS, Real, covariance_at
 from .functions import hold, in_order
 from .gravity import STANDARD_GRAVITY
-from .schema import Vector, check_ranges
+from .schema import Vector, broken, check_ranges
 
 if TYPE_CHECKING:
     from .calibration import Calibration
@@ -43,9 +43,6 @@ LARGEST_SLOPE = 0.2
 
 #: Index of the first coefficient of the nonlinearity in a result of `Correction.line`.
 _NONLINEAR: Final = 12 + N_COEFFICIENTS
-
-# Type of a quantity: the value of one sample, or an array of many samples.
-Real = TypeVar('Real', float, Floats)
 
 
 @dataclass(frozen=True)
@@ -101,18 +98,14 @@ class Nonlinearity:
             raise ValueError(f'`terms` must be of {list(POWERS)}, at most one each, in this order')
 
     def check_slope(self, force: float, temperatures: Sequence[float]) -> None:
-        """
-        Raise ValueError if the slope of the terms reaches `LARGEST_SLOPE` at a |f| up to `force`
-        [m/s^2], at one of the temperatures [K from T_ref].
-        """
+        """Raise ValueError if the slope is too large up to |f| = `force` [m/s^2], at any t [K]."""
         for t in temperatures:
             k2, kq, k3 = np.abs(self.coefficients(np.array([t])))[..., 0]
             slope = float(np.max(2.0 * (k2 + kq) * force + 3.0 * k3 * force * force))
             if not slope < LARGEST_SLOPE:
-                raise ValueError(
-                    f'`nonlinearity.terms` must have a slope below {LARGEST_SLOPE:g} up to full '
-                    f'scale, got {slope:.3g} at {t:+.3g} K from T_ref'
-                )
+                rule = f'have a slope below {LARGEST_SLOPE:g} up to full scale'
+                got = f'{slope:.3g} at {t:+.3g} K from T_ref'
+                raise broken('nonlinearity.terms', rule, got)
 
     def coefficients(self, t: Floats) -> Floats:
         """Return K2, Kq [s^2/m], K3 [s^4/m^2] by axis at t [K] from T_ref, shape (3, 3, n)."""
@@ -202,10 +195,7 @@ class BeyondForce(NamedTuple):
 
 
 def beyond_force(calibration: Calibration) -> BeyondForce:
-    """
-    Return the variance of an unknown square term beyond the largest |f| in the fit, or, if the
-    calibration has no nonlinearity, beyond a force of 1 % above gravity.
-    """
+    """Return the variance of an unknown square term beyond the |f| of the fit, or at rest."""
     known = calibration.nonlinearity
     edge = known.force_range_m_s2[1] if known else AT_REST * calibration.gravity_m_s2
     sd = (known.beyond_sd_g_g2 if known else K2_SD) / STANDARD_GRAVITY
@@ -226,9 +216,7 @@ class ForceCorrection:
         return hold(board, *self._span) - self._reference
 
     def linearise(self, x: Floats, board: Floats) -> Floats:
-        """
-        Subtract the nonlinear terms from readings of the axes (n, 3), at board temperatures (n,).
-        """
+        """Subtract the nonlinear terms from readings (n, 3) at board temperatures (n,)."""
         k2, kq, k3 = self._of.coefficients(self.held(board))
         return np.asarray(linearised(x.T, k2, kq, k3).T)
 
@@ -261,17 +249,13 @@ class ForceCorrection:
         scale, (rank, n). The covariances of Kq with other parameters are omitted: most are
         negative, so in most cases the result is too large.
         """
-        kinds = [term.kind for term in self._of.terms]
-        k = len(kinds)
-        units = np.array([unit_of(kind) for kind in kinds]).reshape(-1, 1)
-        along = (rows[:k, :, np.newaxis] + t * rows[k:, :, np.newaxis]) / units[:, np.newaxis]
-        alone = (rest[:k, np.newaxis] + t * t * rest[k:, np.newaxis]) / (units * units)
-        none = np.zeros_like(on_bias), np.zeros_like(t)
-        terms = [
-            (along[kinds.index(kind)], alone[kinds.index(kind)]) if kind in kinds else none
-            for kind in POWERS
-        ]
-        (n2, v2), (nq, vq), (n3, v3) = terms
+        k = len(self._of.terms)
+        kinds = [list(POWERS).index(term.kind) for term in self._of.terms]
+        units = np.array([unit_of(term.kind) for term in self._of.terms]).reshape(-1, 1)
+        along, alone = np.zeros((3, *on_bias.shape)), np.zeros((3, len(t)))
+        along[kinds] = (rows[:k, :, np.newaxis] + t * rows[k:, :, np.newaxis]) / units[:, :, None]
+        alone[kinds] = (rest[:k, np.newaxis] + t * t * rest[k:, np.newaxis]) / (units * units)
+        (n2, nq, n3), (v2, vq, v3) = along, alone
         # Products and sums are explicit, because results of BLAS depend on the arrays' alignment.
         products = (
             2.0 * on_bias * n2,

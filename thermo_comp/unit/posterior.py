@@ -16,9 +16,10 @@ import numpy.typing as npt
 from ..quantities import QUANTITIES
 from ..typing import Floats
 from .functions import TemperatureFunction
+from .schema import broken
 
-#: Fraction of a variance that is below the resolution of single precision.
-_NEGLIGIBLE = 1e-7
+#: Largest fraction of each variance that a `diagonal` may have.
+_TOLERANCE = 1e-5
 #: Most negative eigenvalue of a correlation matrix that rounding can cause.
 _MOST_NEGATIVE = -1e-6
 _FLOAT32 = np.dtype('<f4')
@@ -42,9 +43,8 @@ class Posterior:
     def __post_init__(self) -> None:
         n, size = self.n_parameters, len(_decoded('factor', self.factor))
         if size != n * self.rank:
-            raise ValueError(
-                f'`factor` must hold {n} x {self.rank} numbers (`diagonal` x `rank`), got {size}'
-            )
+            rule = f'hold {n} x {self.rank} numbers (`diagonal` x `rank`)'
+            raise broken('factor', rule, size)
         if (self.variances < 0.0).any():
             raise ValueError('`diagonal` must not have a negative variance')
 
@@ -76,10 +76,8 @@ class Posterior:
     def check_size(self, expected: int) -> None:
         """Raise ValueError, with the key's name, if there are not `expected` parameters."""
         if self.n_parameters != expected:
-            raise ValueError(
-                f'`posterior.diagonal` must have one number per parameter ({expected}), '
-                f'got {self.n_parameters}'
-            )
+            rule = f'have one number per parameter ({expected})'
+            raise broken('posterior.diagonal', rule, self.n_parameters)
 
 
 class Block(NamedTuple):
@@ -133,8 +131,8 @@ class ParameterLayout(NamedTuple):
         return [slice(first, first + n) for first in (self.nonlinear + n * k for k in range(3))]
 
 
-def posterior_of(covariance: Floats, tolerance: float = 1e-5) -> Posterior:
-    """Encode a covariance; `diagonal` has at most the fraction `tolerance` of each variance."""
+def posterior_of(covariance: Floats) -> Posterior:
+    """Encode a covariance with the smallest rank that `_TOLERANCE` permits."""
     diagonal = np.diag(covariance).copy()
     if not np.all(diagonal >= 0.0):
         raise ValueError('`covariance` must not have a negative variance')
@@ -151,7 +149,7 @@ def posterior_of(covariance: Floats, tolerance: float = 1e-5) -> Posterior:
     columns = vectors[:, ::-1] * np.sqrt(np.maximum(eigenvalues[::-1], 0.0))
     share = np.where(diagonal > 0.0, 1.0, 0.0)
     left_out = share[:, np.newaxis] - np.cumsum(columns**2, axis=1)
-    enough = np.all(left_out <= max(tolerance, _NEGLIGIBLE), axis=0)
+    enough = np.all(left_out <= _TOLERANCE, axis=0)
     rank = int(np.argmax(enough)) + 1 if diagonal.any() else 0
     factor = _single(columns[:, :rank] * scale[:, np.newaxis])
     held = np.sum(factor.astype(np.float64) ** 2, axis=1)

@@ -43,19 +43,17 @@ class SlowUncertainty:
             sum(w * tau for (of, tau), w in lag.first_order_weights.items() if of == BOARD_INPUT)
             for lag in lags
         ])  # fmt: skip
-        #: For each axis, for bias, scale and nonlinear terms: rows of `matrix` and `variances` of
-        #: the posterior.
-        self._blocks: list[list[tuple[Floats, Floats]]] = []
-        #: Rows of `matrix` and `variances` of the posterior for the misalignment.
-        self._misalignment = np.zeros((3, 0)), np.square(calibration.misalignment_sd)
-        posterior = calibration.posterior
-        if posterior is None:
-            return
-        layout = parameter_layout(calibration)
-        matrix, diagonal = posterior.matrix, posterior.variances
-        for bias, scale, force in zip(layout.bias, layout.scale, layout.force, strict=True):
-            parts = bias.rows, scale.rows, force
-            self._blocks.append([(matrix[part], diagonal[part]) for part in parts])
+        layout, posterior = parameter_layout(calibration), calibration.posterior
+        matrix, diagonal = np.zeros((layout.n_parameters, 0)), np.zeros(layout.n_parameters)
+        diagonal[layout.misalignment :] = np.square(calibration.misalignment_sd)
+        if posterior is not None:
+            matrix, diagonal = posterior.matrix, posterior.variances
+        #: For each axis, for bias, scale and nonlinear terms, and for the misalignment: rows of
+        #: factor and diagonal of the covariance of the parameters.
+        self._blocks = [
+            [(matrix[part], diagonal[part]) for part in (bias.rows, scale.rows, force)]
+            for bias, scale, force in zip(layout.bias, layout.scale, layout.force, strict=True)
+        ]
         self._misalignment = matrix[layout.misalignment :], diagonal[layout.misalignment :]
 
     def at(
@@ -96,12 +94,8 @@ class SlowUncertainty:
 
     def _at(self, states: Floats, start_shares: Floats, rates: Floats) -> Floats:
         of_start = self.of_start(states, start_shares, rates)
-        table = self._correction.table
-        regressors = (
-            self._correction.curves.regressors(states, table.values(states))
-            if self._blocks
-            else []
-        )
+        curves, phi = self._correction.curves, self._correction.table.values(states)
+        regressors = curves.regressors(states, phi)
         of_misalignment, var_misalignment = self._misalignment
         n_start, (n, rank) = len(of_start), (states.shape[1], of_misalignment.shape[1])
         errors = np.zeros((9, n_start + rank, n))
@@ -114,20 +108,15 @@ class SlowUncertainty:
         for axis, K in enumerate(self._K):
             on_bias, on_scale = errors[2 * axis : 2 * axis + 2]
             on_bias[:n_start], on_scale[:n_start] = of_start[:, axis] / K, of_start[:, axis + 3]
-            if self._blocks:
-                (of_bias, var_bias), (of_scale, var_scale), of_force = self._blocks[axis]
-                by_bias, by_scale = regressors[axis] / K, regressors[axis + 3]
-                on_bias[n_start:] = _combined(of_bias, by_bias)
-                on_scale[n_start:] = _combined(of_scale, by_scale)
-                added[axis, 0] = in_order(var_bias[:, np.newaxis] * by_bias**2, 0)
-                added[axis, 2] = in_order(var_scale[:, np.newaxis] * by_scale**2, 0)
-                if nonlinear is not None:
-                    both = on_bias[n_start:], on_scale[n_start:]
-                    beyond.append(
-                        nonlinear.variance(nonlinear.held(states[BOARD]), *of_force, *both)
-                    )
-            elif nonlinear is not None:
-                beyond.append(np.zeros((5, n)))
+            (of_bias, var_bias), (of_scale, var_scale), of_force = self._blocks[axis]
+            by_bias, by_scale = regressors[axis] / K, regressors[axis + 3]
+            on_bias[n_start:] = _combined(of_bias, by_bias)
+            on_scale[n_start:] = _combined(of_scale, by_scale)
+            added[axis, 0] = in_order(var_bias[:, np.newaxis] * by_bias**2, 0)
+            added[axis, 2] = in_order(var_scale[:, np.newaxis] * by_scale**2, 0)
+            if nonlinear is not None:
+                t, both = nonlinear.held(states[BOARD]), (on_bias[n_start:], on_scale[n_start:])
+                beyond.append(nonlinear.variance(t, *of_force, *both))
             products = on_bias * on_bias, 2.0 * (on_bias * on_scale), on_scale * on_scale
             added[axis] += in_order(np.array(products), 1)
         between = rows_between(errors, var_misalignment)
@@ -217,15 +206,10 @@ def sd_of_states(calibration: Calibration, states: Floats) -> tuple[Floats, Floa
     slow = SlowUncertainty(calibration, correction)
     forgotten = np.zeros((len(correction.memory.lags), len(states)))
     variance = slow.at(states.T, forgotten)[:9].T.reshape(-1, 3, 3)
-    board, n = states[:, BOARD], len(states)
-    regime, each = np.rint(states[:, WEIGHT]).astype(np.int64), np.arange(n)
-    unexplained, lack = (
-        np.broadcast_to(variances, (2, 3, n))[regime, :, each]
-        for variances in (
-            correction.curves.unexplained(board),
-            correction.curves.lack_of_fit(board),
-        )
-    )
+    board, each = states[:, BOARD], np.arange(len(states))
+    regime = np.rint(states[:, WEIGHT]).astype(np.int64)
+    unexplained = correction.curves.unexplained(board)[regime, :, each]
+    lack = correction.curves.lack_of_fit(board)[regime, :, each]
     warmer = states.copy()
     _add_gradient(warmer, calibration, (calibration.soak_gradient_k or (0.0, 0.0))[1])
     by_gradient = correction.bias_scale(warmer.T) - correction.bias_scale(states.T)
@@ -241,10 +225,7 @@ def ramp_states(
     rate: float = 0.0,
     lasted_s: Floats | float = 0.0,
 ) -> Floats:
-    """
-    Build thermal states (n, width) of a ramp at `rate` [K/s] that has lasted for `lasted_s` [s];
-    the gradient due to self-heating is `soak_gradient_k`.
-    """
+    """Build thermal states (n, width) of a ramp at `rate` [K/s] that has lasted `lasted_s` [s]."""
     layout = StateLayout(memory_of_unit(calibration))
     states = np.zeros((len(temperature), layout.width))
     states[:, BOARD], states[:, WEIGHT] = temperature, float(rate != 0.0)
@@ -269,8 +250,6 @@ def _add_gradient(states: Floats, calibration: Calibration, change_k: float) -> 
         if isinstance(quantity, Gradient) and quantity.input == calibration.sensors[0]:
             states[:, place] += change_k
         elif isinstance(quantity, Lag):
-            states[:, place] += change_k * sum(
-                share
-                for (name, _), share in quantity.first_order_weights.items()
-                if name == calibration.sensors[0]
-            )
+            weights = quantity.first_order_weights.items()
+            of_first = (share for (name, _), share in weights if name == calibration.sensors[0])
+            states[:, place] += change_k * sum(of_first)

@@ -79,7 +79,5 @@ class Provenance:
     @property
     def left_out_rms(self) -> float:
         """RMS of ``|f| - g`` on positions left out of the fit [m/s^2]; NaN where unknown."""
-        values = [
-            summary.left_out_rms_m_s2 for summary in self.residuals if summary.section == 'all'
-        ]
+        values = [row.left_out_rms_m_s2 for row in self.residuals if row.section == 'all']
         return math.nan if not values or values[0] is None else values[0]

@@ -46,18 +46,21 @@ def build(hint: type[Value], data: Any, key: str = '') -> Value:
     return result
 
 
+def broken(key: str, rule: str, got: object) -> ValueError:
+    """Return the error of a key whose value breaks a rule: '`key` must rule, got value'."""
+    shown = f'{got:g}' if isinstance(got, float) else got
+    return ValueError(f'`{key}` must {rule}, got {shown}')
+
+
 def check_ranges(value: object, **spans: Bounds) -> None:
     """Raise ValueError, with the key's name, if a range is reversed or narrower than its bound."""
     for key, span in spans.items():
         lower, upper = getattr(value, key)
+        shown = f'[{lower}, {upper}]'
         if not lower < upper:
-            raise ValueError(
-                f'`{key}` must be [lower, upper] with lower < upper, got [{lower}, {upper}]'
-            )
+            raise broken(key, 'be [lower, upper] with lower < upper', shown)
         if span.at_least is not None and not upper - lower >= span.at_least:
-            raise ValueError(
-                f'`{key}` must span at least {span.at_least:g} {span.unit}, got [{lower}, {upper}]'
-            )
+            raise broken(key, f'span at least {span.at_least:g} {span.unit}', shown)
 
 
 def plain(value: Any) -> Any:
@@ -84,7 +87,7 @@ def _build(hint: Any, data: Any, key: str) -> Any:
         return value
     if origin is Literal:
         if not isinstance(data, str) or data not in arguments:
-            _refuse(key, f'must be {_choice([repr(option) for option in arguments])}', data)
+            _refuse(key, f'must be {_choice([*map(repr, arguments)])}', data)
         return data
     if origin is tuple:
         return _sequence(arguments, data, key)
@@ -96,10 +99,8 @@ def fields_of(cls: type) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Return the type hints of a dataclass by key, and the keys that must be given."""
     hints = typing.get_type_hints(cls, include_extras=True)
     fields = dataclasses.fields(cls)
-    required = tuple(
-        f.name for f in fields if f.default is f.default_factory is dataclasses.MISSING
-    )
-    return {f.name: hints[f.name] for f in fields}, required
+    required = (f.name for f in fields if f.default is f.default_factory is dataclasses.MISSING)
+    return {f.name: hints[f.name] for f in fields}, tuple(required)
 
 
 def _scalar(hint: type, data: Any, key: str) -> Any:
@@ -126,11 +127,8 @@ def _object(cls: type, data: Any, key: str) -> Any:
     for name in required:
         if name not in data:
             raise SchemaError(_joined(key, name), 'this key is missing')
-    values = {
-        name: _build(hint, data[name], _joined(key, name))
-        for name, hint in hints.items()
-        if name in data
-    }
+    given = {name: hint for name, hint in hints.items() if name in data}
+    values = {name: _build(hint, data[name], _joined(key, name)) for name, hint in given.items()}
     try:
         return cls(**values)
     except ValueError as error:
@@ -168,9 +166,7 @@ def _either(arguments: tuple[Any, ...], data: Any, key: str) -> Any:
         raise SchemaError(_joined(key, 'kind'), 'this key is missing')
     kind = data['kind']
     if not isinstance(kind, str) or kind not in kinds:
-        _refuse(
-            _joined(key, 'kind'), f'must be {_choice([repr(option) for option in kinds])}', kind
-        )
+        _refuse(_joined(key, 'kind'), f'must be {_choice([*map(repr, kinds)])}', kind)
     return _object(kinds[kind], data, key)
 
 

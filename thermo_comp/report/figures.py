@@ -1,23 +1,30 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the figures of bags: over time, like the paper's Fig. 3, 4, 6 and 7, and by position."""
+"""
+Owns the figures: of bags over time, like the paper's Fig. 3, 4, 6 and 7, and by position; of a
+calibration over temperature; of a fleet.
+"""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import groupby
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 
 from ..thermal.regime import Regime
 from ..typing import Bools, Floats
-from ..unit.calibration import AXES
+from ..unit.calibration import AXES, Calibration, rate_triad
 from ..unit.gravity import MICRO_G, ug_text
-from ..unit.metrics import statistics_by_regime
+from ..unit.metrics import means_by, statistics_by_regime
+from ..unit.rate_bias import MILLIDEGREE
 from . import style
-from .evidence import LEFT_OUT, RAW, Evidence, Position, required
-from .html import number
-from .trace import ShownBag
+from .certificate import Curve, curves, slopes
+from .evidence import CHOSEN, LEFT_OUT, RAW, Evidence, Position, ShownBag, required
+from .style import minus, number
 
 # Length of the part at the start of a position whose mean reading counts as zero drift [s].
 _ZERO_S = 120.0
@@ -26,6 +33,16 @@ _SHADE = '#E9E9E9'
 _RING = 22.0
 # Largest number of positions, and so of rows, in `draw_every_position`.
 _MOST = 24
+#: Two-sided 95 % of a normal distribution, in standard deviations.
+BAND_SDS = 1.96
+_BOARD = 'T board, °C'
+# Line, hatch and marker of a soak and of temperature ramps.
+_LOOKS: dict[str, tuple[style.Line, str, str]] = {
+    'soak': (style.STATIC_LINE, '////', 'o'),
+    'heating': (style.DYNAMIC_LINE, '\\\\\\\\', '^'),
+    'cooling': (style.AXIS_LINES[2], '....', 'v'),
+}
+_POINT: style.Line = {'color': style.BLACK, 'ms': 3.0, 'mfc': 'none', 'mew': 0.8}
 
 
 def draw_temperatures(evidence: Evidence) -> Figure:
@@ -64,8 +81,7 @@ def draw_dynamics(evidence: Evidence) -> Figure:
     style.legend_above(rates, 'b  first derivatives')
     line = style.CASE_LINE if shown.leader == 'case' else style.BOARD_LINE
     bend.plot(shown.time / unit, shown.acceleration * 3600.0, **line)
-    bend.set_ylabel('K/min²')
-    bend.set_title(f'second derivative of T {shown.leader}')
+    bend.set(ylabel='K/min²', title=f'second derivative of T {shown.leader}')
     bend.locator_params(axis='y', nbins=4)
     _draw_flag(flag, shown, unit)
     figure.align_ylabels(panels[:-1])
@@ -124,17 +140,13 @@ def _panels(
     unit, name = style.time_unit(shown.duration_s)
     figure = style.new_figure(more + sum(heights))
     panels = figure.subplots(len(heights), sharex=True, height_ratios=heights, squeeze=False)[:, 0]
-    spans: list[tuple[float, float]] = []
-    for stretch in shown.stretches:
-        if stretch.regime == Regime.DYNAMIC:
-            # Join successive heating and cooling, so that no bright line is between them.
-            start = spans.pop()[0] if spans and spans[-1][1] == stretch.start else stretch.start
-            spans.append((start, stretch.stop))
-    for axes in panels[:-1] if is_flagged else panels:
-        for start, stop in spans:
-            axes.axvspan(start / unit, stop / unit, color=_SHADE, lw=0, zorder=0)
-    panels[-1].set_xlabel(name)
-    panels[-1].set_xlim(0.0, shown.duration_s / unit)
+    # Join successive heating and cooling, so that no bright line is between them.
+    for regime, run in groupby(shown.stretches, key=attrgetter('regime')):
+        start, *_, stop = (edge / unit for stretch in run for edge in stretch[:2])
+        if regime == Regime.DYNAMIC:
+            for axes in panels[:-1] if is_flagged else panels:
+                axes.axvspan(start, stop, color=_SHADE, lw=0, zorder=0)
+    panels[-1].set(xlabel=name, xlim=(0.0, shown.duration_s / unit))
     return figure, list(panels), shown, unit
 
 
@@ -155,11 +167,9 @@ def _drift(evidence: Evidence) -> tuple[Floats, str]:
     windows = evidence.windows
     if windows is None or not _rows(evidence).any():
         return np.zeros((0, 3)), ''
-    drift = windows.mean.copy()
-    for p in np.unique(windows.position):
-        rows = windows.position == p
-        begin = windows.time[rows] <= windows.time[rows][0] + _ZERO_S
-        drift[rows] -= windows.mean[rows][begin].mean(axis=0)
+    _, first, place = np.unique(windows.position, return_index=True, return_inverse=True)
+    begin = windows.time <= windows.time[first][place] + _ZERO_S
+    drift = windows.mean - means_by(place[begin], windows.mean[begin])[place]
     if evidence.calibration is not None:
         K = [axis.scale_factor for axis in evidence.calibration.axes]
         return drift / K / MICRO_G, 'µg'
@@ -174,17 +184,16 @@ def _draw_flag(axes: Axes, shown: ShownBag, unit: float) -> None:
         if stretch.regime == Regime.UNKNOWN:
             axes.axvspan(*span, fill=False, hatch='---', edgecolor='#999999', lw=0)
             continue
-        level = float(stretch.direction if stretch.regime == Regime.DYNAMIC else 0)
+        level = float(stretch.direction)  # 0 only in the static regime
         times += span
         levels += [level, level]
-        if stretch.regime == Regime.DYNAMIC:
-            hatch = {1: '////', -1: '\\\\\\\\', 0: 'xxxx'}[stretch.direction]
+        if level:
+            hatch = '////' if level > 0.0 else '\\\\\\\\'
             look: Any = {'facecolor': _SHADE, 'edgecolor': '#777777', 'hatch': hatch, 'lw': 0}
-            axes.fill_between(span, [stretch.direction or 1.0] * 2, **look)
+            axes.fill_between(span, [level, level], **look)
     axes.plot(times, levels, color='black', linewidth=1.3)
-    axes.set_ylim(-1.35, 1.35)
+    axes.set(ylim=(-1.35, 1.35), title='c  regime flag S')
     axes.set_yticks([-1, 0, 1], ['S = 1, cooling', 'S = 0, static', 'S = 1, heating'])
-    axes.set_title('c  regime flag S')
     axes.grid(visible=False, axis='x')
 
 
@@ -215,16 +224,13 @@ def draw_every_position(evidence: Evidence) -> Figure:
         # The lines of the regimes differ in width, because dashes would hide noise.
         for is_drawn, color, width in ((~dynamic, style.BLACK, 1.4), (dynamic, style.RED, 0.7)):
             axes.plot(time, np.where(is_drawn, value, np.nan), color=color, linewidth=width)
-    axes.set_ylim(len(shown) - 0.4, -0.6)
     axes.set_yticks(range(len(shown)), [str(position.number) for position in shown])
     right = axes.secondary_yaxis('right')
     right.set_yticks(
         range(len(shown)), [number(position.residual_rms[judged] / MICRO_G) for position in shown]
     )
     right.set_ylabel('RMS, µg')
-    axes.set_ylabel('position')
-    axes.set_xlabel(name)
-    axes.set_xlim(0.0, None)
+    axes.set(xlabel=name, ylabel='position', xlim=(0.0, None), ylim=(len(shown) - 0.4, -0.6))
     part = f'; the {_MOST} with the largest RMS' if len(evidence.positions) > _MOST else ''
     axes.set_title(f'{judged}: a row is ±{number(limit / MICRO_G, 2)} µg high{part}')
     return figure
@@ -284,7 +290,131 @@ def _draw_hemisphere(axes: Axes, positions: tuple[Position, ...], side: int, jud
                 size = _RING * np.sqrt(position.residual_rms.get(judged, 0.0) / largest)
                 axes.plot(*place, 'o', markersize=size, mfc='none', mec=style.RED, mew=1.1)
             _note(axes, str(position.number), place, (3.5, 2.5))
-    axes.set_xlim(-1.32, 1.32)
-    axes.set_ylim(-1.32, 1.32)
-    axes.set_aspect('equal')
+    axes.set(xlim=(-1.32, 1.32), ylim=(-1.32, 1.32), aspect='equal')
     axes.set_axis_off()
+
+
+def draw_functions(evidence: Evidence) -> Figure:
+    """Draw bias and scale over temperature, less a straight line, with bands and measurements."""
+    calibration = required(evidence.calibration)
+    figure = style.new_figure(4.4)
+    panels = figure.subplots(2, 3, sharex=True)
+    drawn = curves(calibration)
+    temperature, errors = soak_measurements(evidence)
+    level = errors - np.outer(temperature - calibration.reference_temperature_c, slopes(drawn[0]))
+    for k, axes in enumerate(panels.flat):
+        _draw_less_line(axes, calibration, drawn, k, 'µg' if k < 3 else 'ppm')
+        if np.isfinite(errors[:, k]).any():
+            soak = np.interp(temperature, drawn[0].temperature, drawn[0].value[:, k])
+            axes.plot(temperature, soak + level[:, k], 'o', label='measured in a soak', **_POINT)
+    panels[0, 0].set_ylabel('bias less the line, µg')
+    panels[1, 0].set_ylabel('scale less the line, ppm')
+    for axes in panels[1]:
+        axes.set_xlabel(_BOARD)
+    style.shared_legend(figure, panels[0, 0], 4)
+    return figure
+
+
+def draw_rates(evidence: Evidence) -> Figure:
+    """Draw the bias of the angular rate over temperature, less a straight line, with bands."""
+    triad = rate_triad(required(evidence.calibration))
+    figure = style.new_figure(2.5)
+    panels = figure.subplots(1, 3, sharex=True)
+    panels[0].set_ylabel('bias less the line, mdeg/s')
+    # In the triad of a gyroscope m/s^2 stands for rad/s.
+    factor = MICRO_G / MILLIDEGREE
+    drawn = [c._replace(value=factor * c.value, sd=factor * c.sd) for c in curves(triad)]
+    for i, axes in enumerate(panels):
+        axes.set_xlabel(_BOARD)
+        _draw_less_line(axes, triad, drawn, i, 'mdeg/s')
+    style.shared_legend(figure, panels[0], 3)
+    return figure
+
+
+def _draw_less_line(
+    axes: Axes, calibration: Calibration, drawn: list[Curve], k: int, unit: str
+) -> None:
+    """Draw column `k` of the curves, with bands, less the straight line through the soak."""
+    reference, slope = calibration.reference_temperature_c, slopes(drawn[0])[k]
+    widest = 0.0
+    for curve in drawn:
+        line, hatch, marker = _LOOKS[curve.program.name]
+        at, color = curve.temperature, line['color']
+        value = curve.value[:, k] - slope * (at - reference)
+        if calibration.posterior is not None:
+            half = BAND_SDS * curve.sd[:, k]
+            look: style.Line = {'facecolor': color, 'edgecolor': color, 'hatch': hatch}
+            axes.fill_between(at, value - half, value + half, alpha=0.25, linewidth=0, **look)
+            widest = max(widest, float(half.max()))
+        # Mark the ends of the valid range, so that a range of a few K stays visible.
+        look = {'marker': marker, 'markersize': 3.5, 'markevery': [0, -1]}
+        axes.plot(at, value, label=curve.program.label, **look, **line)
+    title = f'{AXES[k % 3]}: slope {minus(f"{slope:+.3g}")} {unit}/K'
+    axes.set_title(f'{title}\n95 % band within ±{number(widest, 2)} {unit}' if widest else title)
+    axes.axvline(reference, color=style.GREY, linewidth=0.8)
+    axes.locator_params(axis='y', nbins=5)
+
+
+def soak_measurements(evidence: Evidence) -> tuple[Floats, Floats]:
+    """
+    Average the residual in each soak of each position. Return temperatures (n,), and the residual
+    as an error of the bias [micro-g] and of the scale [ppm], (n, 6). The error of the scale is NaN
+    if the force along the axis is below half of gravity.
+    """
+    windows, residual = evidence.windows, evidence.axis_residuals().get(CHOSEN)
+    if windows is None or residual is None:
+        return np.zeros(0), np.zeros((0, 6))
+    changes = (np.diff(windows.position) != 0) | (np.diff(windows.is_dynamic) != 0)
+    soak = np.concatenate(([0], np.cumsum(changes)))[~windows.is_dynamic]
+    values = np.column_stack((windows.board, residual, windows.force - residual))
+    mean = means_by(soak, values[~windows.is_dynamic])
+    error, force = mean[:, 1:4], mean[:, 4:]
+    known = np.abs(force) >= 0.5 * windows.gravity
+    scale = np.divide(error, force, out=np.full(error.shape, np.nan), where=known)
+    return mean[:, 0], np.hstack((error / MICRO_G, scale * 1e6))
+
+
+def draw_shares(curves: Mapping[str, Floats]) -> Figure:
+    """Draw the percentage of units up to each RMS residual [micro-g], for each section."""
+    figure = style.new_figure(2.6)
+    axes = figure.subplots()
+    drawn = {name: np.sort(values[values > 0.0]) for name, values in curves.items()}
+    drawn = {name: values for name, values in drawn.items() if len(values)}
+    lines = {'raw': style.CORRECTION_LINES['raw'], 'static': style.STATIC_LINE}
+    for name, values in drawn.items():
+        share = np.arange(1, len(values) + 1) / len(values) * 100.0
+        line = lines.get(name, style.DYNAMIC_LINE)
+        axes.step(values, share, where='post', label=name, **line)
+    low = min((float(values[0]) for values in drawn.values()), default=1.0)
+    high = max((float(values[-1]) for values in drawn.values()), default=1.0)
+    axes.set(xscale='log', xlim=(low / 1.3, high * 1.3))
+    subs = (1.0, 2.0, 5.0) if high * 1.3 < 50.0 * (low / 1.3) else (1.0,)
+    axes.xaxis.set_major_locator(LogLocator(subs=subs))
+    axes.xaxis.set_major_formatter(lambda value, _: f'{value:g}')
+    axes.xaxis.set_minor_formatter('')
+    axes.set(ylim=(0.0, 103.0), xlabel='|f| − g of a unit, RMS, µg', ylabel='units, %')
+    style.legend_above(axes)
+    return figure
+
+
+def draw_distances(
+    labels: Sequence[str], distances: Sequence[Floats], limits: Sequence[float]
+) -> Figure:
+    """Draw each unit's distance from the fleet's median, by quantity; outliers are diamonds."""
+    figure = style.new_figure(0.6 + 0.19 * len(labels))
+    axes = figure.subplots()
+    known = [limit for limit in limits if np.isfinite(limit)]
+    shown = min(max(1.15 * max(known, default=0.0), 4.0), 12.0)
+    for row, (z, limit) in enumerate(zip(distances, limits, strict=True)):
+        at = np.clip(z, -1.04 * shown, 1.04 * shown)
+        is_far = np.abs(z) > limit
+        marks = ((~is_far, '|', style.GREY, 6.0), (is_far, 'D', style.RED, 3.5))
+        for rows, mark, color, size in marks:
+            axes.plot(at[rows], np.full(int(rows.sum()), row), mark, color=color, ms=size)
+        for edge in (-limit, limit):
+            if abs(edge) < 1.1 * shown:
+                axes.plot([edge, edge], [row - 0.5, row + 0.5], color=style.BLACK, linewidth=0.8)
+    axes.set_yticks(range(len(labels)), labels)
+    axes.set(xlim=(-1.1 * shown, 1.1 * shown), ylim=(len(labels) - 0.4, -0.6))
+    axes.set_xlabel('distance from the median, standard deviations')
+    return figure
