@@ -5,7 +5,7 @@
 import re
 from contextlib import nullcontext
 from dataclasses import replace
-from types import SimpleNamespace
+from types import SimpleNamespace as Parts
 
 import numpy as np
 import pytest
@@ -165,11 +165,15 @@ def judged(
         residual_statistics(np.full(0 if rms is None else 9, (rms or 0.0) * MICRO_G))
         for rms in (raw, raw, raw, fitted, left_out)
     ]
-    findings = judge_result(
-        np.full(3, 990.0), [ResidualRow('all', *steps)], slow * MICRO_G,
-        FitOptions(gravity=9.81, **options), span=span, drift=drift * MICRO_G,
-        noise=noise * MICRO_G, sigma=sigma * MICRO_G, is_changed=False,
-    )  # fmt: skip
+    prior = Parts(sigma=sigma * MICRO_G, informative=None)
+    fit = Parts(
+        windows=Parts(temperature=[0.0, span], data=Parts(position=np.zeros(2, int))),
+        selected=Parts(score=Parts(noise=noise * MICRO_G)),
+        posterior=Parts(state=Parts(kappa=np.full(3, 990.0)), prior=prior),
+        regression=Parts(nominal_scale=1.0),
+    )
+    norms, options = np.array([drift, -drift]) * MICRO_G, FitOptions(gravity=9.81, **options)
+    findings = judge_result(fit, ResidualRow('all', *steps), norms, slow * MICRO_G, options)
     return {finding.name: finding for finding in findings}
 
 
@@ -249,9 +253,9 @@ def test_the_gradient_of_a_soak_does_not_depend_on_the_ramps(good, rng):
 )
 def test_implausible_scale_factors_from_few_attitudes_are_refused(kappa, n, is_refused):
     # WHY: a fit to three attitudes found scale factors of 1.04, 1.19, 0.53: force errors of 0.3 g.
-    state = SimpleNamespace(kappa=np.array(kappa), up=positions(n, 3))
-    prior = SimpleNamespace(informative=None, scale_mean=np.ones(3), scale_sd=0.05)
-    fit = SimpleNamespace(posterior=SimpleNamespace(state=state, prior=prior))
+    state = Parts(kappa=np.array(kappa), up=positions(n, 3))
+    prior = Parts(informative=None, scale_mean=np.ones(3), scale_sd=0.05)
+    fit = Parts(posterior=Parts(state=state, prior=prior))
     with pytest.raises(UndeterminedError) if is_refused else nullcontext() as refusal:
         check_scale(fit)
     assert not is_refused or 'scale factor of z is 0.53 times' in str(refusal.value)

@@ -148,8 +148,8 @@ def test_the_radius_of_a_rotation_is_estimated(rng):
 def test_a_table_of_sections_is_read_as_begin_end_force_and_sd():
     text = '# begin end |f| sd\n0 100 9.81\n120, 300, 49.05, 0.001  # spun up'
     known = KnownForce('bag', parse_sections(text))
-    at = [known.of(a * 10**9, b * 10**9, 0) for a, b in ((10, 90), (150, 250), (310, 400))]
-    assert at == [Magnitude(9.81), Magnitude(49.05, sd=0.001), Magnitude(None)]
+    at = [known.of(a * 10**9, b * 10**9, 0, G) for a, b in ((10, 90), (150, 250), (310, 400))]
+    assert at == [Magnitude(9.81), Magnitude(49.05, sd=0.001), Magnitude(G)]
     assert parse_sections('49.05') == (Section(0.0, math.inf, 49.05, 0.0),)
     for wrong, said in (
         ('fast', 'expected numbers'),
@@ -167,11 +167,8 @@ def test_a_force_given_by_the_user_overrides_the_force_in_the_bag(tmp_path):
     rate = np.zeros((200, 3))
     rate[:, 2] = np.where(np.arange(200) < 100, 0.0, 5.0)
     by_rate = {ROTATION: 'table/rate', 'rotation_radius_m': '2', 'rotation_radius_sd_m': '0.01'}
-    for name, metadata in (
-        ('a', {MAGNITUDE: '30'}),
-        ('02', by_rate),
-        ('c', {ROTATION: 'table/rate'}),
-    ):
+    bags = {'a': {MAGNITUDE: '30'}, '02': by_rate, 'c': {ROTATION: 'table/rate'}}
+    for name, metadata in bags.items():
         with BagWriter(tmp_path / f'{name}.mcap', metadata=metadata) as writer:
             writer.write_counts('accel/counts', stamps, rate)
             writer.write_counts('table/rate', stamps, rate)
@@ -182,19 +179,19 @@ def test_a_force_given_by_the_user_overrides_the_force_in_the_bag(tmp_path):
         path = tmp_path / f'{name}.mcap'
         return known_force(path, inspect_recording(path), asked)
 
-    whole = 10**18, 10**18 + 4 * 10**9, 10**18
+    whole = 10**18, 10**18 + 4 * 10**9, 10**18, 10.0
     assert read('a').of(*whole).still == 30.0
     assert read('a', ForceOptions('5g')).of(*whole).still == pytest.approx(5 * G)
     for name, size in (('a', 20.0), ('02', 25.0), ('c', None)):
         known = read(name, ForceOptions(str(tmp_path / 'table.txt'))) if size else None
         assert known is None or known.of(*whole).still == size
     turning = read('02')
-    assert turning.of(*whole) == Magnitude(None, 0.0, 0.0)
-    fast = turning.of(10**18 + 11 * 10**9, 10**18 + 19 * 10**9, 10**18)
-    assert fast.norm(10.0) == pytest.approx(math.hypot(10.0, 50.0))
-    assert turning.radius_part(fast, 10.0) == pytest.approx(2500.0 / math.hypot(10, 50) * 0.005)
+    assert turning.of(*whole) == Magnitude(10.0, 0.0, 0.0)
+    fast = turning.of(10**18 + 11 * 10**9, 10**18 + 19 * 10**9, 10**18, 10.0)
+    assert fast.norm == pytest.approx(math.hypot(10.0, 50.0))
+    assert turning.radius_part(fast) == pytest.approx(2500.0 / math.hypot(10, 50) * 0.005)
     with pytest.raises(FitError, match='a rest needs 3'):
-        turning.of(10**18 + 30 * 10**9, 10**18 + 31 * 10**9, 10**18)
+        turning.of(10**18 + 30 * 10**9, 10**18 + 31 * 10**9, 10**18, 10.0)
     with pytest.raises(FitError, match='need a positive rotation_radius_m'):
         read('c')
     with pytest.raises(FitError, match='0 topics are called spin'):

@@ -21,7 +21,7 @@ from strangers_cases import (
 )
 from strangers_units import GRAVITY, navigation, program, record, rng_of, spread
 
-from thermo_comp.fitting import unseen_axes
+from thermo_comp.fitting import thermal_ranges
 from thermo_comp.fitting.rests import poses_of
 from thermo_comp.unit.calibration import LackOfFit
 
@@ -59,14 +59,14 @@ def test_axes_never_along_gravity_at_some_temperatures_have_a_larger_sd():
     # Six positions, one per face, cover 0 to 40 degC; one position with x up covers -40 to 0 degC.
     faces = [*np.eye(3), *-np.eye(3), np.eye(3)[0]]
     fit = fit_of([0, 40] * 6 + [-40, 0], faces, np.repeat(np.arange(7), 2))
-    (lack, _) = unseen_axes.with_unseen_axes(fit, ((), ()), None)
+    (lack, _) = thermal_ranges.with_unseen_axes(fit, ((), ()), None)
     assert [point.temperature_c for point in lack] == pytest.approx([-40, -31, -22, -13, -4])
     for point in lack:
         # The curve of a scale is used to 4 K (a tenth of its range) beyond its range; farther out
         # the slope of the scale is assumed to have an sd of 5 ppm/K, half of the fitted slope.
         sd = 0.5e-5 * 10.0 * (-4.0 - point.temperature_c)
         assert point.sd_m_s2 == pytest.approx((0.0, sd, sd), abs=1e-12)
-    (finding,) = unseen_axes.judge_unseen_axes(fit, None)
+    (finding,) = thermal_ranges.judge_unseen_axes(fit, None)
     assert 'below -4 degC no position has gravity along y and z' in finding.message
 
 
@@ -76,10 +76,10 @@ def test_axes_never_along_gravity_at_some_temperatures_have_a_larger_sd():
 def test_no_sd_is_added_if_the_same_axes_are_along_gravity_at_all_temperatures(up):
     fit = fit_of([0, 40, -40, 0], [up[0], up[1]], [0, 0, 1, 1])
     only_x = np.allclose(up, [1.0, 0.0, 0.0])
-    assert unseen_axes.with_unseen_axes(fit, ((), ()), None) == [(), ()]
-    assert unseen_axes.judge_unseen_axes(fit, None) == []
+    assert thermal_ranges.with_unseen_axes(fit, ((), ()), None) == [(), ()]
+    assert thermal_ranges.judge_unseen_axes(fit, None) == []
     # A prior determines all axes within its temperature range, from 0 to 40 degC.
-    (lack, _) = unseen_axes.with_unseen_axes(fit, ((), ()), prior_of(0.0, 40.0))
+    (lack, _) = thermal_ranges.with_unseen_axes(fit, ((), ()), prior_of(0.0, 40.0))
     assert bool(lack) == only_x
 
 
@@ -87,7 +87,7 @@ def test_an_update_keeps_the_lack_of_fit_of_axes_that_it_does_not_observe():
     lacks = LackOfFit(0.0, (1e-3, 1e-3, 1e-3)), LackOfFit(40.0, (1e-3, 1e-3, 1e-3))
     fit = fit_of([10, 30], [[1.0, 0.0, 0.0]], [0, 0])
     new = (LackOfFit(20.0, (2e-4, 2e-4, 2e-3)),)
-    (points, _) = unseen_axes.with_unseen_axes(fit, (new, new), prior_of(0.0, 40.0, *lacks))
+    (points, _) = thermal_ranges.with_unseen_axes(fit, (new, new), prior_of(0.0, 40.0, *lacks))
     by_temperature = {point.temperature_c: point.sd_m_s2 for point in points}
     assert by_temperature[20.0] == pytest.approx((2e-4, 1e-3, 2e-3))
     assert by_temperature[0.0] == pytest.approx((1e-3, 1e-3, 2e-3))

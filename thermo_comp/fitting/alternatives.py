@@ -21,7 +21,7 @@ from .priors import prior_model
 from .reduction import ReducedBag
 from .selection import Fit
 from .sensors import board_span, gradients_at_rest, learn_detector
-from .windows import PART, PART_SUMS, SET, Model, ThermalWindows, Track, thermal_windows
+from .windows import PART, PRODUCTS, SET, Model, ThermalWindows, Track, thermal_windows
 
 
 def model_of(
@@ -57,7 +57,7 @@ def model_of(
     if options.groups is not None:
         groups = {*options.groups, *options.forced}
         if PART in groups:
-            groups.update(PART_SUMS)
+            groups.update(('board', *PRODUCTS))
         columns = tuple(column for column in columns if column.group in groups)
     sets = sets_of(options, bags)
     return Model(options.model, sets, columns, sensors, detector, reference, parts)
@@ -99,7 +99,7 @@ def windows_of(
     undisturbed: Floats | None = None,
 ) -> ThermalWindows:
     """Return the windows of bags; `tracks`: thermal states of the bags, if computed before."""
-    windows = with_forces(thermal_windows(bags, model, tracks), bags, options)
+    windows = with_forces(thermal_windows(bags, model, tracks), options)
     return replace(windows, data=replace(windows.data, undisturbed=undisturbed))
 
 

@@ -38,7 +38,6 @@ from .reduction import ReducedBag
 from .regression import Regression
 from .selection import Fit
 from .unknowns import State
-from .unseen_axes import with_unseen_axes
 from .windows import PART, Model, ThermalWindows
 
 
@@ -106,7 +105,7 @@ def _regime_sets(fit: Fit, claim: Claim, known: Calibration | None) -> list[Regi
     slow = np.sqrt(claim.offset_sd**2 + prior.sigma**2 * prior.noise.variance).tolist()
     lacks: Sequence[tuple[LackOfFit, ...]] = ((), ())
     if fit.regression.gravity:
-        lacks = with_unseen_axes(fit, lack_of_fit(fit, claim), known)
+        lacks = ranges.with_unseen_axes(fit, lack_of_fit(fit, claim), known)
     result = []
     for k, (family, lack) in enumerate(zip(windows.model.sets.families, lacks, strict=True)):
         zero = (0.0,) * family.n_free
@@ -127,7 +126,7 @@ def _valid_columns(
     """Return the response columns in use with their valid ranges."""
     lower, upper = ranges.temperature_range(windows)
     is_weighed = np.any(state.weights != 0.0, axis=(0, 1))
-    n_alone = windows.model.part_curves.sums.shape[1]
+    n_alone = windows.model.part_sums.shape[1]
     alone = is_weighed[len(windows.model.sets.groups) :]
     weighed = _of_columns(windows, is_weighed)
     of_parts = _of_columns(windows, is_weighed & (np.arange(len(is_weighed)) >= n_alone))
@@ -155,8 +154,8 @@ def _valid_columns(
 
 
 def _of_columns(windows: ThermalWindows, mask: Bools) -> list[int]:
-    """Return the response columns that a mask selects, directly or in a sum of `part_curves`."""
-    sums, n_curves = windows.model.part_curves.sums, len(windows.model.sets.groups)
+    """Return the response columns that a mask selects, directly or in a sum of `part_sums`."""
+    sums, n_curves = windows.model.part_sums, len(windows.model.sets.groups)
     contained = mask[: sums.shape[1]] | (sums != 0.0)[mask[sums.shape[1] :]].any(axis=0)
     return [int(k) for k in np.flatnonzero(contained[n_curves:])]
 
@@ -287,7 +286,7 @@ def file_jacobian(
 
     `used`: response columns in the file; `kinds`: nonlinear terms in the file
     """
-    sets, sums = model.sets, model.part_curves.sums
+    sets, sums = model.sets, model.part_sums
     n, m = sets.static.n_free, sets.dynamic.n_free
     # The last row is zero: the index -1 of a parameter that is not estimated selects this row.
     unknown = np.eye(layout.n_unit + 1, layout.n_unit)

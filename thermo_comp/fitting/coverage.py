@@ -31,11 +31,10 @@ SAME_DIRECTION_DEG = 5.0
 
 def force_columns(up: Floats) -> Floats:
     """Differentiate the force at unit vectors (n, 3) w.r.t. a triad's constants: (n, 3, 9)."""
-    columns = np.zeros((len(up), 3, 9))
-    for axis in range(3):
-        columns[:, axis, axis] = 1.0
-        columns[:, axis, 3 + axis] = up[:, axis]
-    columns[:, 1, 6], columns[:, 2, 7], columns[:, 2, 8] = up[:, 0], up[:, 0], up[:, 1]
+    columns, axes = np.zeros((len(up), 3, 9)), np.arange(3)
+    columns[:, axes, axes] = 1.0
+    columns[:, axes, 3 + axes] = up
+    columns[:, [1, 2, 2], [6, 7, 8]] = up[:, [0, 0, 1]]
     return columns
 
 
@@ -70,10 +69,10 @@ def next_direction(covariance: Floats, sd: float, positions: Floats) -> Floats:
     """
     columns = force_columns(_SPHERE)
     weight = np.einsum('nij,nik->jk', columns, columns) / len(columns)
-    columns_of_norm = norm_columns(_SPHERE)
-    moved = columns_of_norm @ covariance
+    of_norm = norm_columns(_SPHERE)
+    moved = of_norm @ covariance
     gain = np.einsum('ij,jk,ik->i', moved, weight, moved)
-    gain /= np.einsum('ij,ij->i', moved, columns_of_norm) + sd * sd
+    gain /= np.einsum('ij,ij->i', moved, of_norm) + sd * sd
     gain[np.max(_SPHERE @ positions.T, axis=1, initial=-1.0) > math.cos(math.radians(20.0))] = 0.0
     good = gain >= max(0.5 * gain.max(), 1e-300)
     # Slices of `_SPHERE`: faces, edges and corners of a cube, and all other directions.
@@ -86,7 +85,7 @@ def farthest(up: Floats) -> tuple[Floats, float]:
     """Return the direction farthest from its nearest vector in `up`, (n, 3); their angle [deg]."""
     nearest = np.max(_SPHERE @ up.T, axis=1, initial=-1.0)
     chosen = int(np.argmin(nearest))
-    return _SPHERE[chosen], float(np.degrees(np.arccos(np.clip(nearest[chosen], -1.0, 1.0))))
+    return _SPHERE[chosen], float(np.degrees(np.arccos(np.minimum(nearest[chosen], 1.0))))
 
 
 def distinct_directions(up: Floats) -> Floats:
@@ -105,13 +104,17 @@ def directions(means: Floats, centre: Floats) -> Floats:
     return np.asarray((means - centre) / np.where(norms > 0.0, norms, np.nan))
 
 
+def n_directions(means: Floats) -> int:
+    """Return the number of distinct directions of mean readings, (n, 3), from `rough_centre`."""
+    return len(distinct_directions(directions(means, rough_centre(means))))
+
+
 def rough_centre(means: Floats) -> Floats:
     """
     Return the reading at zero force: 0, or the centre of a fitted sphere if the norms differ.
 
-    In offset binary codes the angle between two readings is meaningful only after the code at zero
-    force is subtracted. `means`: mean readings, shape (n, 3). The result is 0 for fewer than four
-    readings, readings in a plane or almost one attitude, and an implausible sphere.
+    `means`: mean readings, shape (n, 3). The result is 0 for fewer than four readings, readings in
+    a plane or almost one attitude, and an implausible sphere.
     """
     zero = np.zeros(3)
     if len(means) < 4:
@@ -159,8 +162,7 @@ def best_rests(candidates: list[Floats]) -> int:
     residuals of |f|. The best set is the first whose sd is within 2 % of the smallest sd: the
     first sets have the longest, quietest rests. If no set has six attitudes, take the first set.
     """
-    ups = [directions(means, rough_centre(means)) for means in candidates]
-    counts = [len(distinct_directions(up)) for up in ups]
+    counts = [n_directions(means) for means in candidates]
     costs = np.array([
         _cost(means, max(counts) >= 12) if n >= 6 else np.inf
         for means, n in zip(candidates, counts, strict=True)
@@ -206,11 +208,11 @@ def least_known(calibration: Calibration, up: Floats) -> LeastKnown | None:
     """Find the attitude of largest sd of |f|, None without covariance; `up`: positions, (n, 3)."""
     if calibration.posterior is None:
         return None
-    layout, axes = parameter_layout(calibration), calibration.axes
+    layout = parameter_layout(calibration)
     levels = [block.static for block in (*layout.bias, *layout.scale)]
     places = [*levels, *range(layout.misalignment, layout.misalignment + 3)]
     # Negative signs: if a calibrated bias or scale is too large, the corrected force is too small.
-    unit = np.array([-1.0 / axis.scale_factor for axis in (axes.x, axes.y, axes.z)])
+    unit = np.array([-1.0 / axis.scale_factor for axis in calibration.axes])
     unit = np.concatenate((unit, np.repeat((-1.0, 1.0), 3) * calibration.gravity_m_s2))
     covariance = calibration.posterior.covariance()[np.ix_(places, places)] * np.outer(unit, unit)
     sd, seen_sd = (
@@ -218,14 +220,10 @@ def least_known(calibration: Calibration, up: Floats) -> LeastKnown | None:
         for columns in (norm_columns(_SPHERE), norm_columns(up))
     )
     worst = int(np.argmax(sd))
-    nearest = float(np.max(up @ _SPHERE[worst], initial=-1.0))
     x, y, z = _SPHERE[worst].tolist()
-    return LeastKnown(
-        (x, y, z),
-        math.degrees(math.acos(min(nearest, 1.0))),
-        float(sd[worst]),
-        float(np.median(seen_sd)),
-    )
+    nearest = min(float(np.max(up @ _SPHERE[worst], initial=-1.0)), 1.0)
+    away_deg = math.degrees(math.acos(nearest))
+    return LeastKnown((x, y, z), away_deg, float(sd[worst]), float(np.median(seen_sd)))
 
 
 def direction_text(up: Floats) -> str:

@@ -9,7 +9,7 @@ uncertainty. A refusal stops the fit, unless its `Finding.name` is allowed; advi
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -77,12 +77,12 @@ def judge_windows(
     temperatures beyond the range of the prior are judged instead of the span and the ramps.
     """
     yield _judge_positions(up)
-    used_bags = list({id(bag): bag for bag, _ in windows.rests}.values())
     if not windows.has_temperature:
         what = 'no change of temperature was read'
-        if not any(len(bag.board.value) for bag in used_bags):
-            is_read = any(len(of.value) for bag in used_bags for of in bag.temperatures.values())
-            what = 'the bags have no thermometer' + ' of the board' * is_read
+        bags = [bag for bag, _ in windows.rests]
+        read = {name for bag in bags for name in bag.temperatures if len(bag.readings(name).value)}
+        if 'board' not in read:
+            what = 'the bags have no thermometer' + ' of the board' * bool(read)
         text = f'{what}: the calibration holds at the temperature of the test'
         yield advice('temperature', text)
         return
@@ -146,10 +146,7 @@ def _has_drift(windows: ThermalWindows) -> bool:
 
 
 def _ramp_rates(windows: ThermalWindows) -> Floats:
-    """
-    Return the rate of the board temperature [K/min], shape (n,). The rate is set to 0, as noise,
-    where the slope of the windows' mean temperatures is below half of the rate.
-    """
+    """Return the board's rate [K/min], (n,); 0 where it is over twice the windows' slope."""
     rate, edges = windows.rate * 60.0, windows.data.edges
     for rows in map(slice, edges[:-1], edges[1:]):
         if rows.stop - rows.start > 1:
@@ -275,9 +272,8 @@ def determines_misalignment(up: Floats) -> bool:
     six faces held three times each by hand.
     """
     distinct = distinct_directions(up)
-    if len(distinct) < POSITIONS_FOR_MISALIGNMENT:
-        return False
-    return geometry(distinct, with_misalignment=True) <= 6.0
+    is_enough = len(distinct) >= POSITIONS_FOR_MISALIGNMENT
+    return is_enough and geometry(distinct, with_misalignment=True) <= 6.0
 
 
 def judge_constants(fit: Fit, raw: float, options: FitOptions) -> Iterator[Finding]:
@@ -325,29 +321,17 @@ def check_scale(fit: Fit) -> None:
 
 
 def judge_result(
-    K: Floats,
-    rows: Sequence[ResidualRow],
-    slow: float,
-    options: FitOptions,
-    *,
-    span: float,
-    drift: float,
-    noise: float,
-    sigma: float,
-    is_changed: bool,
+    fit: Fit, overall: ResidualRow, norms: Floats, slow: float, options: FitOptions
 ) -> Iterator[Finding]:
     """
-    Check the residuals of a fit.
+    Check the residuals of a fit, `overall`: of all windows.
 
-    K: scale factors; rows: residuals by regime and, last, of all windows
+    norms: ``|f| - g`` of each window, shape (n,) [m/s^2]
     slow: sd of the bias offset of a mounting or turn-on [m/s^2]
-    span: span of the board temperature [K]
-    drift: RMS of ``|f| - g`` about the means of the positions [m/s^2]
-    noise: white noise of a window [m/s^2]
-    sigma: RMS error of a window that the fit does not explain [m/s^2]
-    is_changed: whether a prior far wider than the given calibration has more evidence
     """
-    overall = rows[-1]
+    drift = within_positions(norms[:, None], fit.windows.data.position)
+    span, noise = float(np.ptp(fit.windows.temperature)), fit.selected.score.noise
+    prior, K = fit.posterior.prior, fit.posterior.state.kappa * fit.regression.nominal_scale
     raw, fitted, left_out = (
         row.rms / MICRO_G for row in (overall.raw, overall.fitted, overall.left_out)
     )
@@ -357,18 +341,15 @@ def judge_result(
     # Noise explains a residual of up to twice the white noise.
     if span > 0.0 and is_slow and overall.fitted.rms > 2.0 * noise:
         why = 'temperature does not explain the drift (jumps, mounting, a loose thermometer?)'
-        if drift <= max(2.0 * noise, 0.3 * overall.fitted.rms):
+        if float(np.sqrt(np.mean(drift**2))) <= max(2.0 * noise, 0.3 * overall.fitted.rms):
             why = (
                 '|f| differs between positions, while temperature explains the drift within them: '
                 'the bias does not repeat after the unit is mounted or switched on again'
             )
         yield advice('misfit', f'{text}: {why}')
     elif raw < 1.2 * fitted and span >= LEAST_SPAN_K:
-        why = (
-            ': there is hardly a temperature drift above the noise to correct; are the samples '
-            'already compensated?'
-        )
-        yield advice('compensated', text + why)
+        why = 'there is hardly a temperature drift above the noise to correct; are the samples'
+        yield advice('compensated', f'{text}: {why} already compensated?')
     elif overall.left_out.rms > overall.raw.rms and raw >= 1.2 * fitted and span > 0.0:
         why = 'the other positions predict a left-out position badly; record more positions'
         yield advice('left out', f'{text}: left-out residuals exceed the raw residual: {why}')
@@ -377,14 +358,14 @@ def judge_result(
     alone = overall.two_sets.rms
     # A bias offset of up to 2 sd (2 `slow`) after a new turn-on does not contradict the prior, nor
     # does a residual that the initial lag states explain: then `sigma` is about the noise.
-    contradiction = ''
+    contradiction, sigma = '', float(np.mean(prior.sigma))
     is_above = overall.fitted.rms > np.hypot(1.5 * alone, 2.0 * slow) and sigma > 1.5 * alone
     if options.prior is not None and is_above:
         contradiction = (
             f'|f| - g is {ug_text(overall.fitted.rms)} RMS with the prior, {ug_text(alone)} with '
             'a static and a dynamic set fitted without the prior'
         )
-    elif is_changed:
+    elif prior.informative and prior.informative.is_changed:
         contradiction = 'the parameters differ from the prior by far more than the prior sd'
     if contradiction:
         yield advice(

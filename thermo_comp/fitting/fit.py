@@ -31,10 +31,8 @@ from .data_checks import Finding, advice, enforce
 from .environments import contradicting_bag, contradiction, is_better_without, with_excluded_error
 from .evidence import PositionReport, ResidualRow, position_reports, residual_rows
 from .gyroscope import RateRow, add_gyroscope
-from .initial_triad import within_positions
 from .initialisation import Problem, initial_triad
 from .joining import joined
-from .missing_readings import judge_missing
 from .nonlinear import choose, is_beyond, judge_terms, of_file, with_blank, with_forces
 from .options import COUNTS_FULL_SCALE, FitOptions
 from .priors import constants_of, offset_sd_of
@@ -42,7 +40,7 @@ from .reduction import ReducedBag, reduce_source
 from .selection import Fit
 from .sensors import without_copies
 from .sources import FitSource
-from .unseen_axes import judge_unseen_axes
+from .thermal_ranges import judge_unseen_axes
 from .windows import FEWEST_WINDOWS
 
 Progress = Callable[[float], None]
@@ -277,13 +275,13 @@ def _fit(
     windows = windows_of(bags, model_of(bags, options), options)
     if options.prior and windows.data.forces and options.prior.nonlinearity is None:
         options = replace(options, prior=with_blank(options.prior, options))
-        windows = with_forces(windows, bags, options)
+        windows = with_forces(windows, options)
     known = options.prior
     start = initial_triad(windows, options) if known is None else constants_of(known)
     up = start.directions(windows.data)
     has_case = all(len(bag.case.value) for bag in bags)
     findings += enforce(data_checks.judge_windows(windows, up, has_case, known), options)
-    findings += judge_missing(windows)
+    findings += raw_checks.judge_missing(bags, windows)
     progress(0.7)
     fit = regressed(
         windows, Problem(bags, options, start, up, progress, is_by_settled, has_pieces)
@@ -299,17 +297,8 @@ def _fit(
         lacks_effects=fit.selected.lacks_effects,
     )
     residuals, in_sample, left_out = residual_rows(fit)
-    drift = within_positions(in_sample[:, None], fit.windows.data.position)
     findings += enforce(data_checks.judge_constants(fit, residuals[-1].raw.rms, options), options)
-    K, informative = fit.posterior.state.kappa * start.scale, fit.posterior.prior.informative
-    findings += data_checks.judge_result(
-        *(K, residuals, claim.offset_sd, options),
-        span=float(np.ptp(fit.windows.temperature)),
-        drift=float(np.sqrt(np.mean(drift**2))),
-        noise=fit.selected.score.noise,
-        sigma=float(np.mean(fit.posterior.prior.sigma)),
-        is_changed=bool(informative and informative.is_changed),
-    )
+    findings += data_checks.judge_result(fit, residuals[-1], in_sample, claim.offset_sd, options)
     findings += data_checks.judge_mountings(fit, claim.offset_sd, options)
     try:
         nonlinearity = of_file(fit.regression, terms, options)
@@ -354,7 +343,8 @@ def _judged(
     findings = enforce(raw_checks.judge_prior(serial, options.prior), options)
     findings += enforce(raw_checks.judge_bags(bags, options), options)
     kept, copies = without_copies(bags)
-    return kept, findings + raw_checks.judge_copies(copies)
+    text = 'repeats the readings of the board, and is left out'
+    return kept, findings + [data_checks.advice('copy', f'temperature/{k} {text}') for k in copies]
 
 
 def _unusable(error: ValueError, up: Floats) -> FitError:

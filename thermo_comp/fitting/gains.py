@@ -66,10 +66,9 @@ class Inactive:
 
     def gain(self, column_sd: Floats, wanted: Bools) -> float:
         """
-        Return the gain in log evidence if the columns in the mask `wanted`, (m,), are added.
-
-        The gain is ``(q (1 + S)^-1 q - log det(1 + S)) / 2``, at least 0, with S and q in units of
-        the prior sd: `column_sd`, (2, m), times the root of the best of `_SQUARED_FACTORS`.
+        Return the gain in log evidence if the columns in the mask `wanted`, (m,), are added:
+        ``(q (1 + S)^-1 q - log det(1 + S)) / 2``, at least 0, with S and q in units of the prior
+        sd, which is `column_sd`, (2, m), times the root of the best of `_SQUARED_FACTORS`.
         """
         S, Q, _ = self._in_prior_sd(column_sd, wanted)
         S, along = np.linalg.eigh(S)

@@ -67,9 +67,8 @@ def add_gyroscope(
         tilt=windows.data.tilt[:, :0],
     )
     regression = Regression(data, 0.0, np.ones(3))
-    level = position_means(data)
     up = np.tile((0.0, 0.0, 1.0), (data.n_positions, 1))
-    state = regression.initial_state(level.mean(axis=0), np.zeros(3), up)
+    state = regression.initial_state(position_means(data).mean(axis=0), np.zeros(3), up)
     # Sd of the component of the Earth's rate along one axis in an unknown attitude [rad/s].
     earth_sd = EARTH_RATE / math.sqrt(3.0)
     prior = Prior(
@@ -83,12 +82,10 @@ def add_gyroscope(
     )
     fit = Fit(windows, regression, select(regression, state, prior, _candidates(data, options)))
     # The positions determine the sd of the offsets well: `claim_of` need not marginalise this sd.
-    fixed_sd = replace(fit.posterior.prior, offset_scale=0.0)
-    chosen = replace(fit.posterior, prior=fixed_sd)
+    chosen = replace(fit.posterior, prior=replace(fit.posterior.prior, offset_scale=0.0))
     claim = claim_of(regression, chosen, lacks_effects=fit.selected.lacks_effects)
     # The offsets contain the Earth's rate, no error of the gyroscope: subtract its variance.
-    turn_on = math.sqrt(max(claim.offset_sd**2 - earth_sd**2, 0.0))
-    claim = replace(claim, offset_sd=turn_on)
+    claim = replace(claim, offset_sd=math.sqrt(max(claim.offset_sd**2 - earth_sd**2, 0.0)))
     triad = build_calibration(fit, claim, bags, calibration.unit)
     needed = {*calibration.sensors, *triad.sensors}
     sensors = tuple(name for name in windows.model.sensors if name in needed)

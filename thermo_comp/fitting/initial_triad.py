@@ -55,7 +55,7 @@ def constant_calibration(
     if isinstance(gravity, np.ndarray):
         scale = np.full(3, float(np.median(np.linalg.norm(means, axis=1) / gravity)))
         calibration, rms = _refine(means, gravity, np.zeros(3), scale, misalignment_sd)
-        if not np.all(calibration.scale > 0.0) or not rms < largest_rms:
+        if not rms < largest_rms:
             raise FitError(
                 'the readings at rest contradict the stated |f|: are the values in '
                 '--specific-force, --radius or the metadata of the bags right?'
@@ -64,22 +64,19 @@ def constant_calibration(
     bias = 0.5 * (means.max(axis=0) + means.min(axis=0))
     half = 0.5 * (means.max(axis=0) - means.min(axis=0))
     if not np.all(half > 0.0):
-        axes = ', '.join(
-            axis for axis, size in zip('xyz', half.tolist(), strict=True) if size == 0.0
-        )
+        axes = ', '.join('xyz'[k] for k in np.flatnonzero(half == 0.0))
         raise FitError(
             f'an axis ({axes}) reads the same in all positions: the axis is dead, or the unit was '
             'never turned about another axis'
         )
-    tried = []
-    for spread in (1.0, 1.3):
-        scale = np.full(3, float(np.max(half)) * spread / gravity)
-        scale = np.where(half * 4.0 > np.max(half), scale, half / gravity)
-        tried.append(_refine(means, gravity, bias, scale, misalignment_sd))
+    # The largest half range is |f| if two positions are near its axis, else less: try two ratios.
+    scales = (float(np.max(half)) * spread / gravity for spread in (1.0, 1.3))
+    starts = (np.where(half * 4.0 > np.max(half), scale, half / gravity) for scale in scales)
+    tried = (_refine(means, gravity, bias, scale, misalignment_sd) for scale in starts)
     calibration, rms = min(tried, key=lambda fitted: fitted[1])
     # Scattered points may give a very large ellipsoid with a far centre, which is refused.
     is_around = np.all(np.abs(calibration.bias - bias) < 2.0 * np.max(half))
-    if not np.all(calibration.scale > 0.0) or not is_around or not rms < largest_rms:
+    if not (is_around and rms < largest_rms):
         raise FitError(
             'the mean readings of the positions do not lie on an ellipsoid: was the unit at rest '
             'in every position, and are these the readings of an accelerometer, with three axes '
@@ -91,12 +88,7 @@ def constant_calibration(
 def _refine(
     means: Floats, gravity: float | Floats, bias: Floats, scale: Floats, misalignment_sd: float
 ) -> tuple[ConstantCalibration, float]:
-    """
-    Fit the triad, beginning with given values; return also the RMS error of |f| [m/s^2].
-
-    |f| of few positions hardly determines some constants, so the built-in prior of the constants
-    is added, weighted as if |f| had an error of 0.1 %.
-    """
+    """Fit the triad, beginning with given values; return also the RMS error of |f| [m/s^2]."""
     one_g = float(np.median(gravity))
 
     def unpack(parameters: Floats) -> ConstantCalibration:
@@ -110,6 +102,8 @@ def _refine(
         return np.asarray(np.linalg.norm(calibration.force(means), axis=1) / gravity - 1.0)
 
     def residual(parameters: Floats) -> Floats:
+        # |f| of few positions hardly determines some constants, so the built-in prior of the
+        # constants is added, weighted as if |f| had an error of 0.1 %.
         calibration = unpack(parameters)
         bias_sd = BIAS_SD / STANDARD_GRAVITY * one_g
         log_scale = np.log(np.abs(calibration.scale))

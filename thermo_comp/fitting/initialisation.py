@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -56,6 +57,11 @@ class Problem:
     is_by_settled: bool = False
     has_pieces: bool = False
 
+    @cached_property
+    def n_directions(self) -> int:
+        """Number of distinct attitudes."""
+        return len(distinct_directions(self.up))
+
 
 def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     """
@@ -93,7 +99,7 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
 def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = False) -> Fit:
     """Fit the windows; `is_at_rest`: whether the columns are set constant in each position."""
     data, options, start = windows.data, problem.options, problem.start
-    known, n_directions = options.prior, len(distinct_directions(problem.up))
+    known, n_directions = options.prior, problem.n_directions
     # With a prior calibration, drifts in one attitude separate bias and scale: assume no bench.
     is_bench = known is None and rests.is_bench(windows, problem.up)
     has_poses = n_directions < POSITIONS_NEEDED and rests.is_constant(windows, data.position)
@@ -104,17 +110,16 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
         # of the unit, in a pose not from a change of the attitude, and in Golovach's model tilts
         # would absorb errors of the two sets.
         data = replace(data, tilt=data.tilt[:, :0])
-    data = replace(data, has_prior=known is not None)
-    if not problem.is_by_settled:
-        data = replace(data, settled=None)
+    settled = data.settled if problem.is_by_settled else None
+    data = replace(data, has_prior=known is not None, settled=settled)
     regression = Regression(data, options.gravity, start.scale)
     state = initial_state(regression, start, problem.up)
-    prior = _initial_prior(windows, start, options)
+    prior = _initial_prior(windows, problem)
     if n_directions >= POSITIONS_NEEDED and not data.has_turn_ons:
         # Misalignments would explain turn-on offsets, no unknowns here: reduce the sd of M.
         prior = _with_faces(prior, problem.up)
-    steepness = _steepness(windows, start, options, is_at_rest=is_at_rest)
-    candidates = _candidates(windows, steepness, options, n_directions, is_bench=is_bench)
+    steepness = _steepness(windows, problem, is_at_rest=is_at_rest)
+    candidates = _candidates(windows, problem, steepness, is_bench=is_bench)
     if known is not None:
         state = with_terms(with_calibration(known, regression, state), known)
         usual_ageing = LARGE_OFFSETS * _mounting_scale(_noise_in_1_hz(windows, start.scale))
@@ -141,9 +146,8 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     if options.model == 'golovach':
         prior = replace(prior, column_sd=candidates.typical)
         return Fit(windows, regression, fit_all(regression, state, prior, candidates))
-    narrow = prior
-    if n_directions < POSITIONS_NEEDED:
-        narrow = _narrowed(prior, regression, state, options)
+    is_few = n_directions < POSITIONS_NEEDED
+    narrow = _narrowed(prior, regression, state) if is_few else prior
     without_slow = replace(candidates, typical=candidates.typical * ~_is_slow(windows))
     selected = select(
         *(regression, state, narrow, without_slow),
@@ -153,10 +157,8 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     full_prior = replace(chosen.prior, bias_sd=prior.bias_sd, scale_sd=prior.scale_sd)
     selected = replace(selected, posterior=replace(chosen, prior=full_prior))
     # The covariance has the full prior sd of slopes of the scale, not that halved by `_steepest`.
-    full, used = (
-        _typical_slopes(steepness, limits, options)
-        for limits in (STEEPEST, _steepest(n_directions))
-    )
+    limits = STEEPEST, _steepest(n_directions)
+    full, used = (_typical_slopes(steepness, limit, options.gravity) for limit in limits)
     claimed = candidates.typical * (full / used)[:, np.newaxis]
     return Fit(windows, regression, selected, claimed)
 
@@ -168,11 +170,9 @@ def initial_state(regression: Regression, start: ConstantCalibration, up: Floats
     return regression.initial_state(start.bias / start.scale, misalignment, up)
 
 
-def _initial_prior(
-    windows: ThermalWindows, start: ConstantCalibration, options: FitOptions
-) -> Prior:
+def _initial_prior(windows: ThermalWindows, problem: Problem) -> Prior:
     """Return the prior of the constants and of the noises, without columns."""
-    data = windows.data
+    data, start, options = windows.data, problem.start, problem.options
     drift = within_positions(data.mean / start.scale, data.position)
     # Initial sd of mounting offsets, and smallest initial white noise: 1 ug [m/s^2].
     least = 1e-5
@@ -205,9 +205,9 @@ def _initial_prior(
 
 def _with_faces(prior: Prior, up: Floats) -> Prior:
     """
-    Return the prior with a smaller misalignment sd if a noisy sensor has only positions near its
-    six faces. Faces hardly determine misalignments, and misalignments of some degrees would, to
-    second order, explain any errors of |f|. The published covariance keeps the sd of `prior`.
+    Return the prior with a smaller misalignment sd if a noisy sensor is only held on its faces:
+    there misalignments of some degrees would, to second order, explain any errors of |f|. The
+    published covariance keeps the sd of `prior`.
     """
     by_element = up[:, [1, 2, 2]] * up[:, [0, 0, 1]]
     # Smaller sd of an element of M [rad]: the cross-axis sensitivity of good consumer MEMS.
@@ -219,7 +219,7 @@ def _with_faces(prior: Prior, up: Floats) -> Prior:
     return replace(prior, misalignment_sd=of_faces, unseen_misalignment_sd=sd)
 
 
-def _narrowed(prior: Prior, regression: Regression, state: State, options: FitOptions) -> Prior:
+def _narrowed(prior: Prior, regression: Regression, state: State) -> Prior:
     """
     Return the prior for the selection of the columns: the sds of bias and scale are five times the
     largest error of |f|, but 5 % to 100 % of those of `prior`. With wider priors, bias and scale
@@ -227,23 +227,19 @@ def _narrowed(prior: Prior, regression: Regression, state: State, options: FitOp
     """
     norms = np.linalg.norm(position_means(regression.windows) / regression.nominal_scale, axis=1)
     limit = 5.0 * float(np.abs(norms - regression.norms(state)).max())
-    bias, scale = (
-        float(np.clip(ratio, 0.05, 1.0))
-        for ratio in (limit / BIAS_SD, limit / options.gravity / SCALE_SD)
-    )
+    ratios = limit / BIAS_SD, limit / regression.gravity / SCALE_SD
+    bias, scale = np.clip(ratios, 0.05, 1.0).tolist()
     return replace(prior, bias_sd=bias * prior.bias_sd, scale_sd=scale * prior.scale_sd)
 
 
 def _is_slow(windows: ThermalWindows) -> Bools:
     """
-    Return which columns, shape (m,), have lags that settle by less than 90 % in the longest bag.
-
-    A slow column is nearly collinear with the curve, and its effect after settling would be
-    extrapolated. `select` does not use slow columns; the covariance includes them, see `claim`.
+    Return which columns, (m,), have lags that settle by less than 90 % in the longest bag: such a
+    column is nearly collinear with the curve, so `select` does not use it, but `claim` does.
     """
     model, longest_s = windows.model, float(windows.data.age.max())
     taus = np.array([0.0] * len(model.sets.groups) + [column.tau_s for column in model.columns])
-    of_part = ((model.part_curves.sums != 0.0) * taus).max(axis=1, initial=0.0)
+    of_part = ((model.part_sums != 0.0) * taus).max(axis=1, initial=0.0)
     return np.asarray(np.append(taus, of_part) > longest_s / np.log(10.0))
 
 
@@ -267,26 +263,17 @@ def _mounting_scale(noise: float) -> float:
 
 
 def _candidates(
-    windows: ThermalWindows,
-    steepness: float,
-    options: FitOptions,
-    n_directions: int,
-    *,
-    is_bench: bool,
+    windows: ThermalWindows, problem: Problem, steepness: float, *, is_bench: bool
 ) -> Candidates:
-    """
-    Return the columns that the model may have, with the typical and largest sd of their weights.
-
-    `is_bench`: whether only one of several attitudes was heated, see `rests`
-    """
-    data = windows.data
+    """Return the columns that the model may have, with the typical and largest sd of weights."""
+    data, options = windows.data, problem.options
     groups = np.array(data.groups)
     allowed = {*data.groups} if options.groups is None else {*options.groups, *options.forced}
     is_candidate = np.isin(groups, list(allowed)) & (data.kelvins > 0.0)
     is_candidate &= windows.has_temperature
     parts = np.stack((is_candidate, is_candidate & data.in_scale))
-    steepest = _steepest(n_directions)
-    slopes = _typical_slopes(steepness, steepest, options)
+    steepest = _steepest(problem.n_directions)
+    slopes = _typical_slopes(steepness, steepest, options.gravity)
     fixed = np.zeros(parts.shape, dtype=bool)
     if is_bench:
         # One attitude cannot separate scale and bias: the curve of the scale keeps its prior sd.
@@ -296,9 +283,7 @@ def _candidates(
         # All columns of both sets of Golovach's paper are kept, with ten times the largest prior
         # sd of a slope, which is almost a flat prior.
         slopes, forced, fixed = 10.0 * STEEPEST, np.ones_like(forced), np.ones_like(fixed)
-    typical, largest = (
-        np.outer(slope_sd, data.kelvins) * parts for slope_sd in (slopes, steepest)
-    )
+    typical, largest = (np.outer(sd, data.kelvins) * parts for sd in (slopes, steepest))
     if not windows.was_measured:
         # Without a thermometer the slopes over temperature keep their largest prior sd.
         typical[:, 0] = largest[:, 0] = STEEPEST
@@ -315,18 +300,16 @@ def _steepest(n_directions: int) -> Floats:
     return STEEPEST * (1.0, 0.5 if is_few else 1.0)
 
 
-def _typical_slopes(steepness: float, steepest: Floats, options: FitOptions) -> Floats:
+def _typical_slopes(steepness: float, steepest: Floats, gravity: float) -> Floats:
     """Return the typical prior sd of a slope of bias and scale, shape (2,)."""
     # The smallest typical slope of the bias is 0.1 ug/K, better than navigation grade.
     slope = float(np.clip(steepness, 1e-6, steepest[0] / 3.0))
-    return np.array([slope, min(slope / options.gravity, steepest[1] / 3.0)])
+    return np.array([slope, min(slope / gravity, steepest[1] / 3.0)])
 
 
-def _steepness(
-    windows: ThermalWindows, start: ConstantCalibration, options: FitOptions, *, is_at_rest: bool
-) -> float:
+def _steepness(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool) -> float:
     """Return the RMS change of a reading per kelvin, taken for a change of bias [m/s^2 per K]."""
-    data = windows.data
+    data, start = windows.data, problem.start
     within = within_positions(data.mean / start.scale, data.position)
     drift = float(np.sqrt(np.mean(within**2, axis=0)).max())
     if data.n_positions < POSITIONS_NEEDED:
@@ -335,8 +318,7 @@ def _steepness(
     kelvins = float(np.std(windows.temperature)) or 1.0
     # If the temperature differs between rests only, the drift appears in differences of their |f|.
     force = (position_means(data) - start.bias) / start.scale
-    sizes = sizes_of(windows, options)
-    norms = np.linalg.norm(force, axis=1)
+    sizes, norms = sizes_of(windows, problem.options), np.linalg.norm(force, axis=1)
     errors = norms - sizes
     if np.ptp(sizes) > 0.0:
         # Nonlinearity over |f| is not a thermal drift: subtract a cubic of |f| from the errors.
@@ -362,8 +344,7 @@ def sizes_of(windows: ThermalWindows, options: FitOptions) -> Floats:
 
 def initial_triad(windows: ThermalWindows, options: FitOptions) -> ConstantCalibration:
     """Fit the constants without temperature; with few attitudes only the scale, 1 for m/s^2."""
-    means = position_means(windows.data)
-    gravity = sizes_of(windows, options)
+    means, gravity = position_means(windows.data), sizes_of(windows, options)
     norms = np.linalg.norm(means, axis=1)
     if not norms.all() or (len(means) > 1 and not means.any(axis=0).all()):
         axes = ', '.join('xyz'[k] for k in np.flatnonzero(~np.any(means, axis=0)))

@@ -86,7 +86,7 @@ def _one_recording(parts: Sequence[ReducedBag]) -> ReducedBag:
         end_ns=last.end_ns,
         intervals=_intervals(parts),
         temperatures={
-            name: _readings([part.temperatures.get(name, Readings()) for part in parts])
+            name: _readings([part.readings(name) for part in parts])
             for name in dict.fromkeys(name for part in parts for name in part.temperatures)
         },
         n_spikes=sum((Counter(part.n_spikes) for part in parts), Counter()),

@@ -28,8 +28,8 @@ from ..typing import Floats
 from .reduction import ReducedBag
 from .sources import angular_velocity
 
-# Shortest time [s] and smallest number of samples for the mean level before or after a gap.
-_MARGIN_S, _MARGIN_SAMPLES = 10.0, 120
+# Shortest time for the mean level before or after a gap [s].
+_MARGIN_S = 10.0
 # Smallest number of samples before a step, and after it, for a test of the step.
 _FEWEST_SAMPLES = 8
 # Smallest significant ratio of a step to its sd. In noise without a step, the largest ratio over
@@ -65,10 +65,9 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     Two rests are compared if the gap between them is at most 30 s or 250 samples, whichever is
     longer, and their directions differ by less than 10 degrees.
     """
-    cycle_s = bag.cycle_s if np.isfinite(bag.cycle_s) else 0.0
     # At a low sample rate gaps are long: a rest is made of cells, usually of 30 samples each.
-    longest_ns = 1e9 * max(30.0, 250.0 * cycle_s)
-    margin_s = max(_MARGIN_S, _MARGIN_SAMPLES * cycle_s)
+    longest_ns = 1e9 * max(30.0, 250.0 * bag.cycle_s)
+    margin_s = max(_MARGIN_S, 120.0 * bag.cycle_s)  # at least 120 samples
     means = [np.average(rest.mean, axis=0, weights=rest.count) for rest in bag.intervals]
     ups = [mean / np.linalg.norm(mean) for mean in means]
     gaps = [
@@ -79,14 +78,13 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     quiet_sd = np.median([interval.sample_sd for interval in bag.intervals], axis=0)
     # Samples without visible noise have at least the error of rounding.
     rounding_sd = np.median([interval.rounding_sd for interval in bag.intervals], axis=0)
-    quiet_sd = np.maximum(quiet_sd, np.maximum(rounding_sd, 1e-9))
+    sds = np.maximum(quiet_sd, np.maximum(rounding_sd, 1e-9)), rounding_sd
     beside = _beside_gaps(bag, gaps, [margin_s] * len(gaps))
     # Correlated noise needs more samples than white noise for a mean level beside a gap.
-    margins = [max(_margin(part, quiet_sd), margin_s) for part in beside]
+    margins = [max(_margin(part, sds[0]), margin_s) for part in beside]
     if max(margins, default=0.0) > margin_s:
         beside = _beside_gaps(bag, gaps, margins)
-    sds = quiet_sd, rounding_sd
-    jumps = (_examine(part, gap, *sds, bag) for part, gap in zip(beside, gaps, strict=True))
+    jumps = (_examine(part, gap, sds, bag) for part, gap in zip(beside, gaps, strict=True))
     return tuple(jump for jump in jumps if jump is not None)
 
 
@@ -116,35 +114,29 @@ def _margin(samples: Floats, quiet_sd: Floats) -> float:
 
 
 def _examine(
-    samples: Floats,
-    gap: tuple[float, float],
-    quiet_sd: Floats,
-    rounding_sd: Floats,
-    bag: ReducedBag,
+    samples: Floats, gap: tuple[float, float], sds: tuple[Floats, Floats], bag: ReducedBag
 ) -> Jump | None:
-    """Return the jump in the samples around a gap between two rests, or None for no jump."""
+    """Return the jump around a gap between two rests, or None; `sds`: of noise, of rounding."""
+    quiet_sd, rounding_sd = sds
     time, accel, gyro = samples[:, 0], samples[:, 1:4], samples[:, 4:]
     before, after = time <= gap[0], time >= gap[1]
     if min(before.sum(), after.sum()) < _FEWEST_SAMPLES:
         return None
     beside = before | after
     at, r = _place_and_colour(time, accel, quiet_sd)
-    # A step changes the mean level of the quiet samples; a shock, which decays, does not.
     lasting, relative_sd, residual = _step(time[beside], accel[beside], time[at])
-    lasting_sd = quiet_sd * relative_sd * _correlation(residual, quiet_sd)
     # Two levels are rounded, the level before and the level after the step.
     by_rounding = 2.0**0.5 * rounding_sd
-    lasting_sd = np.hypot(lasting_sd, by_rounding)
+    lasting_sd = np.hypot(quiet_sd * relative_sd * _correlation(residual, quiet_sd), by_rounding)
     step, relative_sd, residual = _step(time, accel, time[at], r)
     # If noise is correlated, the scatter within half a second underestimates the noise of means.
     sd = np.sqrt(np.mean(residual**2, axis=0)) if r else quiet_sd
     step_sd = np.hypot(sd * relative_sd * _correlation(residual, sd), by_rounding)
     if r:
+        is_step = np.abs(step) > _STEP_SDS * step_sd
         # The change of the mean level must be at least half of the step within one sample, and
         # exceed four of its standard deviations.
-        is_step = (np.abs(step) > _STEP_SDS * step_sd) & (
-            lasting * np.sign(step) > 0.5 * np.abs(step)
-        )
+        is_step &= lasting * np.sign(step) > 0.5 * np.abs(step)
         is_step &= np.abs(lasting) > 4.0 * lasting_sd
     else:
         is_step = np.abs(lasting) > _STEP_SDS * lasting_sd
@@ -167,10 +159,8 @@ def _examine(
     # If someone handled the unit, the samples scatter by far more than twice the quiet noise.
     if not is_no_turn or np.any(spread > 2.0 * quiet_sd):
         return None
-    x, y, z = step.tolist()
-    duration_s = float(time[at] - time[at - 1])
-    warmed = _temperature_step(bag, time[0], time[at], time[-1])
-    return Jump(float(time[at]), duration_s, (x, y, z), along, *warmed)
+    (x, y, z), warmed = step.tolist(), _temperature_step(bag, time[0], time[at], time[-1])
+    return Jump(float(time[at]), float(time[at] - time[at - 1]), (x, y, z), along, *warmed)
 
 
 def _correlation(residual: Floats, sd: Floats) -> Floats:
@@ -195,8 +185,7 @@ def _temperature_step(bag: ReducedBag, begin: float, at: float, end: float) -> t
     if min(np.sum(time < at), np.sum(time >= at)) < _FEWEST_SAMPLES:
         return np.nan, np.nan
     (step,), relative_sd, residual = _step(time, value[:, None], at)
-    variance = float(np.sum(residual**2)) / max(len(value) - 3, 1)
-    return float(step), relative_sd * float(np.sqrt(variance))
+    return float(step), relative_sd * float(np.sqrt(np.sum(residual**2) / (len(value) - 3)))
 
 
 def _place_and_colour(time: Floats, accel: Floats, quiet_sd: Floats) -> tuple[int, float]:
@@ -258,7 +247,7 @@ def _step(time: Floats, values: Floats, at: float, r: float = 0.0) -> tuple[Floa
     return step, square**-0.5, values - trend @ (trend.T @ values) - np.outer(jump, step)
 
 
-def _trend(time: Floats, r: float = 0.0) -> Floats:
+def _trend(time: Floats, r: float) -> Floats:
     """Return a constant and a linear drift, whitened and made orthonormal, shape (n, 2)."""
     columns = np.column_stack((np.ones(len(time)), time - time.mean()))
     return np.asarray(np.linalg.qr(whitened(columns, r))[0])

@@ -29,8 +29,6 @@ from ..unit.gravity import parse_acceleration
 #: Keys of a bag's metadata about |f|.
 MAGNITUDE, ROTATION = 'specific_force_magnitude_m_s2', 'rotation_topic'
 RADIUS, RADIUS_SD = 'rotation_radius_m', 'rotation_radius_sd_m'
-# The name of a bag, such as 01.mcap or run_*; a number with its unit, such as 10s, is no name.
-_NAME = re.compile(r'[A-Za-z_*?]{2}|[*]')
 
 
 class Section(NamedTuple):
@@ -46,18 +44,19 @@ class Magnitude(NamedTuple):
     """
     The known |f| of a rest, ``hypot(still, spin)`` [m/s^2].
 
-    still: |f| without the rotation; None for gravity
+    still: |f| without the rotation
     spin: centripetal acceleration w^2 r at the stated radius
     sd: sd of |f|, except for the error of the radius
     """
 
-    still: float | None
+    still: float
     spin: float = 0.0
     sd: float = 0.0
 
-    def norm(self, gravity: float) -> float:
-        """Return |f| [m/s^2] with the radius as stated."""
-        return math.hypot(gravity if self.still is None else self.still, self.spin)
+    @property
+    def norm(self) -> float:
+        """|f| with the radius as stated [m/s^2]."""
+        return math.hypot(self.still, self.spin)
 
 
 @dataclass(frozen=True)
@@ -77,20 +76,18 @@ class KnownForce:
     radius: float = 0.0
     radius_sd: float = 0.0
 
-    def radius_part(self, size: Magnitude, gravity: float) -> float:
+    def radius_part(self, size: Magnitude) -> float:
         """Return the sd of |f| due to the error of the radius [m/s^2]."""
-        if not self.radius:
-            return 0.0
-        return size.spin**2 / size.norm(gravity) * self.radius_sd / self.radius
+        return size.spin**2 / size.norm * self.radius_sd / self.radius if self.radius else 0.0
 
-    def of(self, start_ns: int, end_ns: int, first_ns: int) -> Magnitude:
+    def of(self, start_ns: int, end_ns: int, first_ns: int, gravity: float) -> Magnitude:
         """Return |f| of a rest between two stamps; `first_ns`: stamp of the bag's first sample."""
         if self.stamp_ns is None or self.rate is None:
             middle_s = (0.5 * (start_ns + end_ns) - first_ns) * 1e-9
             for section in self.sections:
                 if section.begin_s <= middle_s < section.end_s:
                     return Magnitude(section.size, sd=section.sd)
-            return Magnitude(None)
+            return Magnitude(gravity)
         inside = (self.stamp_ns >= start_ns) & (self.stamp_ns <= end_ns)
         n, needed = int(inside.sum()), 3  # the sd of the mean of 2 readings is not reliable
         if n < needed:
@@ -102,7 +99,7 @@ class KnownForce:
         spin = self.rate[inside] ** 2 * self.radius
         mean, sd = float(spin.mean()), float(spin.std(ddof=1)) / math.sqrt(len(spin))
         # |f|^2 = g^2 + spin^2, so d|f| = spin / |f| d(spin).
-        return Magnitude(None, mean, sd * mean / math.hypot(mean, 9.8))
+        return Magnitude(gravity, mean, sd * mean / math.hypot(mean, 9.8))
 
 
 @dataclass(frozen=True)
@@ -216,7 +213,8 @@ def _asked_sections(text: str, path: Path) -> tuple[Section, ...]:
     mine: list[str] = []
     for line in content.splitlines():
         first, _, rest = line.strip().replace(',', ' ').partition(' ')
-        if not first or first[0] == '#' or not _NAME.search(first):
+        # A name of a bag is 01.mcap or run_*; a number with its unit, such as 10s, is no name.
+        if not first or first[0] == '#' or not re.search(r'[A-Za-z_*?]{2}|[*]', first):
             mine.append(line)
         elif fnmatch(path.name, first):
             mine.append(rest)

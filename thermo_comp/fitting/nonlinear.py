@@ -25,9 +25,9 @@ from .data_checks import Finding, advice
 from .hyperparameters import CLEAR_GAIN, LEAST_GAIN
 from .left_out import Score, score_of
 from .options import FitOptions
-from .reduction import ReducedBag
 from .regression import PosteriorMode, Regression
 from .selection import Selected
+from .thermal_ranges import union
 from .unknowns import State
 from .windows import ThermalWindows
 
@@ -103,9 +103,7 @@ class Forces:
         return linearised(x, k2, kq, k3)
 
 
-def with_forces(
-    windows: ThermalWindows, bags: Sequence[ReducedBag], options: FitOptions
-) -> ThermalWindows:
+def with_forces(windows: ThermalWindows, options: FitOptions) -> ThermalWindows:
     """
     Add |f| of the positions and the nonlinear terms to the windows.
 
@@ -113,17 +111,18 @@ def with_forces(
     options nor the prior have nonlinear terms.
     """
     still, spin, sd = np.outer((options.gravity, 0.0, 0.0), np.ones(windows.data.n_positions))
+    radii = set()
     for p, (bag, rest) in enumerate(windows.rests):
         if (known := bag.source.force) is not None:
             first_ns = bag.start_ns - round(bag.since_s * 1e9)
-            size, spin[p], sd[p] = known.of(rest.start_ns, rest.end_ns, first_ns)
-            still[p] = options.gravity if size is None else size
+            size = known.of(rest.start_ns, rest.end_ns, first_ns, options.gravity)
+            still[p], spin[p], sd[p] = size
+            if known.radius:
+                radii.add((known.radius, known.radius_sd))
     prior = options.prior.nonlinearity if options.prior else None
     is_usual = np.ptp([*np.hypot(still, spin), options.gravity]) < 1e-3 * options.gravity
     if is_usual and prior is None and options.k2_sd is None and options.k3_sd is None:
         return windows
-    rotating = [bag.source.force for bag in bags if bag.source.force and bag.source.force.radius]
-    radii = {(force.radius, force.radius_sd) for force in rotating}
     if len(radii) > 1:
         stated = ', '.join(f'{radius:g} +- {sd:g} m' for radius, sd in sorted(radii))
         raise FitError(f'the bags state different distances from the axis of rotation: {stated}')
@@ -146,10 +145,7 @@ def is_beyond(windows: ThermalWindows) -> bool:
 
 
 def prior_sd(kinds: Sequence[Kind], options: FitOptions) -> Floats:
-    """
-    Return the prior sd of the coefficients of k terms, then the prior sd of their changes per
-    kelvin, 2 % of those of the coefficients, shape (2 k,).
-    """
+    """Return the prior sds of k coefficients, then of their changes per kelvin, shape (2 k,)."""
     sd = np.array([options.nonlinear_sd(kind) for kind in kinds])
     return np.concatenate((sd, 0.02 * sd))
 
@@ -207,10 +203,7 @@ class _TermFits:
 def choose(
     regression: Regression, selected: Selected, options: FitOptions
 ) -> tuple[Selected, tuple[NonlinearTerm, ...]]:
-    """
-    Choose the nonlinear terms, and those whose coefficient depends on temperature. With a prior
-    calibration there is no choice, because the fit keeps the terms of the prior.
-    """
+    """Choose the nonlinear terms, and which depend on temperature; a prior's terms are kept."""
     forces = regression.forces
     if forces is None or options.prior is not None:
         return selected, ()
@@ -258,16 +251,13 @@ def of_file(
     if forces is None:
         return None
     known = options.prior.nonlinearity if options.prior else None
-    sizes = forces.sizes
     # The calibrated range of |f| extends 1 % beyond the |f| of the positions at both ends.
-    low, high = 0.99 * float(sizes.min()), 1.01 * float(sizes.max())
-    if known:
-        lower, upper = known.force_range_m_s2
-        low, high = min(low, lower), max(high, upper)
-    sd = known.beyond_sd_g_g2 if known else options.nonlinear_sd('square')
-    kept = known.terms if known else terms
-    blank = (replace(term, coefficient=(0.0,) * 3, per_kelvin=(0.0,) * 3) for term in kept)
-    return Nonlinearity((low, high), sd, tuple(blank))
+    reach = 0.99 * float(forces.sizes.min()), 1.01 * float(forces.sizes.max())
+    if known is None:
+        return Nonlinearity(reach, options.nonlinear_sd('square'), tuple(terms))
+    blank = (replace(term, coefficient=(0.0,) * 3, per_kelvin=(0.0,) * 3) for term in known.terms)
+    reach = union((reach, known.force_range_m_s2))
+    return Nonlinearity(reach, known.beyond_sd_g_g2, tuple(blank))
 
 
 def with_terms(state: State, calibration: Calibration) -> State:
@@ -282,7 +272,7 @@ def with_terms(state: State, calibration: Calibration) -> State:
 def with_blank(calibration: Calibration, options: FitOptions) -> Calibration:
     """Add the terms square and cube, with prior sd, to a calibration without nonlinearity."""
     posterior, at = calibration.posterior, parameter_layout(calibration).misalignment
-    if calibration.nonlinearity is not None or posterior is None:
+    if posterior is None:
         return calibration
     kinds: tuple[Kind, ...] = ('square', 'cube')
     sd = np.tile(prior_sd(kinds, options), 3)

@@ -56,19 +56,7 @@ class _Shape(NamedTuple):
     has_gradient: bool = False
 
 
-class _Steps(NamedTuple):
-    """
-    First steps of a search in the logarithms of both time constants of a part, in the share of the
-    gradient, and in the ratio of lead to first time constant; a step of 0 keeps a value constant.
-    """
-
-    tau: float
-    second: float = 0.0
-    share: float = 0.0
-    lead: float = 0.0
-
-
-# Ratio of the RMS residual to white noise below which no further shape of `_SHAPES` is tried.
+# Ratio of the RMS residual to white noise up to which no other shape or lag is tried.
 _EXPLAINED_RATIO = 1.1
 # Shapes of the curves, in the order of the trials. A spline of 4 nodes determines a lag best, but
 # cannot describe a kink of the bias, so the limit of its RMS residual is low.
@@ -118,7 +106,7 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> list[Part
             continue
         subset = _PartCurves(windows, start, shape, 3000)
         lags = [subset.refined(lag, axis) for axis, lag in enumerate(searched)]
-        parts, ratio = _parts_of(windows, start, shape, lags, noise)
+        parts, ratio = _PartCurves(windows, start, shape, len(data.time)).parts(lags, noise)
         # A residual above `most_noise` times the white noise has a cause besides white noise and
         # lags, such as slow noise: the lags are then accepted only if the RMS residual of each
         # axis is at most a quarter of its RMS residual without a lag.
@@ -134,38 +122,15 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> list[Part
         curves = _PartCurves(windows, start, _SHAPES[0], 500)
         lags = [curves.one_stage(axis) for axis in range(3)]
         if min(map(curves.reduction, lags, range(3))) > 2.0:
-            return [_parts_of(windows, start, _SHAPES[0], lags, noise)[0], *accepted]
+            full = _PartCurves(windows, start, _SHAPES[0], len(data.time))
+            return [full.parts(lags, noise)[0], *accepted]
     return accepted
-
-
-def _parts_of(
-    windows: ThermalWindows,
-    start: ConstantCalibration,
-    shape: _Shape,
-    lags: Sequence[Part],
-    noise: Floats,
-) -> tuple[Parts, float]:
-    """Return the lags with the weights of the windows, and the ratio of RMS residual to noise."""
-    data = windows.data
-    full = _PartCurves(windows, start, shape, len(data.time))
-    residual = np.column_stack([full.residual(lag, axis) for axis, lag in enumerate(lags)])
-    factors = undisturbed(residual, data.weight, data.position)
-    square = np.average(residual**2, axis=0, weights=data.weight * factors)
-    square /= max(1.0 - full.n_parameters(lags[0]) / len(data.time), 0.05)
-    ratio = float(np.sqrt((square / noise**2).max()))
-    x, y, z = (Part(*map(round, lag, (1, 1, 4, 1))) for lag in lags)
-    # Largest left-out drift at which the lags are kept without trial of other models: 10 sd of the
-    # noise if noise explains the residual of a shape without stress (its curves extrapolate badly
-    # to left-out data), else 2 sd.
-    is_curve = ratio <= shape.most_noise and not shape.has_stress
-    return Parts((x, y, z), factors, (10.0 if is_curve else 2.0) * float(noise.mean())), ratio
 
 
 class _PartCurves:
     """
-    Bias and scale factor of each axis as functions of x, the temperature of a part, for any lags.
-
-    Every k-th window is used, with the largest k that keeps at least `n_windows` windows.
+    Bias and scale factor of each axis as functions of x, the temperature of a part, for any lags;
+    every k-th window is used, with the largest k that keeps at least `n_windows` windows.
     """
 
     def __init__(
@@ -174,28 +139,29 @@ class _PartCurves:
         data, columns = windows.data, windows.model.columns
         rows = slice(None, None, max(len(data.time) // n_windows, 1))
         of_board = [k for k, column in enumerate(columns) if column.group == 'board']
+        taus = np.array([columns[k].tau_s for k in of_board])
         _, self._first, self._position = np.unique(
             data.position[rows], return_index=True, return_inverse=True
         )
         self._age = data.age[rows, None]
         self._is_of_bag = data.bag[rows, None] == np.arange(data.bag[-1] + 1.0)
-        self._root_weight = np.sqrt(data.weight[rows])[:, None]
-        self._share = data.weight[rows, None]
-        self._share = self._share / np.add.reduceat(self._share, self._first)[self._position]
+        self._weight = data.weight[rows]
+        weight = self._weight[:, None]
+        self._root_weight = np.sqrt(weight)
+        self._share = weight / np.add.reduceat(weight, self._first)[self._position]
         self._case = windows.gradient[rows]
         self._t = windows.temperature[rows] - windows.model.reference_temperature
-        self._taus = np.array([columns[k].tau_s for k in of_board])
         #: Time constants tried [s]: four short ones, and those of the columns of group `board`.
-        self._tried = np.array([15.0, 21.0, 30.0, 42.0, *self._taus])
+        self._tried = np.array([15.0, 21.0, 30.0, 42.0, *taus])
         # The lag m is interpolated between the time constants tau of the columns: m / tau is a
         # smooth function of tau, whose limit at tau = 0 is the rate of the temperature.
-        ratios = np.column_stack((windows.rate, windows.raw[:, of_board] / self._taus))[rows]
-        knots = _interpolation_place(np.append(0.0, self._taus))
+        ratios = np.column_stack((windows.rate, windows.raw[:, of_board] / taus))[rows]
+        knots = _interpolation_place(np.append(0.0, taus))
         self._ratio = CubicSpline(knots, ratios, axis=1)
         # The lag L_tau(G) of the gradient G is interpolated over tau; its limit at tau = 0 is G.
         of_case = [
             [c.group == 'gradient_lag' and c.tau_s == tau and c.sensor == 'case' for c in columns]
-            for tau in self._taus
+            for tau in taus
         ]
         self._has_case = bool(np.any(of_case, axis=1).all())
         if self._has_case:
@@ -219,23 +185,19 @@ class _PartCurves:
     def _is_of_use(
         self, lag: Part, axis: int, noise: float, most_noise: float = 3.0, reduction: float = 4.0
     ) -> bool:
-        """
-        Whether the residual is at most `most_noise` times the noise, or `lag` divides the residual
-        by `reduction` or more.
-        """
-        typical = 1.4826 * np.median(np.abs(self.residual(lag, axis)))
+        """Whether the residual is below `most_noise` noises or reduced by `reduction` or more."""
+        typical = 1.4826 * np.median(np.abs(self._weighted(lag, axis) / self._root_weight[:, 0]))
         return bool(typical <= most_noise * noise or self.reduction(lag, axis) >= reduction)
 
     def _lag(self, axis: int, noise: float) -> Part:
         """
-        Return the lag with the smallest RMS residual; 0 s if no lag reduces the residual.
-
-        If the RMS residual exceeds 1.1 times the white noise `noise`, a second stage or another
-        share of the gradient is tried, and must reduce the RMS residual by more than 5 %.
+        Return the lag with the smallest RMS residual; 0 s if no lag reduces the residual. If noise
+        does not explain the residual, a second stage or another share of the gradient is tried,
+        and must reduce the RMS residual by more than 5 %.
         """
         one_stage = self.one_stage(axis)
         best = self._with_lead(one_stage, axis)
-        enough = 1.1**2 * noise**2 * len(self._t)
+        enough = _EXPLAINED_RATIO**2 * noise**2 * len(self._t)
         if self._square(best, axis) > enough:
             starts = [one_stage]
             if self._has_case:
@@ -246,19 +208,18 @@ class _PartCurves:
             if not any(self._is_of_use(near, axis, noise, 8.0, 1.5) for near in (best, *starts)):
                 # Neither a second stage nor another share would reduce this residual enough.
                 return best
-            lags = [self._searched(axis, _in_two_stages(one_stage), _Steps(0.2, 0.4))]
+            lags = [self._searched(axis, _in_two_stages(one_stage), (0.2, 0.4, 0.0, 0.0))]
             if best.lead_s:
-                steps = _Steps(0.2, 0.4, lead=0.1)
-                lags.append(self._searched(axis, _in_two_stages(best), steps))
+                lags.append(self._searched(axis, _in_two_stages(best), (0.2, 0.4, 0.0, 0.1)))
             if self._has_case:
                 for near in starts:
                     first = near._replace(tau_s=max(near.tau_s, 15.0))
-                    lags.append(self._searched(axis, first, _Steps(0.2, share=0.1)))
+                    lags.append(self._searched(axis, first, (0.2, 0.0, 0.1, 0.0)))
             best = self._better(axis, best, min(lags, key=lambda lag: self._square(lag, axis)))
         is_incomplete = self._is_of_use(best, axis, noise) and self._square(best, axis) > enough
         if self._has_case and is_incomplete:
             first = best if best.second_tau_s else _in_two_stages(best)
-            searched = self._searched(axis, first, _Steps(0.2, 0.4, share=0.3))
+            searched = self._searched(axis, first, (0.2, 0.4, 0.3, 0.0))
             best = self._better(axis, best, searched)
         return best
 
@@ -284,16 +245,15 @@ class _PartCurves:
             return lag
         longer, lead = 0.03 * np.clip(steps, -10.0, 20.0)
         first = lag._replace(tau_s=float(tau * (1.0 + longer)), **{key: float(lead * unit)})
-        of_lead = _Steps(0.1, **{'share' if self._has_case else 'lead': 0.1})
-        found = self._searched(axis, first, of_lead)
+        share_and_lead = (0.1, 0.0) if self._has_case else (0.0, 0.1)
+        found = self._searched(axis, first, (0.1, 0.0, *share_and_lead))
         return found if self._square(found, axis) <= enough else lag
 
     def refined(self, lag: Part, axis: int) -> Part:
         """Return the lag with the smallest RMS residual, by a search from `lag` in small steps."""
         if not lag.tau_s:
             return lag
-        near = _Steps(0.03, 0.06, 0.02, 0.02)
-        steps = _Steps(*(step * bool(value) for step, value in zip(near, lag, strict=True)))
+        steps = np.where(lag, (0.03, 0.06, 0.02, 0.02), 0.0)
         return self._searched(axis, lag, steps, accuracy=1e-3)
 
     def _better(self, axis: int, simple: Part, other: Part) -> Part:
@@ -301,12 +261,15 @@ class _PartCurves:
         is_better = self._square(other, axis) < self._square(simple, axis) / 1.05**2
         return other if is_better else simple
 
-    def _searched(self, axis: int, first: Part, steps: _Steps, accuracy: float = 0.01) -> Part:
+    def _searched(
+        self, axis: int, first: Part, steps: Sequence[float] | Floats, accuracy: float = 0.01
+    ) -> Part:
         """
         Return the lag of the smallest RMS residual by the simplex method, from the lag `first`.
 
-        `accuracy`: half of the largest extent of the final simplex, in logarithms of the time
-        constants, in the share, and in the ratio of lead to first time constant
+        The coordinates are the logarithms of both time constants, the share of the gradient, and
+        the ratio of lead to first time constant. `steps`: first steps in the coordinates; 0 keeps
+        a coordinate constant. `accuracy`: half of the largest extent of the final simplex.
         """
         tau, second, share, lead = first
         start = np.array([np.log(tau), np.log(second or 1.0), share, lead / tau])
@@ -367,13 +330,23 @@ class _PartCurves:
         """Return the ratio of the RMS residual of an axis without a lag to that with `lag`."""
         return float(np.sqrt(self._square(Part(0.0), axis) / self._square(lag, axis)))
 
-    def n_parameters(self, lag: Part) -> int:
-        """Return the number of unknowns of an axis: coefficients, and one level per position."""
-        return int(self._series(lag, 0).shape[1]) + len(self._first)
-
-    def residual(self, lag: Part, axis: int) -> Floats:
-        """Return the residuals of one axis in all windows, shape (n,) [m/s^2]."""
-        return np.asarray(self._weighted(lag, axis) / self._root_weight[:, 0])
+    def parts(self, lags: Sequence[Part], noise: Floats) -> tuple[Parts, float]:
+        """Return the lags with factors of the weights, and the ratio of RMS residual to noise."""
+        weighted = np.column_stack([self._weighted(lag, axis) for axis, lag in enumerate(lags)])
+        residual = weighted / self._root_weight
+        factors = undisturbed(residual, self._weight, self._position)
+        square = np.average(residual**2, axis=0, weights=self._weight * factors)
+        # The unknowns of an axis are the coefficients, and one level per position.
+        n_unknowns = self._series(lags[0], 0).shape[1] + len(self._first)
+        square /= max(1.0 - n_unknowns / len(residual), 0.05)
+        ratio = float(np.sqrt((square / noise**2).max()))
+        x, y, z = (Part(*map(round, lag, (1, 1, 4, 1))) for lag in lags)
+        # Largest left-out drift at which the lags are kept without trial of other models: 10 sd of
+        # the noise if noise explains the residual of a shape without stress (its curves
+        # extrapolate badly to left-out data), else 2 sd.
+        is_curve = ratio <= self._shape.most_noise and not self._shape.has_stress
+        most_drift = (10.0 if is_curve else 2.0) * float(noise.mean())
+        return Parts((x, y, z), factors, most_drift), ratio
 
     def _square(self, lag: Part, axis: int) -> float:
         left = self._weighted(lag, axis)
@@ -382,7 +355,12 @@ class _PartCurves:
     def _weighted(self, lag: Part, axis: int) -> Floats:
         """Return the residuals of an axis times the roots of the windows' weights, shape (n,)."""
         series, measured = self._series(lag, axis), self._measured[:, axis]
-        return np.asarray(measured - series @ _solved(series, measured))
+        normal, right = series.T @ series, series.T @ measured
+        # Regressors of any magnitude are divided by their size.
+        size = np.sqrt(np.diag(normal)) + 1e-12
+        normal = normal / np.outer(size, size)
+        normal[np.diag_indices_from(normal)] += 1e-7  # a ridge, for nearly collinear regressors
+        return np.asarray(measured - series @ (dposv(normal, right / size)[1] / size))
 
     def _series(self, lag: Part, axis: int) -> Floats:
         """Return the weighted regressors of bias, scale and initial lag states, shape (n, k)."""
@@ -429,11 +407,7 @@ def _in_two_stages(lag: Part) -> Part:
 
 
 def _in_order(tau_s: float, second_tau_s: float, sensor_share: float, lead_share: float) -> Part:
-    """
-    Return a lag with the longer time constant first, and the shorter at most 0.89 of the longer.
-
-    `lead_share`: ratio of the lead to `tau_s`
-    """
+    """Return a lag with the longer time constant first; `lead_share`: ratio of lead to `tau_s`."""
     # `Part` accepts ratios of its two time constants up to 0.9, after rounding to 0.1 s.
     longer, shorter = max(tau_s, second_tau_s), min(tau_s, second_tau_s)
     return Part(longer, min(shorter, 0.89 * longer), sensor_share, lead_share * tau_s)
@@ -442,12 +416,3 @@ def _in_order(tau_s: float, second_tau_s: float, sensor_share: float, lead_share
 def _interpolation_place(tau_s: Floats) -> Floats:
     """Map time constants [s] to 0..1, the abscissa of the interpolation; 200 s become 0.5."""
     return np.asarray(tau_s / (tau_s + 200.0))
-
-
-def _solved(series: Floats, measured: Floats) -> Floats:
-    """Return the least-squares coefficients of regressors of any magnitude."""
-    normal, right = series.T @ series, series.T @ measured
-    size = np.sqrt(np.diag(normal)) + 1e-12
-    normal = normal / np.outer(size, size)
-    normal[np.diag_indices_from(normal)] += 1e-7  # a ridge, for nearly collinear regressors
-    return np.asarray(dposv(normal, right / size)[1] / size)

@@ -19,7 +19,6 @@ import math
 from bisect import bisect
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -39,8 +38,6 @@ from .thermal_ranges import union
 
 #: Smallest number of units for a prior: fewer units do not determine the scatter.
 UNITS_NEEDED = 3
-#: Values of the fields for a column whose lag has one stage, no share of the gradient, no lead.
-_ONE_STAGE: Any = {'second_tau_s': 0.0, 'sensor_share': 0.0, 'lead_s': 0.0}
 
 
 def population(calibrations: Sequence[Calibration]) -> Calibration:
@@ -52,23 +49,17 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     sensors or the form of the curves.
     """
     # Nonlinear terms are left out: few calibrations have them, as a centrifuge determines them.
-    calibrations = [
-        each if each.nonlinearity is None else without_terms(each) for each in calibrations
-    ]
+    calibrations = [without_terms(each) for each in calibrations]
     _check_alike(calibrations)
     keys: dict[Column, list[Column]] = {}
     for calibration in calibrations:
         for column in prior_columns(calibration):
             for common, _ in _on_common_lags(column):
                 keys.setdefault(_without_range(common), []).append(common)
-    columns = [
-        replace(
-            key,
-            range=union(column.range for column in columns),
-            rest_k=float(np.mean([column.rest_k for column in columns])),
-        )
-        for key, columns in keys.items()
-    ]
+    columns = []
+    for key, same in keys.items():
+        rest_k = float(np.mean([column.rest_k for column in same]))
+        columns.append(replace(key, range=union(column.range for column in same), rest_k=rest_k))
     template = _template(calibrations, columns)
     K = np.array([constants_of(calibration).scale for calibration in calibrations])
     mean_K = np.exp(np.mean(np.log(np.abs(K)), axis=0)) * np.sign(K[0])
@@ -90,23 +81,21 @@ def _check_alike(calibrations: Sequence[Calibration]) -> None:
             f'the prior of a type needs the calibrations of at least {UNITS_NEEDED} units, got '
             f'{len(calibrations)}'
         )
-    first = calibrations[0]
-    serials = [calibration.unit.serial for calibration in calibrations]
-    if twice := sorted(serial for serial in set(serials) if serials.count(serial) > 1):
+    first, serials = calibrations[0], [each.unit.serial for each in calibrations]
+    if twice := sorted(serial for serial in serials if serials.count(serial) > 1):
         raise FitError(f'two calibrations are of unit {twice[0]}: give one calibration per unit')
-    for calibration in calibrations:
-        serial, unit = calibration.unit.serial, calibration.unit
-        alike = (unit.input, calibration.reference_temperature_c, calibration.sensors)
+    for each in calibrations:
+        alike = each.unit.input, each.reference_temperature_c, each.sensors
         if alike != (first.unit.input, first.reference_temperature_c, first.sensors):
             raise FitError(
-                f'the calibrations of units {serial} and {first.unit.serial} differ in the key '
-                'unit.input, reference_temperature_c or sensors: they are not of one type'
+                f'the calibrations of units {each.unit.serial} and {first.unit.serial} differ in '
+                'the key unit.input, reference_temperature_c or sensors: they are not of one type'
             )
-        if _shape(calibration) != _shape(first):
+        if _shape(each) != _shape(first):
             raise FitError(
-                f'the curves over temperature of unit {serial} have another form than those of '
-                f'unit {first.unit.serial}: fit both units with the same --model, --static-curve '
-                'and --dynamic-curve'
+                f'the curves over temperature of unit {each.unit.serial} have another form than '
+                f'those of unit {first.unit.serial}: fit both units with the same --model, '
+                '--static-curve and --dynamic-curve'
             )
 
 
@@ -175,6 +164,11 @@ def _without_range(column: Column) -> Column:
     return replace(column, range=(0.0, 1.0), rest_k=0.0)
 
 
+def _in_one_stage(column: Column, tau_s: float) -> Column:
+    """Return a column whose lag has one stage, no share of the gradient, and no lead."""
+    return replace(column, tau_s=tau_s, second_tau_s=0.0, sensor_share=0.0, lead_s=0.0)
+
+
 def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
     """
     Return columns of the bank of time constants, with factors, whose sum approximates a column.
@@ -189,18 +183,15 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
     is_line = isinstance(lag, Lag) and column.term.form is LINE
     if not is_line and any(column.part[1:]):
         # Replace a power of a sum of lags by the power of one lag, whose time constant is >= 1 s.
-        behind_s = max(tau + second - column.lead_s, 1.0)
-        return _on_common_lags(replace(column, tau_s=behind_s, **_ONE_STAGE))
+        return _on_common_lags(_in_one_stage(column, max(tau + second - column.lead_s, 1.0)))
     summands: list[tuple[Column, float]] = []
     if column.sensor_share:
         of_board = replace(column, sensor_share=0.0)
         of_sensor = replace(of_board, group='gradient_lag', kind='gradient_lag')
         summands = [(of_board, 1.0), (of_sensor, -column.sensor_share)]
     elif any(column.part[1:]) and isinstance(lag, Lag):
-        summands = [
-            (replace(column, tau_s=tau_s, **_ONE_STAGE), share)
-            for (_, tau_s), share in lag.first_order_weights.items()
-        ]
+        weights = lag.first_order_weights
+        summands = [(_in_one_stage(column, tau_s), share) for (_, tau_s), share in weights.items()]
     if summands:
         return [
             (common, share * part)
@@ -253,11 +244,9 @@ def _relative_to(
     placed = np.zeros((into.n_parameters, len(values)))
     others = np.arange(layout.nonlinear, len(values))
     placed[others - len(values) + into.n_parameters, others] = 1.0
-    blocks = zip((*layout.bias, *layout.scale), (*into.bias, *into.scale), strict=True)
-    for old, new in blocks:
-        placed[new.static : new.response, old.static : old.response] = np.eye(
-            old.response - old.static
-        )
+    for old, new in zip(layout.bias + layout.scale, into.bias + into.scale, strict=True):
+        levels = np.eye(old.response - old.static)
+        placed[new.static : new.response, old.static : old.response] = levels
         placed[new.response : new.end, old.response : old.end] = terms
     placed = placed * factor
     return placed @ values, placed @ calibration.posterior.covariance() @ placed.T

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the checks of the raw data of a fit: serial numbers, samples and thermometer readings."""
+"""Owns the checks of the raw data of a fit: serial numbers, samples, thermometer readings."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from ..unit.gravity import STANDARD_GRAVITY
 from .data_checks import Finding, advice
 from .jumps import Jump, find_jumps
 from .options import FitOptions
-from .reduction import ReducedBag
+from .reduction import ReducedBag, StillInterval
+from .windows import ThermalWindows, Track
 
 
 def judge_prior(serial: str, prior: Calibration | None) -> Iterator[Finding]:
@@ -40,7 +41,7 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
     def total(name: str) -> int:
         return sum(getattr(bag, name) for bag in bags)
 
-    n_samples = max(total('n_samples'), 1)
+    n_samples = total('n_samples')
     part = total('n_saturated') / n_samples
     if part > 0.001:
         yield Finding(
@@ -61,14 +62,14 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
             'glitches',
             f'{counted(n, "sample")} far from both neighbours, left out: does the bus lose bits?',
         )
-    still = total('n_still_cells') / max(total('n_cells'), 1)
+    still = total('n_still_cells') / total('n_cells')
     if still < 0.5:
         yield advice(
             'motion',
             f'the unit was still for only {100.0 * still:.0f} % of the time; the times of '
             'vibration or handling were left out',
         )
-    rests = [interval for bag in bags for interval in bag.intervals]
+    rests = _rests(bags)
     if n_equal := sum(not rest.sample_sd.any() for rest in rests):
         share = '' if n_equal == len(rests) else f' in {n_equal} of {len(rests)} rests'
         text = (
@@ -81,22 +82,26 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
     if dead := list(_dead_axes(bags)):
         text = '; '.join(f'{axis.bag}: {axis.text}' for axis in dead)
         yield Finding('stuck', 'refusal', f'{text}: {_why_dead(bags, dead)}')
-    means = np.concatenate([interval.mean for bag in bags for interval in bag.intervals])
-    size = float(np.median(np.linalg.norm(means, axis=1)))
+    size = float(np.median(np.linalg.norm(np.concatenate([rest.mean for rest in rests]), axis=1)))
     yield from _judge_thermometers(bags)
     yield from _judge_units(bags, size, options)
-    jumps = [(bag, event) for bag in bags for event in find_jumps(bag)]
-    if jumps:
-        per_mg = 1e-3 * (STANDARD_GRAVITY if options.input == 'm/s^2' else size)
-        jumped = '; '.join(
-            f'{bag.source.name}: {describe(event, per_mg, bag.since_s)}' for bag, event in jumps
-        )
+    per_mg = 1e-3 * (STANDARD_GRAVITY if options.input == 'm/s^2' else size)
+    jumped = '; '.join(
+        f'{bag.source.name}: {describe(jump, per_mg, bag.since_s)}'
+        for bag in bags
+        for jump in find_jumps(bag)
+    )
+    if jumped:
         text = f'{jumped}: leave out a bag with a jump, or end before the jump with --to'
         yield Finding('jump', 'refusal', text)
     if not all(bag.angular_rate == bags[0].angular_rate != 'part' for bag in bags):
         names = ', '.join(bag.source.name for bag in bags if bag.angular_rate != 'whole')
         text = f'{names}: not every sample has an angular rate, so no gyroscope was fitted'
         yield advice('rate', text)
+
+
+def _rests(bags: Sequence[ReducedBag]) -> list[StillInterval]:
+    return [rest for bag in bags for rest in bag.intervals]
 
 
 def _judge_thermometers(bags: Sequence[ReducedBag]) -> Iterator[Finding]:
@@ -110,8 +115,7 @@ def _judge_thermometers(bags: Sequence[ReducedBag]) -> Iterator[Finding]:
                 'before and after, left out: does the thermometer lose contact?',
             )
     for name in names:
-        read = [b.temperatures[name].value for b in bags if name in b.temperatures]
-        celsius = np.concatenate(read)
+        celsius = np.concatenate([bag.readings(name).value for bag in bags])
         if len(celsius) and KELVINS[0] < np.median(celsius) < KELVINS[1]:
             reads = f'temperature/{name} reads {np.min(celsius):.4g} .. {np.max(celsius):.4g} degC'
             yield advice('kelvins', f'{reads}: that looks like kelvins; record degC')
@@ -150,7 +154,7 @@ class _DeadAxis(NamedTuple):
 
 def _why_dead(bags: Sequence[ReducedBag], dead: Sequence[_DeadAxis]) -> str:
     """Return why the readings of axes are constant: clipped at the full scale, or dead."""
-    largest = max(float(np.abs(rest.mean).max()) for bag in bags for rest in bag.intervals)
+    largest = max(float(np.abs(rest.mean).max()) for rest in _rests(bags))
     # The limits of a two's complement code, such as -32768 and 32767, differ in size by one count.
     is_at_top = np.isclose([abs(axis.value) for axis in dead], largest, rtol=1e-4, atol=0.0)
     ends = {(axis.axis, axis.value > 0.0) for axis in dead}
@@ -169,7 +173,7 @@ def _dead_axes(bags: Sequence[ReducedBag]) -> Iterator[_DeadAxis]:
     Find the axes that are constant throughout a rest but have noise in at least half of the rests,
     and the axes that are constant, but not always 0, in every rest while another axis has noise.
     """
-    rests = [rest for bag in bags for rest in bag.intervals]
+    rests = _rests(bags)
     alive = np.array([rest.sample_sd > 0.0 for rest in rests])
     usual = 2 * alive.sum(axis=0) >= len(rests)
     if len(rests) > 1 and usual.any():
@@ -207,9 +211,60 @@ def describe(jump: Jump, per_mg: float, since_s: float = 0.0) -> str:
     )
 
 
-def judge_copies(names: Sequence[str]) -> list[Finding]:
-    """Report the thermometers `names`, whose readings are equal to the board's."""
-    return [
-        advice('copy', f'temperature/{name} repeats the readings of the board, and is left out')
-        for name in names
-    ]
+def judge_missing(bags: Sequence[ReducedBag], windows: ThermalWindows) -> Iterator[Finding]:
+    """Report which share of the time at rest is left out without a temperature, and why."""
+    if not windows.has_temperature:
+        return
+    counts = [_missing(bag, track) for bag, track in zip(bags, windows.tracks, strict=True)]
+    n_still, n_unsettled, n_between = np.sum(counts, axis=0).tolist()
+    n_used = float(windows.data.weight.sum()) * windows.typical_count
+    unsettled = n_unsettled / n_still
+    missing = 1.0 - n_used / n_still - unsettled
+    reported = 0.1  # smallest share of the time at rest without temperature that is reported
+    if missing > reported:
+        why = 'do the thermometers and the accelerometer use the same clock?'
+        if n_between > 0.5 * missing * n_still:
+            why = f'does a thermometer stick, or drop out? {_longest_pause(bags)}'
+        share = f'{100.0 * missing:.0f} % of the time at rest'
+        yield advice('unmeasured', f'{share} has no temperatures and is left out: {why}')
+    if unsettled > reported:
+        quantum = windows.model.detector.board.quantum_c
+        steps = f' (steps of {quantum:g} K)' if quantum else ''
+        yield advice(
+            'steps',
+            f'{100.0 * unsettled:.0f} % of the time at rest is left out: the board temperature is '
+            f'not accurate before the reading of temperature/board{steps} changes for '
+            'the first time in a bag; begin with a ramp, or use a finer thermometer',
+        )
+
+
+def _missing(bag: ReducedBag, track: Track) -> tuple[float, float, float]:
+    """
+    Count a bag's samples at rest: all; those before the estimate of the board temperature is
+    accurate; later ones without a temperature, but between readings of each thermometer.
+    """
+    read = [readings.stamp_ns for readings in bag.temperatures.values() if len(readings.stamp_ns)]
+    begin_s = 1e-9 * (max(stamp_ns[0] for stamp_ns in read) - bag.start_ns)
+    end_s = 1e-9 * (min(stamp_ns[-1] for stamp_ns in read) - bag.start_ns)
+    n_still = n_unsettled = n_between = 0.0
+    for rest in bag.intervals:
+        is_known = np.interp(rest.time, track.grid_s, track.is_known, left=0.0) == 1.0
+        is_settled = rest.time >= track.settled_s
+        n_still += float(rest.count.sum())
+        n_unsettled += float(rest.count[(rest.time >= track.start_s) & ~is_settled].sum())
+        is_between = ~is_known & is_settled & (rest.time > begin_s) & (rest.time < end_s)
+        n_between += float(rest.count[is_between].sum())
+    return n_still, n_unsettled, n_between
+
+
+def _longest_pause(bags: Sequence[ReducedBag]) -> str:
+    """Describe the longest time between two changes of a thermometer's reading."""
+    pauses = []
+    for bag in bags:
+        for name, readings in bag.temperatures.items():
+            is_new = np.diff(readings.value, prepend=np.nan) != 0.0
+            stamps = np.append(readings.stamp_ns[is_new], readings.stamp_ns[-1:])
+            pause_s = float(np.diff(stamps).max(initial=0)) * 1e-9
+            pauses.append((pause_s, name, bag.source.name))
+    pause_s, name, where = max(pauses)
+    return f'{where}: temperature/{name} has no new value for {pause_s:.0f} s'

@@ -31,7 +31,7 @@ from ..thermal.plausibility import CONTINUED_SHARE
 from ..thermal.thermometer import COLDEST, HOTTEST
 from ..typing import Bools, Floats, Ints
 from ..unit.provenance import Source
-from .coverage import best_rests, directions, distinct_directions, rough_centre
+from .coverage import best_rests, n_directions
 from .initial_triad import block_means
 from .sources import FitSource, angular_velocity
 
@@ -129,22 +129,23 @@ class ReducedBag:
         name, sha256 = self.source.name, self.source.sha256 or ''
         return self.parts or (Source(name, sha256, self.n_samples),)
 
+    def readings(self, name: str) -> Readings:
+        """Return the readings of a thermometer, no readings if the bag lacks the thermometer."""
+        return self.temperatures.get(name, Readings())
+
     @property
     def board(self) -> Readings:
         """Readings of the board's thermometer."""
-        return self.temperatures.get('board', Readings())
+        return self.readings('board')
 
     @property
     def case(self) -> Readings:
         """Readings of the case's thermometer."""
-        return self.temperatures.get('case', Readings())
+        return self.readings('case')
 
 
 class _Pass:
-    """
-    The results of reading the blocks of a source once: cells of the samples, temperature readings,
-    possible causes of a lack of rests; `has_rate`: whether all angular rates are finite.
-    """
+    """A pass over the blocks of a source; `has_rate`: whether all angular rates are finite."""
 
     def __init__(self, source: FitSource, accumulator: CellAccumulator) -> None:
         readings: dict[str, list[Readings]] = {}
@@ -218,8 +219,7 @@ def reduce_source(
         # Cells of 5 samples are used if they give rests in six attitudes or more.
         shorter, _ = reduced(5)
         means = np.array([interval.mean.mean(axis=0) for interval in shorter.intervals])
-        means = means.reshape(-1, 3)
-        if len(distinct_directions(directions(means, rough_centre(means)))) >= 6:
+        if n_directions(means.reshape(-1, 3)) >= 6:
             return shorter
     return usual
 
@@ -243,18 +243,23 @@ def _reduced(
         ranges = stillness.still_intervals(cells, min_rest_s or 3.0, still_sd)
     restless = reading.causes.cause(cells, still_sd)
     if not ranges and not restless:
-        restless = f'no still interval: {_why_restless(cells, reading.n_samples, still_sd)}'
+        if 2 * cells.n_saturated > reading.n_samples:
+            share = f'{100.0 * cells.n_saturated / reading.n_samples:.0f} % of its samples'
+            why = f'{share} are at the full scale: is --full-scale right?'
+        else:
+            why = stillness.why_restless(cells, still_sd)
+        restless = f'no still interval: {why}'
         if min_rest_s is not None:
             restless += f'; --min-rest accepts rests of {min_rest_s:g} s or more only'
     per_window = max(1, round(window_s / cells.cell_s)) if cells.cell_s else 1
-    sizes = [min(per_window, max(1, (b - a) // fewest_windows)) for a, b in ranges]
+    has_rate = reading.has_rate
     bag = ReducedBag(
         source=source,
         start_ns=cells.start_ns,
         end_ns=cells.end_ns,
         intervals=tuple(
-            _windows(cells, *edges, size, reading.has_rate)
-            for edges, size in zip(ranges, sizes, strict=True)
+            _windows(cells, a, b, min(per_window, max(1, (b - a) // fewest_windows)), has_rate)
+            for a, b in ranges
         ),
         temperatures=reading.temperatures,
         n_spikes=reading.n_spikes,
@@ -264,7 +269,7 @@ def _reduced(
         n_glitches=cells.n_glitches,
         n_repeated=cells.n_repeated,
         n_cells=len(cells.count),
-        n_still_cells=sum(upper - lower for lower, upper in ranges),
+        n_still_cells=sum(b - a for a, b in ranges),
         # A bag without a usable sample has no cells, and gets the requested window length.
         window_s=round(per_window * cells.cell_s, 6) or window_s,
         cycle_s=_cycle_s(cells),
@@ -273,7 +278,7 @@ def _reduced(
         step=float(cells.quantum.max()),
         max_abs=_max_abs(cells),
         restless=restless,
-        angular_rate='whole' if reading.has_rate else 'part' if cells.rate.any() else 'none',
+        angular_rate='whole' if has_rate else 'part' if cells.rate.any() else 'none',
     )
     if (reader := source.reader()) is not None:
         bag = replace(bag, info=reader.info, since_s=reader.since_s)
@@ -294,18 +299,14 @@ def _cycle_s(cells: Cells) -> float:
 
 
 def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
-    """
-    Keep plausible readings with rising stamps; average groups of readings over about 0.2 s if
-    the mean interval between readings is at most 0.1 s.
-
-    No thermometer responds within 0.2 s, and the tracker's loop over readings is slow in Python.
-    """
+    """Keep plausible readings with rising stamps; average those of over 10 Hz over 0.2 s."""
     stamp_ns, value = np.asarray(stamp_ns, np.int64), np.asarray(value, np.float64)
     before = np.concatenate((last_ns if len(last_ns) else stamp_ns[:1] - 1, stamp_ns[:-1]))
     use = (value >= COLDEST) & (value <= HOTTEST)
     use &= stamp_ns > np.maximum.accumulate(before[: len(stamp_ns)])
     stamp_ns, value = stamp_ns[use], value[use]
     span_s = np.ptp(stamp_ns) * 1e-9 if len(stamp_ns) else 0.0
+    # No thermometer responds within 0.2 s, and the tracker's loop over readings is slow in Python.
     size = int(0.2 * (len(stamp_ns) - 1) / span_s) if span_s else 1
     n = len(stamp_ns) // size * size if size > 1 else 0
     if n:
@@ -317,12 +318,9 @@ def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
 
 
 def is_spike(value: Floats) -> Bools:
-    """
-    Return which readings are more than 10 K from the median of the five readings about them, (n,).
-
-    A thermometer with a loose contact reads -127 or 85 degC for a moment. The fit estimates the
-    noise of a thermometer without spikes, so that the tracker rejects such readings as outliers.
-    """
+    """Return which readings are over 10 K from the median of the five about them, shape (n,)."""
+    # A thermometer with a loose contact reads -127 or 85 degC for a moment. The fit estimates its
+    # noise without such readings, so that the tracker rejects them as outliers.
     far = np.zeros(len(value), dtype=bool)
     if len(value) > 4:
         middle = np.median(sliding_window_view(value, 5), axis=1)
@@ -343,21 +341,12 @@ def _max_abs(cells: Cells) -> float:
     return float(np.quantile(sizes, 0.99))
 
 
-def _why_restless(cells: Cells, n_samples: int, still_sd: float) -> str:
-    if 2 * cells.n_saturated > n_samples:
-        share = 100.0 * cells.n_saturated / n_samples
-        return f'{share:.0f} % of its samples are at the full scale: is --full-scale right?'
-    return stillness.why_restless(cells, still_sd)
-
-
 def _rests(cells: Cells, min_rest_s: float | None, still_sd: float) -> list[tuple[int, int]]:
     """Find the rests, with the thresholds whose rests determine bias and scale best."""
     candidates: list[list[tuple[int, int]]] = []
-    # Values tried for the largest ratio of a rest's variance to the variance of the quietest
-    # cells, in ascending order.
+    # Largest ratio of a rest's variance to that of the quietest cells; smallest length of a rest.
     ratios = tuple(stillness.VARIANCE_RATIO * 2.0**power for power in range(6))
     of_ratios = stillness.still_runs(cells, still_sd, ratios)
-    # Values tried for the smallest length of a rest [s], in descending order.
     for shortest_s in (3.0, 2.0, 1.0) if min_rest_s is None else (min_rest_s,):
         for runs in of_ratios:
             ranges = stillness.long_enough(cells, runs, shortest_s)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import islice, pairwise
+from itertools import pairwise
 
 import numpy as np
 
@@ -24,15 +24,9 @@ from .windows import CURVE
 
 # Length of a piece of a rest in which a slow tilt of the support is taken as constant [s].
 _PIECE_S = 3600.0
-# A fit with slow tilts is tried if the left-out drift, averaged over each hour, exceeds these
-# multiples of the white noise of the average, and of the RMS error of left-out norms.
-_DRIFT_TO_NOISE, _DRIFT_TO_NORMS = 6.0, 0.1
 # Smallest number of positions whose left-out norms are scored, for a reliable standard error of
 # the gain by slow tilts.
 _FEWEST_NORMS = 6
-# Smallest log ratio of the mean square errors of left-out norms without and with slow tilts: 0.3
-# is a decrease of the RMS by 14 %.
-_TILT_GAIN = 0.3
 SLOW_TILTS = advice(
     'tilt',
     'left-out |f| - g is smaller if the supports may tilt from hour to hour: in the fit each hour '
@@ -46,8 +40,8 @@ def extrapolates(fit: Fit) -> bool:
     temperatures is expected to be less accurate than that of a smaller model (`settled_bias`).
     """
     settled, trials = fit.windows.data.settled, fit.selected.trials
-    chosen = next((trial for trial in trials if trial.is_chosen), None)
-    if chosen is None or settled is None or not chosen.score.exceeds_noise:
+    chosen = next(trial for trial in trials if trial.is_chosen)
+    if settled is None or not chosen.score.exceeds_noise:
         return False
     smaller = [
         trial for trial in trials if trial.groups == (CURVE,) or {*trial.groups} < {*chosen.groups}
@@ -69,8 +63,7 @@ def may_have_slow_tilts(fit: Fit) -> bool:
     if np.isfinite(score.norms.square).sum() < _FEWEST_NORMS:
         return False
     drift, n_windows = _slow_drift(data, score.drift)
-    least = max(_DRIFT_TO_NOISE * score.noise / n_windows**0.5, _DRIFT_TO_NORMS * score.norms.rms)
-    return bool(drift > least)
+    return bool(drift > max(6.0 * score.noise / n_windows**0.5, 0.1 * score.norms.rms))
 
 
 def _slow_drift(data: Windows, drift: Floats) -> tuple[float, float]:
@@ -94,25 +87,20 @@ def is_better_with_tilts(fit: Fit, tilted: Fit) -> bool:
     before, after = fit.selected.score.norms, tilted.selected.score.norms
     n_common = np.sum(np.isfinite(before.square) & np.isfinite(after.square))
     gain = before.gain_of(after)
-    return bool(n_common >= _FEWEST_NORMS and gain and gain[0] > max(gain[1], _TILT_GAIN))
+    # A log ratio of mean square errors of 0.3 is a decrease of the RMS error by 14 %.
+    return bool(n_common >= _FEWEST_NORMS and gain and gain[0] > max(gain[1], 0.3))
 
 
 def in_pieces(bag: ReducedBag) -> ReducedBag:
-    """
-    Divide each rest of a bag into equal pieces of about an hour. The fit takes each piece for a
-    separate position, with a separate attitude, as if the support had tilted between the pieces.
-    """
+    """Divide each rest of a bag into equal pieces of about an hour, as separate positions."""
     pieces = [piece for rest in bag.intervals for piece in _pieces(rest, bag.window_s)]
     return replace(bag, intervals=tuple(pieces))
 
 
-def _n_pieces(n_windows: int, window_s: float) -> int:
-    return max(round(n_windows * window_s / _PIECE_S), 1)
-
-
 def _pieces(rest: StillInterval, window_s: float) -> Iterator[StillInterval]:
     n = len(rest.time)
-    edges = np.linspace(0, n, _n_pieces(n, window_s) + 1).round().astype(int)
+    n_pieces = max(round(n * window_s / _PIECE_S), 1)
+    edges = np.linspace(0, n, n_pieces + 1).round().astype(int)
     for first, last in pairwise(edges.tolist()):
         rows = slice(first, last)
         yield replace(
@@ -135,17 +123,15 @@ def of_whole_rests(
     result, left = [], iter(pieces)
     for bag in bags:
         for rest in bag.intervals:
-            parts = list(islice(left, _n_pieces(len(rest.time), bag.window_s)))
+            parts = [next(left) for _ in _pieces(rest, bag.window_s)]
             # A rest of one sample has a duration of 0, so its weight is the length of a window.
             share = np.array([max(part.duration_s, bag.window_s) for part in parts])
             up = share @ np.array([part.up for part in parts])
             x, y, z = (up / np.linalg.norm(up)).tolist()
+            pairs = [(part.residual_rms, part.left_out_rms) for part in parts]
             in_sample, left_out = (
                 float(np.sqrt(np.average(np.square(rms), weights=share)))
-                for rms in (
-                    [part.residual_rms for part in parts],
-                    [part.left_out_rms for part in parts],
-                )
+                for rms in zip(*pairs, strict=True)
             )
             duration_s = (rest.end_ns - rest.start_ns) * 1e-9
             new = replace(parts[0], duration_s=duration_s, up=(x, y, z))

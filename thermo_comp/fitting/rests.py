@@ -37,10 +37,9 @@ def is_bench(windows: ThermalWindows, up: Floats) -> bool:
 
 def _is_heated(windows: ThermalWindows) -> Bools:
     """
-    Return the heated or cooled positions, shape (n_positions,): those whose temperature changes by
-    more than a tenth of the span of all temperatures, or whose mean temperature differs by more
-    than a tenth of the span from the median; all positions if there is no such position. Short
-    rests in other attitudes in a room do not count: their drifts hardly separate bias and scale.
+    Return the heated or cooled positions, shape (n_positions,): their temperature changes by over
+    a tenth of the span of all temperatures, or differs from the median by as much; all positions
+    if there are none. Drifts of short rests in a room hardly separate bias and scale.
     """
     t, edges, weight = windows.temperature, windows.data.edges[:-1], windows.data.weight
     mean = block_means(t[:, None], weight, edges)[:, 0]
@@ -52,11 +51,9 @@ def _is_heated(windows: ThermalWindows) -> Bools:
 def is_steady(windows: ThermalWindows) -> Bools:
     """
     Return the positions whose temperatures, and their differences, change (RMS) by less than three
-    sd of the estimated board temperature, shape (n_positions,).
-
-    In such a position the noise of the thermometers would count as temperature changes that cause
-    no drift, so the fitted slopes would be too small: by a ninth for a change of three sd, because
-    a ninth of the mean square change is then noise.
+    sd of the estimated board temperature, shape (n_positions,). In such a position noise would
+    count as temperature changes that cause no drift: at three sd it is a ninth of the mean square
+    change, and the fitted slopes would be a ninth too small.
     """
     data, model = windows.data, windows.model
     lags = [column.group in LAGS and not column.power for column in model.columns]
@@ -68,10 +65,7 @@ def is_steady(windows: ThermalWindows) -> Bools:
 
 
 def is_without_drift(data: Windows, scale: Floats) -> Bools:
-    """
-    Return the positions in which the RMS drift of the samples of each axis is at most three times
-    the white noise of a window, shape (n_positions,).
-    """
+    """Return positions whose RMS drift is within 3 times a window's noise, (n_positions,)."""
     drift = within_positions(data.mean / scale, data.position) * np.sqrt(data.weight)[:, None]
     square = np.add.reduceat(drift**2, data.edges[:-1], axis=0) / np.diff(data.edges)[:, None]
     return np.asarray((square <= (3.0 * white_noise_of(data, scale)) ** 2).all(axis=1))
@@ -79,9 +73,8 @@ def is_without_drift(data: Windows, scale: Floats) -> Bools:
 
 def constant_in(data: Windows, steady: Bools, settled: Bools) -> Windows:
     """
-    Return the windows with constant columns in the positions of the mask `steady`, (n_positions,),
-    and without effects of initial lag states in the positions of the mask `settled`,
-    (n_positions,), in which such effects would only fit the noise.
+    Return the windows with constant columns in the positions of the mask `steady`, and without
+    effects of initial lag states, which would only fit noise, in `settled`; both (n_positions,).
     """
     in_steady = steady[data.position][:, np.newaxis]
     means = (data.columns - within_positions(data.columns, data.position))[data.edges[:-1]]

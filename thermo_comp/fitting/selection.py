@@ -28,7 +28,7 @@ from .hyperparameters import (
 from .left_out import Score, gain, is_better, is_near, is_undecided, is_worse_by_norms, score_of
 from .regression import PosteriorMode, Regression
 from .unknowns import POSE_SD, InformativePrior, Prior, State
-from .windows import BEND, CURVE, LAGS, PART, PART_SUMS, PRODUCTS, SET, ThermalWindows
+from .windows import BEND, CURVE, LAGS, PART, PRODUCTS, SET, ThermalWindows
 
 #: Large initial sd of mounting offsets, relative to `Prior.offset_scale`: by data sheets, the bias
 #: of tactical triads repeats to 0.3 .. 1 mg over turn-ons, 10 to 20 times `Prior.offset_scale`.
@@ -307,7 +307,7 @@ def _grown(
         growth.tried += trials
         chosen = _best(chosen, trials)
     if growth.regression.windows.acts_on is not None and not chosen.is_complete:
-        trials = growth.with_bends(first, PART_SUMS)
+        trials = growth.with_bends(first, ('board', *PRODUCTS))
         growth.tried += trials
         chosen = _best(chosen, trials)
     chosen = growth.added(chosen, progress)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the estimation of thermometer and detector settings from bags, and the bags' thermal states.
+Owns the estimation of thermometer and detector settings from bags.
 
 The rates of temperature here are central differences over two minutes, which are not causal and
 need a recording. The lag and the ramps of the test that these rates show, and the noise of the
@@ -12,15 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import repeat
 from operator import itemgetter
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
 from ..thermal.settings import OBVIOUS_SHARE, RAMP_K_MIN, DetectorSettings, ThermometerSettings
-from ..thermal.tracker import ThermalTracker
-from ..typing import Bools, Floats
+from ..typing import Floats
 from .reduction import Readings, ReducedBag
 
 # Interval of the grid of rates [s], and number of intervals on each side in a central difference.
@@ -33,12 +31,6 @@ class RateHistory:
 
     rate: Floats
     rate_sd: float
-
-    @property
-    def is_resting(self) -> Bools:
-        """Whether there is no ramp within five minutes before and after each grid point."""
-        moving = np.abs(self.rate) > max(0.2 * self.fastest, self.least_ramp)
-        return np.asarray(np.convolve(moving, np.ones(61))[30:-30] < 0.5)
 
     @property
     def least_ramp(self) -> float:
@@ -124,7 +116,7 @@ def _noise_of(recorded: Sequence[Readings], quantum: float) -> float:
         return 1.4826 * float(np.median(np.abs(second))) / float(np.sqrt(6.0))
     # Most rounded readings are equal to their neighbours, so the median difference is 0. The mean
     # square without the largest 1 % is used instead, less the variance of rounding.
-    square = np.sort(second**2)[: max(1, int(0.99 * len(second)))]
+    square = np.sort(second**2)[: int(0.99 * len(second))]
     noise = float(np.sqrt(max(float(square.mean()) / 6.0 - quantum**2 / 12.0, 0.0)))
     limit = 0.1 * quantum
     return noise if noise > limit else float(np.clip(_flicker(recorded), 0.1 * limit, limit))
@@ -132,9 +124,8 @@ def _noise_of(recorded: Sequence[Readings], quantum: float) -> float:
 
 def _flicker(recorded: Sequence[Readings]) -> float:
     """
-    Return the sd of the noise of readings whose quantum is much larger than the noise [K].
-
-    While the temperature passes the edge between two rounded values at the rate r, readings with
+    Return the sd of the noise of readings whose quantum is much larger than the noise [K]. While
+    the temperature passes the edge between two rounded values at the rate r, readings with
     interval h and noise of sd s change ``2 s / (r h sqrt(pi))`` times, but at least once.
     """
     moves = inverse_rates = 0.0
@@ -160,10 +151,8 @@ def _rate_histories(
     side = _BIN_S * _BINS_PER_SIDE
     result = []
     for readings in recorded:
-        if len(readings.value) < 30:
-            continue
-        time = (readings.stamp_ns - readings.stamp_ns[0]) * 1e-9
-        n_bins = int(time[-1] / _BIN_S)
+        time = (readings.stamp_ns - readings.stamp_ns[:1]) * 1e-9
+        n_bins = int(time[-1] / _BIN_S) if len(time) >= 30 else 0
         if n_bins < 6 * _BINS_PER_SIDE:
             continue
         # The mean over a minute is the change of the integral over the minute, divided by 60 s.
@@ -193,8 +182,12 @@ def _slowest_ramp(histories: Sequence[RateHistory], usual: float) -> float:
 
 def _ripple(histories: Sequence[RateHistory], lag_s: float, usual: float) -> float:
     """Return the amplitude of ripple of the ambient temperature in soaks [K]."""
-    rates = [history.rate[history.is_resting] for history in histories]
-    resting = np.concatenate(rates) if rates else np.zeros(0)
+    rates = [np.zeros(0)]
+    for history in histories:
+        moving = np.abs(history.rate) > max(0.2 * history.fastest, history.least_ramp)
+        # A soak has no ramp within five minutes before and after a grid point.
+        rates.append(history.rate[np.convolve(moving, np.ones(61))[30:-30] < 0.5])
+    resting = np.concatenate(rates)
     if len(resting) < 60:
         return usual
     noise = float(np.median([history.rate_sd for history in histories]))
@@ -212,7 +205,7 @@ def gradients_at_rest(bags: Sequence[ReducedBag], sensors: Sequence[str]) -> dic
     for name in sensors:
         rate, gradient = [np.zeros(0)], [np.zeros(0)]
         for bag in bags:
-            board, sensor = bag.board, bag.temperatures.get(name, Readings())
+            board, sensor = bag.board, bag.readings(name)
             if min(len(board.value), len(sensor.value)) < 30:
                 continue
             first = max(board.stamp_ns[0], sensor.stamp_ns[0])
@@ -236,11 +229,10 @@ def gradients_at_rest(bags: Sequence[ReducedBag], sensors: Sequence[str]) -> dic
 def without_copies(bags: Sequence[ReducedBag]) -> tuple[list[ReducedBag], list[str]]:
     """Return the bags without thermometers that repeat the board's readings; their names."""
     names = sorted(set.intersection(*({*bag.temperatures} for bag in bags)) - {'board'})
-    is_read = any(len(bag.board.value) for bag in bags)
     copies = [
         name
         for name in names
-        if is_read
+        if any(len(bag.board.value) for bag in bags)
         and all(np.array_equal(bag.temperatures[name].value, bag.board.value) for bag in bags)
     ]
     kept = [
@@ -260,42 +252,10 @@ def board_span(bags: Sequence[ReducedBag], reference: float) -> tuple[float, flo
 
 
 def readings_in_order(bag: ReducedBag, inputs: Sequence[str]) -> list[tuple[str, int, float]]:
-    """
-    Return thermometer, stamp and value of each reading in the order of the stamps, and for equal
-    stamps in the order of `inputs`.
-    """
-    rows: list[tuple[str, int, float]] = []
-    for name in inputs:
-        readings = bag.temperatures.get(name, Readings())
-        rows += zip(
-            repeat(name), readings.stamp_ns.tolist(), readings.value.tolist(), strict=False
-        )
+    """Return thermometer, stamp, value of readings by stamp; equal stamps as in `inputs`."""
+    rows = [
+        (name, stamp_ns, value)
+        for name in inputs
+        for stamp_ns, value in zip(*map(np.ndarray.tolist, bag.readings(name)), strict=True)
+    ]
     return sorted(rows, key=itemgetter(1))
-
-
-def thermal_states(
-    bag: ReducedBag, tracker: ThermalTracker, step_s: float
-) -> tuple[float, Floats, Bools]:
-    """
-    Run a tracker over a bag; evaluate its thermal state at intervals of `step_s`.
-
-    Returns the time of the first state [s], the states, and whether readings of each are recent.
-    """
-    readings = iter(readings_in_order(bag, ('board', *tracker.spec.sensors)))
-    reading = next(readings, None)
-    step_ns = round(step_s * 1e9)
-    begin = max(int(bag.board.stamp_ns[0]), bag.start_ns)
-    rows, is_heard = [], []
-    board, *others = tracker.thermometers.values()
-    limit_s, other_limit_s = tracker.config.temperature_timeout_s, tracker.config.case_timeout_s
-    for stamp_ns in range(begin, max(bag.end_ns, begin) + step_ns, step_ns):
-        # As in the node, a state depends on all readings with a stamp up to that of the state.
-        while reading is not None and reading[1] <= stamp_ns:
-            tracker.read(*reading)
-            reading = next(readings, None)
-        rows.append(tracker.sample(stamp_ns))
-        is_heard.append(
-            board.beyond(stamp_ns) <= limit_s
-            and all(sensor.beyond(stamp_ns) <= other_limit_s for sensor in others)
-        )
-    return (begin - bag.start_ns) * 1e-9, np.array(rows), np.array(is_heard)

@@ -69,10 +69,9 @@ class Whitener:
 
     def shows(self, time_s: float) -> bool:
         """Whether a search may try a correlation time: from `times_s[0]` to `_longest_s`."""
-        if not self.times_s:
-            return False
         # Rounding must not exclude the shortest correlation time.
-        return bool(0.999 * self.times_s[0] < time_s < 1.001 * self._longest_s)
+        shortest_s = 0.999 * self.times_s[0] if self.times_s else math.inf
+        return shortest_s < time_s < 1.001 * self._longest_s
 
     def _innovations(
         self, series: Floats, weight: Floats, noises: Sequence[Noise]
@@ -152,12 +151,12 @@ class Whitener:
 
 
 def _vertex(values: Floats, at: int) -> float:
-    """Return the place of the minimum of the parabola through three values about `at`, -1..1."""
+    """Return the vertex of the parabola through the smallest value, `at`, and its neighbours."""
     if not 0 < at < len(values) - 1:
         return 0.0
     before, here, after = values[at - 1 : at + 2].tolist()
     bend = before - 2.0 * here + after
-    return float(np.clip(0.5 * (before - after) / bend, -1.0, 1.0)) if bend > 0.0 else 0.0
+    return 0.5 * float(before - after) / bend if bend > 0.0 else 0.0
 
 
 @dataclass(frozen=True)
@@ -280,13 +279,10 @@ class Series:
             base = Base.of(active, self.windows.lag, self._n_t, self.windows.tilt.shape[1])
             series = self.of(base)
             parts = np.split(self._whitened(series), self._cells[1:])
-            self._products = Products(
-                base,
-                self._averaged(series),
-                np.stack([part.T @ part for part in parts]),
-                np.searchsorted(self._cells, self._first),
-                self.windows.section[self._cells],
-            )
+            cells = np.stack([part.T @ part for part in parts])
+            first, section = np.searchsorted(self._cells, self._first), self.windows.section
+            means = self._averaged(series)
+            self._products = Products(base, means, cells, first, section[self._cells])
         return self._products
 
     def products_of(self, columns: Ints, base: Base, state: State) -> tuple[Floats, Floats]:
@@ -295,8 +291,8 @@ class Series:
         other and with base series, shapes (n_positions, k, k) and (n_positions, k, n_base).
         """
         values, lag = self.columns[:, columns], self.windows.lag[columns]
-        start = (state.start @ self.start_root.T)[self.windows.bag]
-        values[:, lag >= 0] += start[:, lag[lag >= 0]] * self._starts[:, columns[lag >= 0]]
+        lagged, start = lag >= 0, (state.start @ self.start_root.T)[self.windows.bag]
+        values[:, lagged] += start[:, lag[lagged]] * self._starts[:, columns[lagged]]
         series = np.hstack((values, self.of(base)))
         parts = np.split(self._whitened(series), self._first[1:])
         k = len(columns)
@@ -323,11 +319,10 @@ class Series:
         have initial lag states at the prior mean, get the initial lag states of `state`.
         """
         if not len(base.lagged):
-            return rows
+            return rows  # not a copy, whose memory layout would change the last bits of products
         result: Floats = rows.copy()
-        result[..., 1 + base.lagged] += (
-            self.starts(state, base)[:, None] * rows[..., base.at_start]
-        )
+        starts = self.starts(state, base)[:, None]
+        result[..., 1 + base.lagged] += starts * rows[..., base.at_start]
         return result
 
     def products_at(self, products: Floats, state: State, base: Base) -> Floats:

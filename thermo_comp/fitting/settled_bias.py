@@ -14,9 +14,6 @@ import numpy as np
 from ..typing import Floats
 from .regression import PosteriorMode, Regression
 
-# Number of windows that are sufficient to compute the RMS, over the windows, of the bias sd.
-_N_WINDOWS = 500
-
 
 def settled_error(
     regression: Regression, posterior: PosteriorMode, excess: float, settled: Floats
@@ -30,7 +27,8 @@ def settled_error(
     """
     if not posterior.layout.used[0].any():
         return np.inf
-    seen = regression.columns[:: max(len(regression.columns) // _N_WINDOWS, 1)]
+    # 500 windows are sufficient to compute the RMS, over the windows, of the bias sd.
+    seen = regression.columns[:: max(len(regression.columns) // 500, 1)]
     sd, seen_sd = (
         _sd_of_changes(posterior, columns - columns.mean(axis=0))
         for columns in (settled / regression.rms, seen)

@@ -66,10 +66,7 @@ class Tangent:
     scale: Floats
 
     def normal(self, products: Floats) -> Normal:
-        """
-        Return the normal equations, given the products of the base series at the state, shape
-        (n_positions, n_base, n_base).
-        """
+        """Return the normal equations; products of base series: (n_positions, n_base, n_base)."""
         first, with_combined = self.n_local, products[:, None] @ self.combined
         place = self.place[first:]
         n, bias = len(place), slice(1, 1 + self.n_bias)

@@ -12,6 +12,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import product
+from math import comb
 from typing import NamedTuple
 
 import numpy as np
@@ -26,23 +28,19 @@ from ..typing import Bools, Floats, Ints
 from ..unit.columns import Column, ColumnTable, Part, memory_of
 from ..unit.functions import Polynomial, TemperatureFunction
 from .initial_triad import block_means
-from .part_curves import PartCurves, curves_of
 from .reduction import ReducedBag, StillInterval
-from .sensors import thermal_states
+from .sensors import readings_in_order
 from .unknowns import Windows
 
 #: Groups of columns: the curve, the difference of the static and dynamic sets, bends (changes of
 #: slope at a temperature), and the curves over the temperatures of parts.
 CURVE, SET, BEND, PART = 'curve', 'set', 'bend', 'part'
-#: Groups whose columns, with those of the curve, form the curves over a part's temperature.
-PART_SUMS = ('board', 'product', 'square')
 #: Groups of columns linear in a difference of temperatures; groups of the products of such a
-#: difference with temperature, and of its squares.
+#: difference with temperature, and of its squares. The groups 'board' and `PRODUCTS`, with the
+#: curve, form the curves over a part's temperature.
 LAGS, PRODUCTS = ('gradient', 'board', 'gradient_lag'), ('product', 'square')
 #: Number of windows into which a short rest is divided, to determine the noise of the rest.
 FEWEST_WINDOWS = 20
-# Number of temperatures at which the columns are evaluated for settled lags, see `_settled`.
-_N_SETTLED = 9
 #: Number of sections of equal length into which a position is divided. The chamber's program is
 #: the same in all positions, so section k is the same part of the program in each position.
 N_SECTIONS = 6
@@ -66,11 +64,6 @@ class Sets:
         if not self.is_shared:
             static = [(1.0 - weight) * value for value in static]
         return [*static, weight, *(weight * value for value in dynamic)]
-
-    @property
-    def has_cubic(self) -> bool:
-        """Whether static and dynamic set share a curve with the columns t, t^2 and t^3."""
-        return self.is_shared and isinstance(self.static, Polynomial) and self.static.n_free == 3
 
     @property
     def families(self) -> tuple[TemperatureFunction, TemperatureFunction]:
@@ -109,20 +102,43 @@ class Model:
 
     @property
     def acts_on(self) -> Bools | None:
-        """Axes on which each column of the response acts, shape (k, 3); None if on all axes."""
+        """Axes on which each column of `Windows` acts, shape (m, 3); None if on all axes."""
         if self.parts is None:
             return None
         own = [(part, part.of_gradient) for part in self.parts]
-        return np.array([
-            [not column.source.is_of_part or column.part in lags for lags in own]
-            for column in self.columns
-        ])  # fmt: skip
+        acts = [[True] * 3] * len(self.sets.groups)
+        for column in self.columns:
+            acts.append([not column.source.is_of_part or column.part in lags for lags in own])
+        return np.vstack((acts, np.eye(3, dtype=bool)[np.arange(len(self.part_sums)) // 3]))
 
     @cached_property
-    def part_curves(self) -> PartCurves:
-        """Curves over the temperatures of parts; empty without `parts` or their columns."""
-        parts = self.parts if self.sets.has_cubic else None
-        return curves_of(parts or (), self.columns, len(self.sets.groups))
+    def part_sums(self) -> Floats:
+        """
+        The powers x, x^2 and x^3 of the temperature x of each axis's part, as sums of columns:
+        factors of the m columns of sets and response, shape (9, m), in the order of axes, then of
+        powers; (0, m) without `parts`, if a column is missing, or if the sets share no cubic.
+
+        With the board temperature t and the lag m of the part, ``x = t - m``. By the binomial
+        theorem x^p is a sum of t^p, t^(p-1) m, ..., m^p, so one weight per power describes a curve
+        over x. If all bags repeat one warm-up, m is a function of t, and the data would not
+        determine separate weights of the columns.
+        """
+        static, n_curves = self.sets.static, len(self.sets.groups)
+        n_columns = n_curves + len(self.columns)
+        has_cubic = isinstance(static, Polynomial) and static.n_free == 3 and self.sets.is_shared
+        places = {(c.kind, c.power, c.part): k for k, c in enumerate(self.columns, n_curves)}
+        rows = []
+        for part, power in product(self.parts or () if has_cubic else (), (1, 2, 3)):
+            row = np.zeros(n_columns)
+            row[power - 1] = 1.0  # the first columns are t, t^2 and t^3
+            # The columns of the powers m, m^2 and m^3 of a lag m are of these kinds.
+            kinds = ('board', 'square', 'cube')[:power] if part.tau_s else ()
+            for k, kind in enumerate(kinds, 1):
+                if (place := places.get((kind, power - k, part))) is None:
+                    return np.empty((0, n_columns))
+                row[place] = comb(power, k) * (-1.0) ** k
+            rows.append(row)
+        return np.array(rows).reshape(-1, n_columns)
 
 
 class Track(NamedTuple):
@@ -140,6 +156,11 @@ class Track(NamedTuple):
     states: Floats
     is_known: Bools
     settled_s: float = -np.inf
+
+    @property
+    def grid_s(self) -> Floats:
+        """Time of each state [s], shape (n,)."""
+        return np.asarray(self.start_s + self.step_s * np.arange(len(self.states)))
 
 
 @dataclass(frozen=True)
@@ -221,19 +242,23 @@ def thermal_windows(
     spec = memory_of(model.columns, model.sensors)
     tracks = tracks or [_track(bag, model, spec) for bag in bags]
     table = ColumnTable(model.columns, spec, model.reference_temperature)
+    places = StateLayout(spec).places
     parts: list[_Rows] = []
     rests: list[tuple[ReducedBag, StillInterval]] = []
     numbers: list[int] = []
     has_rate = all(interval.angular_rate is not None for bag in bags for interval in bag.intervals)
     for number, (bag, track) in enumerate(zip(bags, tracks, strict=True)):
-        grid, states = _with_memory(track, spec)
+        # All lags of a bag are computed at once, which is faster than reading by reading.
+        gradients = [track.states[:, places[Gradient(name)]] for name in spec.sensors]
+        memory = memory_on_grid(spec, track.step_s, track.states[:, BOARD], gradients)
         # `np.interp` would copy a strided or boolean series at each call.
-        known, all_series = track.is_known.astype(np.float64), np.ascontiguousarray(states.T)
+        states = np.ascontiguousarray(np.hstack((track.states, memory)).T)
+        grid, known = track.grid_s, track.is_known.astype(np.float64)
         for interval in bag.intervals:
             use = np.interp(interval.time, grid, known, left=0.0) == 1.0
             if use.any():
                 time = interval.time[use]
-                at = np.array([np.interp(time, grid, series) for series in all_series])
+                at = np.array([np.interp(time, grid, series) for series in states])
                 parts.append(_rows(interval, has_rate, use, at, grid[0], model, table))
                 rests.append((bag, interval))
                 numbers.append(number)
@@ -268,7 +293,6 @@ def _rows(
 ) -> _Rows:
     """
     Average the windows of a rest selected by `use` to windows of 60 s, shorter in a short rest.
-
     `states`: thermal states, (width, n); `begin_s`: time at which the lags begin [s]
     """
     time, count = interval.time[use], interval.count[use]
@@ -300,14 +324,7 @@ def _windows(
     model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: Ints, table: ColumnTable
 ) -> Windows:
     """Make the data of the regression from the windows of all rests."""
-    curves = model.part_curves
-    groups, columns, acts_on = model.sets.groups, model.columns, model.acts_on
-    if acts_on is not None:
-        of_sets, of_parts = (
-            np.ones((len(groups), 3), dtype=bool),
-            np.eye(3, dtype=bool)[curves.axis],
-        )
-        acts_on = np.vstack((of_sets, acts_on, of_parts))
+    sums, groups, columns = model.part_sums, model.sets.groups, model.columns
     n_curves, lags = len(groups), StateLayout(spec).lags
     t, gradient = rows.thermal[:, 0] - model.reference_temperature, rows.thermal[:, 4]
     # A support tilts linearly with the board and case temperatures, and with the square of the
@@ -317,14 +334,14 @@ def _windows(
     is_tilting = tilt_rms > 0.0
     # The scale factor has no level of the dynamic set, as the relative scale is 1 at the reference
     # temperature in both regimes, and no columns whose term does not act on scale (`has_scale`).
-    in_scale = [True] * n_curves + [c.term.has_scale for c in columns] + [True] * len(curves.axis)
+    in_scale = [True] * n_curves + [c.term.has_scale for c in columns] + [True] * len(sums)
     in_scale[model.sets.level] = False
     start = np.hstack((np.zeros((len(t), n_curves)), rows.start))
     lag = np.array([-1] * n_curves + [lags.get(c.source, -1) for c in columns], np.int64)
-    of_part = rows.columns @ curves.sums.T
+    of_part = rows.columns @ sums.T
     kelvins = _kelvins(model, rows.columns, rows.thermal[:, 5:], t, gradient)
     # The columns of a curve over a part's temperature have no lag, or the lag of this part.
-    lag_of_part = np.where(curves.sums != 0.0, lag, -1).max(axis=1, initial=-1)
+    lag_of_part = np.where(sums != 0.0, lag, -1).max(axis=1, initial=-1)
     settled = _settled(model, spec, rows, table)
     return Windows(
         position=position,
@@ -334,31 +351,28 @@ def _windows(
         weight=rows.n_samples / float(np.median(rows.n_samples)),
         mean=rows.mean,
         columns=np.hstack((rows.columns, of_part)),
-        groups=(*groups, *(column.group for column in columns), *[PART] * len(curves.axis)),
+        groups=(*groups, *(column.group for column in columns), *[PART] * len(sums)),
         lag=np.append(lag, lag_of_part),
-        kelvins=np.append(kelvins, curves.kelvins(of_part)),
-        start=np.hstack((start, start @ curves.sums.T)),
+        kelvins=np.append(kelvins, _part_kelvins(of_part)),
+        start=np.hstack((start, start @ sums.T)),
         start_covariance=start_covariance(spec.lags),
         in_scale=np.array(in_scale),
         tilt=tilt[:, is_tilting] / tilt_rms[is_tilting],
-        acts_on=acts_on,
+        acts_on=model.acts_on,
         board=rows.thermal[:, :2],
         board_noise=model.detector.board.noise_sd_c,
-        settled=np.hstack((settled, settled @ curves.sums.T)),
+        settled=np.hstack((settled, settled @ sums.T)),
     )
 
 
 def _settled(model: Model, spec: MemorySpec, rows: _Rows, table: ColumnTable) -> Floats:
-    """
-    Return the columns at `_N_SETTLED` constant board temperatures over the range of the windows,
-    with settled lags and the median gradient of the static regime, shape (_N_SETTLED, m).
-    """
+    """Return the columns at 9 board temperatures over the windows' range, lags settled, (9, m)."""
     board, is_static = rows.thermal[:, 0], rows.thermal[:, 3] <= 0.5
     some = is_static if is_static.any() else np.ones_like(is_static)
-    states = np.zeros((StateLayout(spec).width, _N_SETTLED))
-    states[BOARD] = np.linspace(board.min(), board.max(), _N_SETTLED)
+    states = np.zeros((StateLayout(spec).width, 9))
+    states[BOARD] = np.linspace(board.min(), board.max(), 9)
     states[GRADIENT] = np.median(rows.thermal[some, 4])
-    weight = np.zeros(_N_SETTLED)
+    weight = np.zeros(9)
     curves = model.sets.columns(states[BOARD] - model.reference_temperature, weight)
     factors, _ = table.factors(states[BOARD], weight)
     return np.asarray(np.vstack((curves, table.raw(states) * factors)).T)
@@ -374,10 +388,7 @@ def _sections(position: Ints, time: Floats) -> Ints:
 
 
 def _kelvins(model: Model, values: Floats, raw: Floats, t: Floats, gradient: Floats) -> Floats:
-    """
-    Return the temperature change that corresponds to the RMS of each column [K], shape (m,): the
-    RMS divided by the largest slope of the column over temperature; 0 if this slope is 0.
-    """
+    """Return the RMS of each column divided by its largest slope over temperature [K], (m,)."""
     farthest = float(np.abs(t).max(initial=0.0))
     flow = float(np.sqrt(np.mean(gradient**2))) or 1.0
     grid = np.linspace(float(t.min()), float(t.max()) + 1e-9, 100)
@@ -392,8 +403,17 @@ def _kelvins(model: Model, values: Floats, raw: Floats, t: Floats, gradient: Flo
     return np.asarray(np.divide(rms, slope, out=np.zeros_like(rms), where=slope > 0.0))
 
 
+def _part_kelvins(values: Floats) -> Floats:
+    """Return the temperature change of the RMS of each power in `Model.part_sums` [K], (9,)."""
+    power = np.tile((1, 2, 3), values.shape[1] // 3)
+    # The largest slope of x^p is p |x|^(p - 1) at the largest |x|.
+    most = np.repeat(np.abs(values[:, ::3]).max(axis=0, initial=0.0), 3)
+    steepest = power * most ** (power - 1)
+    return np.asarray(np.sqrt(np.mean(values**2, axis=0)) / np.maximum(steepest, 1e-300))
+
+
 def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
-    """Run the tracker over the readings of a bag."""
+    """Run the tracker over the readings of a bag, at 5 states per window."""
     spec = replace(spec, lags=(), plays=())
     if not len(bag.board.value):
         # Without readings, assume the reference temperature since 1e9 s, so that all lags are 0.
@@ -401,24 +421,27 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
         still[:, BOARD] = model.reference_temperature
         end_s = 1.0 + (bag.end_ns - bag.start_ns) * 1e-9
         return Track(-1e9, 1e9 + end_s, still, np.ones(2, dtype=bool))
-    tracker = ThermalTracker(model.detector, spec, ThermalConfig())
-    shortest = min(
-        (float(np.median(np.diff(i.time))) for i in bag.intervals if len(i.time) > 1), default=1.0
-    )
-    step_s = max(shortest / 5.0, 0.1)
-    start_s, states, is_known = thermal_states(bag, tracker, step_s)
-    is_settled = states[:, VAR_BOARD] <= 4.0 * np.median(states[:, VAR_BOARD])
-    n_unsettled = int(np.argmax(is_settled))
+    config = ThermalConfig()
+    tracker = ThermalTracker(model.detector, spec, config)
+    board, *others = tracker.thermometers.values()
+    lengths_s = (float(np.median(np.diff(i.time))) for i in bag.intervals if len(i.time) > 1)
+    step_s = max(min(lengths_s, default=1.0) / 5.0, 0.1)
+    step_ns, begin_ns = round(step_s * 1e9), max(int(bag.board.stamp_ns[0]), bag.start_ns)
+    rows, is_heard = [], []
+    readings = iter(readings_in_order(bag, ('board', *spec.sensors)))
+    reading = next(readings, None)
+    for stamp_ns in range(begin_ns, max(bag.end_ns, begin_ns) + step_ns, step_ns):
+        # As in the node, a state depends on all readings with a stamp up to that of the state.
+        while reading is not None and reading[1] <= stamp_ns:
+            tracker.read(*reading)
+            reading = next(readings, None)
+        rows.append(tracker.sample(stamp_ns))
+        is_heard.append(
+            board.beyond(stamp_ns) <= config.temperature_timeout_s
+            and all(sensor.beyond(stamp_ns) <= config.case_timeout_s for sensor in others)
+        )
+    states, is_known = np.array(rows), np.array(is_heard)
+    n_unsettled = int(np.argmax(states[:, VAR_BOARD] <= 4.0 * np.median(states[:, VAR_BOARD])))
     is_known[:n_unsettled] = False
+    start_s = (begin_ns - bag.start_ns) * 1e-9
     return Track(start_s, step_s, states, is_known, start_s + step_s * n_unsettled)
-
-
-def _with_memory(track: Track, spec: MemorySpec) -> tuple[Floats, Floats]:
-    """Return a time grid [s], and the thermal states on this grid with their lags."""
-    states = track.states
-    grid = np.asarray(track.start_s + track.step_s * np.arange(len(states)), dtype=np.float64)
-    # The lags of all grid points are computed at once, which is faster than reading by reading.
-    layout = StateLayout(spec)
-    gradients = [states[:, layout.places[Gradient(name)]] for name in spec.sensors]
-    memory = memory_on_grid(spec, track.step_s, states[:, BOARD], gradients)
-    return grid, np.hstack((states, memory))

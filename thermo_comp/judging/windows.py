@@ -224,9 +224,9 @@ def _table(
             rows['size'] = gravity
             if (known := bag.source.force) is not None:
                 first_ns = bag.start_ns - round(bag.since_s * 1e9)
-                size = known.of(rest.start_ns, rest.end_ns, first_ns)
-                rows['size'] = size.norm(gravity)
-                rows['size_sd'] = np.hypot(size.sd, known.radius_part(size, gravity))
+                size = known.of(rest.start_ns, rest.end_ns, first_ns, gravity)
+                rows['size'] = size.norm
+                rows['size_sd'] = np.hypot(size.sd, known.radius_part(size))
             if n_gyro and rest.angular_rate is not None:
                 rows['gyro'][:, :3] = rest.angular_rate[:n]
             sums.append(rows)
