@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 
 from thermo_comp.quantities import QUANTITIES, Bounds
 from thermo_comp.ros.parameters import NodeConfig
-from thermo_comp.topics import INPUTS, OUTPUTS, STATUS
+from thermo_comp.topics import INPUTS, OUTPUTS, STATUS, NodeTopic
 from thermo_comp.unit.calibration import Calibration
 from thermo_comp.unit.schema import fields_of, plain
 
@@ -360,9 +360,15 @@ def _type(value: dict[str, Any]) -> str:
 def topics_table() -> str:
     """Return the node's topics as the rows of a Markdown table."""
     directions = {'in': INPUTS.values(), 'out': (*OUTPUTS, STATUS)}
+
+    def qos(topic: NodeTopic) -> str:
+        words = ['reliable' if topic.is_reliable else 'best effort']
+        words += ['transient local'] * topic.is_latched
+        return ', '.join([*words, f'keep last {topic.depth}'])
+
     return '\n'.join(
         f'| {direction} | `{topic.name}` | {topic.type.replace("/msg/", "/")}: {topic.meaning} '
-        f'| {topic.qos} |'
+        f'| {qos(topic)} |'
         for direction, topics in directions.items()
         for topic in topics
     )

@@ -233,6 +233,7 @@ class ArrayBlock:
     board: np.ndarray = field(default_factory=lambda: np.zeros(0))
     case_stamp_ns: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     case: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    imu: object = None
 
     @property
     def temperatures(self):

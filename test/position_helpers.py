@@ -25,10 +25,7 @@ class Imu:
     def angular_velocity_covariance(self):
         return np.zeros((len(self.angular_velocity), 9))
 
-
-@dataclass(frozen=True)
-class ImuBlock(ArrayBlock):
-    imu: Imu | None = None
+    linear_acceleration_covariance = angular_velocity_covariance
 
 
 @dataclass
@@ -75,5 +72,5 @@ class Rest:
             rows = slice(first, last)
             imu = Imu(self.gyro[rows]) if with_gyro else None
             readings = (board_ns[use], board[use])
-            blocks.append(ImuBlock(stamp_ns[rows], self.accel[rows], *readings, imu=imu))
+            blocks.append(ArrayBlock(stamp_ns[rows], self.accel[rows], *readings, imu=imu))
         return FitSource(name, lambda: blocks)

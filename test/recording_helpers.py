@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 VECTOR = 'geometry_msgs/msg/Vector3Stamped'
 IMU = 'sensor_msgs/msg/Imu'
 TEMPERATURE = 'sensor_msgs/msg/Temperature'
-STRING = 'std_msgs/msg/String'
+STRING, BOOL = 'std_msgs/msg/String', 'std_msgs/msg/Bool'
 
 ACCEL, IMU_IN, BOARD, CASE, OTHER = (
     '/accel/counts', '/imu/uncompensated', '/temperature/board', '/temperature/case', '/chatter',

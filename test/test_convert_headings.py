@@ -18,6 +18,7 @@ from thermo_comp.convert.column_map import (
 )
 from thermo_comp.convert.headings import map_lines, read_headings
 from thermo_comp.convert.log import NO_STAMP, write_log
+from thermo_comp.convert.readers import read_log
 from thermo_comp.convert.table import exact_ns
 from thermo_comp.errors import RecordingError
 from thermo_comp.fitting.reduction import reduce_source
@@ -219,7 +220,7 @@ def test_columns_with_unusable_times_or_temperatures_are_refused(tmp_path, headi
     # WHY: times in minutes were read as seconds; for times that do not rise the message was wrong.
     path = slow_table(tmp_path / 'log.csv', heading, times)
     with pytest.raises(RecordingError, match=reason):
-        table_log(path, guess_columns(path))
+        read_log(path)
 
 
 def test_a_table_with_blank_temperature_cells_is_read(tmp_path):

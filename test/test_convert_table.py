@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from recording_helpers import IMU, START_NS, TEMPERATURE, Message, write_rosbag1, write_rosbag2
 
+from thermo_comp.convert import log as logs
 from thermo_comp.convert.bag import bag_log, find_topics
 from thermo_comp.convert.column_map import ColumnMap, table_log
 from thermo_comp.convert.log import NO_STAMP, contradiction, find_stillness, infer_unit, write_log
@@ -117,7 +118,7 @@ def test_stamps_of_a_table_are_exact():
 )
 def test_bad_tables_are_refused(tmp_path, text, column, message):
     path = write(tmp_path / 'log.csv', text)
-    with pytest.raises(RecordingError, match=message) as caught:
+    with pytest.raises(RecordingError, match=message) as caught, logs.naming(path):
         read_text(path, [column], ROWS_ALONE)
     assert str(path) in str(caught.value)
 

@@ -125,9 +125,9 @@ def test_a_message_that_ends_inside_a_field_is_refused_as_damaged(store):
 
 def test_message_definitions_are_those_of_the_bag_or_of_ros():
     known = {'a/msg/B': ('ros2msg', 'float32 t\n'), 'a/msg/C': ('ros2msg', '?')}
-    assert Field('a/msg/B', 't', definitions_of('a/msg/B', known)).has_stamp is False
+    assert Field('a/msg/B', 't', definitions_of('a/msg/B', known)).header == ''
     jazzy = definitions_of('sensor_msgs/msg/BatteryState', {})
-    assert Field('sensor_msgs/msg/BatteryState', 'temperature', jazzy).has_stamp
+    assert Field('sensor_msgs/msg/BatteryState', 'temperature', jazzy).header
     idl = 'module a { module msg { struct D { float t; }; }; };'
     for text in (idl, f'{"=" * 80}\nIDL: a/msg/D\n{idl}'):
         assert Field('a/msg/D', 't', definitions_of('a/msg/D', {'a/msg/D': ('ros2idl', text)}))

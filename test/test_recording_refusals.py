@@ -11,6 +11,7 @@ from mcap.opcode import Opcode
 from recording_helpers import (
     ACCEL,
     BOARD,
+    BOOL,
     CASE,
     OTHER,
     START_NS,
@@ -182,7 +183,7 @@ def test_topic_names_with_control_characters_are_escaped_in_messages(tmp_path):
     path = tmp_path / 'bag.mcap'
     with BagWriter(path) as bag:
         for row in range(30):
-            bag.write_bool(f'a\nb\x1b[31m{row:02}' + 'x' * 1000, [1], [True])
+            bag.write_raw(f'a\nb\x1b[31m{row:02}' + 'x' * 1000, BOOL, [1], [b''])
     with pytest.raises(RecordingError, match=r'/a\\nb\\x1b\[31m00x.* and 10 more; name') as caught:
         open_recording(path)
     assert str(caught.value).isprintable()
@@ -211,7 +212,7 @@ def driver_bag(path, *topics, metadata=None):
             elif kind == 'celsius':
                 bag.write_temperature(topic, stamp_ns, np.full(5, 20.0))
             elif kind == 'flag':
-                bag.write_bool(topic, stamp_ns, np.ones(5, bool))
+                bag.write_raw(topic, BOOL, stamp_ns, [b''] * 5)
             else:
                 bag.write_counts(topic, stamp_ns, np.ones((5, 3)))
     return path

@@ -20,7 +20,7 @@ from thermo_comp.errors import OutputError, RecordingError
 from thermo_comp.recording.blocks import ImuColumns
 from thermo_comp.recording.reader import open_recording, read_recording
 from thermo_comp.recording.writer import BagWriter
-from thermo_comp.topics import FLAGS, STAMPED
+from thermo_comp.topics import BOOL, FLAGS, STAMPED
 
 STEP_NS = 2_500_000
 
@@ -55,7 +55,8 @@ def test_rosbags_and_mcap_read_the_written_messages(
                 bag.write_counts(ACCEL, stamp_ns, linear, frame_id, log_ns)
                 bag.write_temperature(BOARD, stamp_ns, linear[:, 0], log_ns)
                 bag.write_imu(IMU_IN, stamp_ns, linear, covariance, frame_id, imu, log_ns)
-                bag.write_bool('regime/dynamic', log_ns, linear[:, 0] > 0)
+                flags = [b'\0\1\0\0' + bytes([x > 0]) for x in linear[:, 0].tolist()]
+                bag.write_raw('regime/dynamic', BOOL, log_ns, flags)
                 bag.write_raw('diagnostics', 'std_msgs/msg/String', log_ns, raw)
                 bag.flush()
                 numbers = {
@@ -69,7 +70,6 @@ def test_rosbags_and_mcap_read_the_written_messages(
                         log_ns.tolist(), stamp_ns.tolist(), numbers[topic].tolist(), strict=True
                     )
                 ]
-                flags = [b'\0\1\0\0' + bytes([x > 0]) for x in linear[:, 0].tolist()]
                 for topic, content in (('/regime/dynamic', flags), ('/diagnostics', raw)):
                     group += [(int(log), topic, c) for log, c in zip(log_ns, content, strict=True)]
                 # A flush writes messages in order of log time, then of the calls.
@@ -160,7 +160,7 @@ def test_a_raw_message_needs_a_definition(tmp_path):
             bag.write_raw('x', 'a/msg/B', [1], [b'\0\1\0\0\7'])
         bag.write_raw('x', 'a/msg/B', [1], [b'\0\1\0\0\7'], ('ros2msg', 'uint8 data\n'))
         with pytest.raises(RecordingError, match='/x: already written with another type than std'):
-            bag.write_bool('x', [1], [True])
+            bag.write_raw('x', BOOL, [1], [b''])
     with AnyReader([tmp_path / 'bag.mcap']) as reader:
         ((connection, _, data),) = reader.messages()
         assert reader.deserialize(data, connection.msgtype).data == 7
@@ -230,13 +230,12 @@ def test_arguments_of_wrong_shape_or_type_are_refused(tmp_path):
             (bag.write_temperature, ([1], [1.0, 2.0]), r'`celsius` .* \(1, 1\), got \(2, 1\)'),
             (bag.write_imu, ([1], [[1.0, 2.0]], np.zeros(9)), '`linear_acceleration` must have'),
             (bag.write_imu, ([1], xyz, np.zeros((1, 3))), 'acceleration_covariance` must have'),
-            (bag.write_bool, ([1], [True, False]), '`log_ns` must have 2 values, got 1'),
             (bag.write_raw, ('std_msgs/msg/Bool', [1, 2], [b'']), '`log_ns` .* 1 values, got 2'),
         ):
             with pytest.raises(ValueError, match=reason):
                 write('a', *given)
     with pytest.raises(RecordingError, match='the bag is closed'):
-        bag.write_bool('a', [1], [True])
+        bag.write_raw('a', BOOL, [1], [b''])
 
 
 @pytest.mark.parametrize('name', ['bag', 'bag.mcap'])
@@ -244,7 +243,7 @@ def test_regime_topics_of_a_bag_have_the_qos_of_the_node(tmp_path, name):
     # WHY: a bag of `replay` had `regime/stamped` as volatile, so on playing the bag a subscriber
     # that joined later got no regime.
     with BagWriter(tmp_path / name) as bag:
-        bag.write_bool('imu0/regime/dynamic', [1], [True])
+        bag.write_raw('imu0/regime/dynamic', BOOL, [1], [b''])
         for topic in ('imu0/regime/stamped', '/diagnostics'):
             bag.write_raw(topic, STAMPED.type, [1], [FLAGS[STAMPED](1, True, 'T-1')])
     path = tmp_path / name / 'bag_0.mcap' if name == 'bag' else tmp_path / name

@@ -9,7 +9,7 @@ import tracemalloc
 import numpy as np
 import pytest
 from builders import calibration, equal_axes, rich_calibration
-from recording_helpers import OTHER, Message, regular_messages, write_rosbag1
+from recording_helpers import BOOL, OTHER, Message, regular_messages, write_rosbag1
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 
@@ -239,8 +239,10 @@ def test_the_option_all_topics_copies_every_topic(tmp_path, storage):
                 writer.write_raw(name, reader.info.topics[name][0], raw.log_ns, raw)
         definition = ('ros2msg', 'string data')
         writer.write_raw('odd', 'odd_msgs/msg/Odd', stamps, messages, definition)
-        writer.write_bool('gps/ok', stamps, np.arange(len(stamps)) % 2)
-        writer.write_bool(IMU_OUT.name, stamps, np.zeros(len(stamps)))
+        writer.write_raw(
+            'gps/ok', BOOL, stamps, [bytes((0, 1, 0, 0, k % 2)) for k in range(len(stamps))]
+        )
+        writer.write_raw(IMU_OUT.name, BOOL, stamps, [bytes((0, 1, 0, 0, 0))] * len(stamps))
     bag = mcap
     if storage == 'sqlite3':
         bag = tmp_path / 'sqlite'

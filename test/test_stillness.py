@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders import source_of
-from position_helpers import GRAVITY, MG, START_NS, Imu, ImuBlock, Rest
+from builders import ArrayBlock, source_of
+from position_helpers import GRAVITY, MG, START_NS, Imu, Rest
 from scipy.signal import lfilter
 
 from thermo_comp.errors import FitError
@@ -22,7 +22,7 @@ OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2')
 
 def source(accel, gyro=None):
     stamps = START_NS + np.rint(np.arange(len(accel)) * 1e9 / RATE_HZ).astype(np.int64)
-    block = ImuBlock(stamps, accel, imu=None if gyro is None else Imu(gyro))
+    block = ArrayBlock(stamps, accel, imu=None if gyro is None else Imu(gyro))
     return FitSource('log', lambda: [block])
 
 

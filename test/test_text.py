@@ -98,7 +98,7 @@ def forged(tmp_path):
     with BagWriter(path, metadata={'serial': FORGED, 'converted_from': FORGED}) as bag:
         bag.write_counts('accel/counts', stamps, np.full((60, 3), 100.0))
         bag.write_temperature('temperature/board', stamps, np.full(60, 20.0))
-        bag.write_bool(FORGED, stamps, np.zeros(60, bool))
+        bag.write_raw(FORGED, 'std_msgs/msg/Bool', stamps, [b''] * 60)
     return path
 
 

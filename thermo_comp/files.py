@@ -46,7 +46,6 @@ class Kind:
                     return f'it holds {entry.name}, which belongs to no bag'
             is_whole = not entries or (path / _INDEX).is_file()
             return '' if is_whole else f'it is no bag: it has no {_INDEX}'
-        head = b''
         if path.is_file():
             with path.open('rb') as file:
                 head = file.read(_HEAD_BYTES)
@@ -103,21 +102,15 @@ def read_bounded(path: str | Path, limit: int, within: Path | None = None) -> by
     PermissionError if it lies outside `within`, OSError if it is missing or not a regular file.
     """
     with open_regular(path) as file:
-        # Check the path of the opened file: a link could be exchanged between a check and the
-        # opening.
-        if within is not None and not _opened(file).is_relative_to(within):
+        # Check the opened file: a link could be exchanged between a check and the opening.
+        opened = Path(f'/proc/self/fd/{file.fileno()}')
+        if within is not None and not opened.readlink().is_relative_to(within):
             raise PermissionError(errno.EPERM, 'outside of its folder', str(path))
-        size = os.fstat(file.fileno()).st_size
-        if size > limit:
-            raise ValueError(f'the file has {size} bytes, at most {limit} are accepted')
         content = file.read(limit + 1)
+        size = os.fstat(file.fileno()).st_size
     if len(content) > limit:
-        raise ValueError(f'the file has more than {limit} bytes, the most that are accepted')
+        raise ValueError(f'the file has {size} bytes, at most {limit} are accepted')
     return content
-
-
-def _opened(file: BinaryIO) -> Path:
-    return Path(f'/proc/self/fd/{file.fileno()}').readlink()
 
 
 def check_output(
@@ -170,7 +163,7 @@ class Draft:
         """Give the output its final name; OutputError if the name exists without `overwrite`."""
         with _output_errors(self._path):
             if self.partial.is_dir():
-                _sync(self.partial)
+                sync(self.partial)
                 self._move_folder()
             elif self._is_replacing:
                 with suppress(FileNotFoundError):
@@ -183,11 +176,10 @@ class Draft:
                 except FileExistsError:
                     raise
                 except OSError:
-                    # On a file system without hard links, such as FAT, the name is reserved before
-                    # the file is moved.
+                    # Without hard links, as on FAT, reserve the name before the file is moved.
                     os.close(os.open(self._target, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
                     self.partial.replace(self._target)
-            _sync(self._target.parent)
+            sync(self._target.parent)
 
     def drop(self) -> None:
         """Remove the incomplete output."""
@@ -219,7 +211,7 @@ def drafted(path: str | Path, kind: Kind, *, overwrite: bool = False) -> Iterato
     try:
         with _output_errors(path):
             yield draft.partial
-            _sync(draft.partial)
+            sync(draft.partial)
         draft.publish()
     except BaseException:
         draft.drop()
@@ -232,7 +224,7 @@ def write_atomically(path: str | Path, data: bytes, kind: Kind, *, overwrite: bo
         partial.write_bytes(data)
 
 
-def _sync(path: Path) -> None:
+def sync(path: Path) -> None:
     """Flush the content of a file, or the entries of a directory, to disk."""
     handle = os.open(path, os.O_RDONLY)
     try:

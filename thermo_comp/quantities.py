@@ -132,11 +132,9 @@ QUANTITIES: Final[Mapping[str, Bounds]] = MappingProxyType(_PREPARED)
 
 @cache
 def _bounds_of(cls: type) -> dict[str, tuple[Bounds, ...]]:
-    hints = typing.get_type_hints(cls, include_extras=True)
-    notes = {name: getattr(hint, '__metadata__', ()) for name, hint in hints.items()}
     return {
-        name: tuple(note for note in of_key if isinstance(note, Bounds))
-        for name, of_key in notes.items()
+        name: tuple(note for note in getattr(hint, '__metadata__', ()) if isinstance(note, Bounds))
+        for name, hint in typing.get_type_hints(cls, include_extras=True).items()
     }
 
 

@@ -22,8 +22,7 @@ N_NUMBERS = {VECTOR3_STAMPED: 3, IMU: 37, TEMPERATURE: 2}
 
 _ENCAPSULATION = b'\0\1\0\0'
 
-#: Serializes a regime flag, given the stamp of the reading that decides the regime [ns], whether
-#: the regime is dynamic, and the serial of the unit.
+#: Serializes a regime flag: stamp of the deciding reading [ns], whether dynamic, unit's serial.
 PackFlag = Callable[[int, bool, str], bytes]
 
 
@@ -38,16 +37,8 @@ class NodeTopic:
     is_reliable: bool = True
     is_latched: bool = False  # a late subscriber gets the last message (transient local)
 
-    @property
-    def qos(self) -> str:
-        """Return the QoS as text for the reference page."""
-        words = ['reliable' if self.is_reliable else 'best effort']
-        words += ['transient local'] * self.is_latched
-        return ', '.join([*words, f'keep last {self.depth}'])
-
 
 def _bool_flag(_stamp_ns: int, is_dynamic: bool, _serial: str) -> bytes:
-    """Serialize a std_msgs/Bool."""
     return _ENCAPSULATION + bytes([is_dynamic])
 
 
@@ -55,14 +46,12 @@ def _stamped_flag(stamp_ns: int, is_dynamic: bool, serial: str) -> bytes:
     """Serialize the regime as a DiagnosticArray with the stamp of the deciding reading."""
     status = b''
     for text in ('regime', 'dynamic' if is_dynamic else 'static', serial):
-        # In CDR the level of a status is one byte, and the length of a text is aligned to four
-        # bytes.
+        # In CDR the level of a status is one byte; the length of a text is aligned to 4 bytes.
         status += bytes(-(1 + len(status)) % 4) + pack('<I', len(text.encode()) + 1)
         status += text.encode() + b'\0'
     status += bytes(-(1 + len(status)) % 4) + pack('<I', 0)  # the status has no key-value pairs
     sec, nanosec = divmod(stamp_ns, 1_000_000_000)
-    # Fields of the header: stamp, length of the empty frame_id with its NUL, padding, number of
-    # status, level.
+    # Stamp, length of the empty frame_id with its NUL, padding, number of status, level.
     head = pack('<iII4xIb', sec, nanosec, 1, 1, 0)
     return _ENCAPSULATION + head + status
 
@@ -108,11 +97,9 @@ STAMPED = NodeTopic(
 )
 STATUS = NodeTopic('/diagnostics', DIAGNOSTICS, '1 Hz; hardware_id = serial of the unit', 10)
 
-#: `SAMPLES`: topics of the samples, by the value of the parameter `input`; `INPUTS`: topics of all
-#: inputs, by their names in `Topics`.
+#: Topics of the samples by the value of the parameter `input`; all inputs by names in `Topics`.
 SAMPLES = {'counts': COUNTS, 'imu': IMU_IN}
 INPUTS = {**SAMPLES, 'board': BOARD, 'case': CASE}
-#: `FLAGS`: topics of the regime flags with their serializers; `OUTPUTS`: all topics that `replay`
-#: writes.
+#: Topics of the regime flags with their serializers; all topics that `replay` writes.
 FLAGS: dict[NodeTopic, PackFlag] = {REGIME: _bool_flag, STAMPED: _stamped_flag}
 OUTPUTS = (IMU_OUT, *FLAGS)

@@ -45,16 +45,15 @@ T = TypeVar('T')
 
 
 class _Correction(NamedTuple):
-    """A parameter that is 1 while the autopilot corrects thermal drift; times of its values."""
+    """A parameter that is 1 while the autopilot corrects thermal drift."""
 
     parameter: str
-    since_ns: Sequence[int]
-    values: Sequence[float]
+    course: Sequence[tuple[int, float]]  # times since boot [ns] and the values from then on
     advice: str
 
 
-#: Content of a log: IMUs, barometers and the thermal corrections of the IMUs, by instance number.
-_Held = tuple[Mapping[int, ForeignLog], Mapping[int, Readings], Mapping[int, _Correction]]
+#: Content of a log: IMUs with their thermal corrections, and barometers, by instance number.
+_Held = tuple[Mapping[int, tuple[ForeignLog, _Correction | None]], Mapping[int, Readings]]
 _Columns = dict[str, npt.NDArray[Any]]
 
 _CENTURY_US = 100 * 366 * 86400 * 10**6
@@ -71,20 +70,16 @@ _VECTORS = ('AccX', 'AccY', 'AccZ', 'GyrX', 'GyrY', 'GyrZ')
 def read_autopilot(
     path: Path, imu: int | None = None, baro: int | None = None, allow_compensated: bool = False
 ) -> ForeignLog:
-    """
-    Read an IMU and a barometer of a PX4 (``.ulg``) or ArduPilot log, by default those with the
-    lowest numbers. ArduPilot's IMUs are counted from 0: the old type ``IMU2`` has the number 1.
-    """
+    """Read an IMU and a barometer, by default those with the lowest numbers, counted from 0."""
     read = _ulog if path.suffix.lower() == '.ulg' else _dataflash
     try:
         # Ignore overflows of integer conversions: `_stamps` finds impossible time stamps.
         with np.errstate(invalid='ignore', over='ignore'):
-            imus, baros, compensated = read(path)
+            imus, baros = read(path)
     except (ArithmeticError, LookupError, TypeError, ValueError) as failure:
         # The messages of a damaged file do not have the declared formats.
-        raise RecordingError(f'damaged: {failure}', path=path) from failure
-    rows = _instance(imus, imu, 'IMU', path)
-    correction = compensated.get(min(imus, default=0) if imu is None else imu)
+        raise RecordingError(f'damaged: {failure}') from failure
+    rows, correction = _instance(imus, imu, 'IMU')
     if correction and not allow_compensated:
         rows = _uncorrected(rows, correction)
     stamped = rows.stamp_ns != NO_STAMP
@@ -92,15 +87,14 @@ def read_autopilot(
     if still.noise <= _NO_NOISE * still.magnitude:
         raise RecordingError(
             'the accelerometer at rest has no noise at all: this is a log of a simulator (SITL), '
-            'which cannot calibrate a real sensor',
-            path=path,
+            'which cannot calibrate a real sensor'
         )
     heard = {number: _reported(readings) for number, readings in baros.items()}
     if baro is None:
         heard = {number: readings for number, readings in heard.items() if len(readings.celsius)}
     readings = [_reported(temperature) for temperature in rows.temperatures.values()]
     if heard or baro is not None:
-        readings.append(_instance(heard, baro, 'barometer', path))
+        readings.append(_instance(heard, baro, 'barometer'))
     thinned = (thermometer.thinned() for thermometer in readings if len(thermometer.celsius))
     named = zip(('board', 'case'), thinned, strict=False)
     return replace(rows, temperatures=dict(named))
@@ -108,31 +102,25 @@ def read_autopilot(
 
 def _uncorrected(rows: ForeignLog, correction: _Correction) -> ForeignLog:
     """Drop samples that the autopilot has corrected; RecordingError if no sample is left."""
-    name, since_ns, values, advice = correction
+    name, course, advice = correction
+    since_ns, values = zip(*course, strict=True)
     at = np.searchsorted(np.array(since_ns, np.int64), rows.stamp_ns, 'right') - 1
     is_corrected = np.array(values)[np.maximum(at, 0)] == 1.0
     reason = 'the autopilot has already corrected the thermal drift of these samples'
     if is_corrected.all():
         raise RecordingError(
-            f'{name} was 1: {reason}; {advice}; or accept these samples with --allow-compensated',
-            path=rows.path,
+            f'{name} was 1: {reason}; {advice}; or accept these samples with --allow-compensated'
         )
     if not is_corrected.any():
         return rows
     share = 100.0 * float(is_corrected.mean())
-    kept = ~is_corrected
-    return replace(
-        rows,
-        stamp_ns=rows.stamp_ns[kept],
-        accel=rows.accel[kept],
-        gyro=None if rows.gyro is None else rows.gyro[kept],
-        chosen=f'{name} was 1 for {share:.0f} % of the samples, which are left out: {reason}',
-    )
+    chosen = f'{name} was 1 for {share:.0f} % of the samples, which are left out: {reason}'
+    return replace(rows.take(~is_corrected), chosen=chosen)
 
 
 def _ulog(path: Path) -> _Held:
     with open_regular(path) as file:
-        log = _read('pyulog', 'ULog', 'px4', 'a ULog file', path, file, list(_TOPICS))
+        log = _read('pyulog', 'ULog', 'px4', 'a ULog file', file, list(_TOPICS))
     by_topic: dict[str, dict[int, _Columns]] = {topic: {} for topic in _TOPICS}
     for data in log.data_list:
         if len(data.data.get('timestamp', ())):  # in a damaged file the time stamps may be missing
@@ -142,11 +130,10 @@ def _ulog(path: Path) -> _Held:
         for topic, name in _BAROMETERS.items()
         for number, columns in by_topic[topic].items()
     }
-    metadata = {}
-    if log.file_corruption:
-        metadata['px4_corruption'] = 'parts of the file could not be read'
+    notes = {'px4_corruption': 'parts of the file could not be read'}
+    metadata = notes if log.file_corruption else {}
     accels, gyros, hint = by_topic['sensor_accel'], by_topic['sensor_gyro'], ''
-    compensated: dict[int, _Correction] = {}
+    correction = None
     if not accels:
         both = {number: _combined(pair) for number, pair in by_topic['sensor_combined'].items()}
         accels, gyros = ({number: pair[part] for number, pair in both.items()} for part in (0, 1))
@@ -155,19 +142,16 @@ def _ulog(path: Path) -> _Held:
             f'corrected by CAL_ACC*; to record raw samples, {_PROFILE}'
         )
         name = 'TC_A_ENABLE'
-        changes = [parameter for parameter in log.changed_parameters if parameter[1] == name]
-        correction = _Correction(
-            name,
-            [0, *(int(change[0]) * 1000 for change in changes)],
-            [float(log.initial_parameters.get(name, 0)), *(float(row[2]) for row in changes)],
-            f'the log has only sensor_combined: {_PROFILE}',
-        )
-        compensated = dict.fromkeys(accels, correction)
+        course = [(0, float(log.initial_parameters.get(name, 0)))]
+        course += [
+            (int(at) * 1000, float(x)) for at, key, x in log.changed_parameters if key == name
+        ]
+        correction = _Correction(name, course, f'the log has only sensor_combined: {_PROFILE}')
     imus = {}
     for number, columns in accels.items():
         stamp_ns = _stamps(columns)
         is_slow = len(stamp_ns) > 1 and np.median(np.diff(stamp_ns[:100])) > 1e9 / SLOW_HZ
-        imus[number] = ForeignLog(
+        rows = ForeignLog(
             str(path),
             stamp_ns,
             _vectors(columns, _AXES),
@@ -177,7 +161,8 @@ def _ulog(path: Path) -> _Held:
             metadata=metadata,
             hint=hint or (_PROFILE if is_slow else ''),
         )
-    return imus, baros, compensated
+        imus[number] = rows, correction
+    return imus, baros
 
 
 def _combined(columns: _Columns) -> list[_Columns]:
@@ -218,8 +203,7 @@ def _matched(stamp_ns: Ints, columns: _Columns | None) -> Floats | None:
     gyro_ns, gyro = _stamps(columns), _vectors(columns, _AXES)
     use = gyro_ns != NO_STAMP
     gyro_ns, gyro = gyro_ns[use], gyro[use]
-    is_sparse = not len(gyro_ns) or 2 * len(gyro_ns) < len(stamp_ns)
-    if is_sparse or not np.isfinite(gyro).all():
+    if len(gyro_ns) < max(len(stamp_ns) / 2, 1) or not np.isfinite(gyro).all():
         return None
     at, where = (stamp_ns - stamp_ns[0]) * 1e-9, (gyro_ns - stamp_ns[0]) * 1e-9
     return np.column_stack([np.interp(at, where, gyro[:, i]) for i in range(3)])
@@ -230,29 +214,28 @@ def _dataflash(path: Path) -> _Held:
         magic = file.read(2)
     if magic != b'\xa3\x95':
         raise RecordingError(
-            'not a DataFlash log of ArduPilot: it does not begin with the bytes a3 95', path=path
+            'not a DataFlash log of ArduPilot: it does not begin with the bytes a3 95'
         )
     reader = _read(
-        'pymavlink.DFReader', 'DFReader_binary', 'ardupilot', 'a DataFlash log', path, str(path)
+        'pymavlink.DFReader', 'DFReader_binary', 'ardupilot', 'a DataFlash log', str(path)
     )
     imus: dict[int, ForeignLog] = {}
     baros: dict[int, Readings] = {}
-    metadata = {}
+    notes = {'ardupilot_simulated': 'the log has SIM_ parameters: a simulator wrote it'}
+    metadata = notes if any(str(key).startswith('SIM_') for key in reader.params) else {}
     changes: dict[str, list[tuple[int, float]]] = {}
-    if any(str(key).startswith('SIM_') for key in reader.params):
-        metadata['ardupilot_simulated'] = 'the log has SIM_ parameters: a simulator wrote it'
     try:
         for name in sorted(reader.name_to_id):
             if not re.fullmatch(r'IMU\d?|BARO|BAR\d|PARM', name):
                 continue
-            table, n_short = _messages(reader, name, path)
+            table, n_short = _messages(reader, name)
             stamp_us = table.get('TimeUS', table.get('TimeMS', np.empty(0)) * 1000.0)
             if name == 'PARM' and table.keys() >= {'Name', 'Value'}:
                 for at, label, value in zip(stamp_us, table['Name'], table['Value'], strict=False):
                     title = label.decode('ascii', 'replace')
                     changes.setdefault(title, []).append((int(at) * 1000, float(value)))
                 continue
-            old = int(name[-1]) - 1 if name[-1].isdigit() else 0
+            old = int(name[-1]) - 1 if name[-1].isdigit() else 0  # `IMU2` has the number 1
             table |= {'timestamp': stamp_us, 'I': table.get('I', np.full(len(stamp_us), old))}
             for number in np.unique(table['I'][: len(stamp_us)]).tolist():
                 columns = {title: column[table['I'] == number] for title, column in table.items()}
@@ -272,29 +255,25 @@ def _dataflash(path: Path) -> _Held:
                     )
     finally:
         reader.close()
-    compensated = {}
-    for number in imus:
+    held = {}
+    for number, rows in imus.items():
         name = f'INS_TCAL{number + 1}_ENABLE'
         course = changes.get(name) or [(0, float(reader.params.get(name, 0.0)))]
-        since_ns, values = zip(*course, strict=True)
-        advice = f'set {name} to 0 and record again'
-        compensated[number] = _Correction(name, since_ns, values, advice)
-    return imus, baros, compensated
+        held[number] = rows, _Correction(name, course, f'set {name} to 0 and record again')
+    return held, baros
 
 
-def _messages(reader: Any, name: str, path: Path) -> tuple[_Columns, int]:
+def _messages(reader: Any, name: str) -> tuple[_Columns, int]:
     """Return the columns of a message type, and the number of its truncated messages."""
     number = reader.name_to_id[name]
     layout = reader.formats[number]
     codes = re.findall(r'(\d*)([a-zA-Z])', layout.msg_struct)  # type codes of module `struct`
     kinds = [f'S{size or 1}' if code == 's' else f'<{code}' for size, code in codes]
     if len({*layout.columns}) < len(layout.columns):
-        raise RecordingError(f'damaged: the format of {name} has a column twice', path=path)
+        raise RecordingError(f'damaged: the format of {name} has a column twice')
     kind = np.dtype(list(zip(layout.columns, kinds, strict=False)))
     if _HEADER_BYTES + kind.itemsize > layout.len:
-        raise RecordingError(
-            f'damaged: the format of {name} is longer than its stated length', path=path
-        )
+        raise RecordingError(f'damaged: the format of {name} is longer than its stated length')
     offsets = reader.offsets[number]
     begins = [at + _HEADER_BYTES for at in offsets if at + layout.len <= reader.data_len]
     content = b''.join(reader.data_map[at : at + kind.itemsize] for at in begins)
@@ -306,24 +285,24 @@ def _messages(reader: Any, name: str, path: Path) -> tuple[_Columns, int]:
     return columns, len(offsets) - len(begins)
 
 
-def _read(module: str, name: str, extra: str, what: str, path: Path, *arguments: Any) -> Any:
+def _read(module: str, name: str, extra: str, what: str, *arguments: Any) -> Any:
     """Read a file with class `name` of a library that is an optional dependency."""
-    read = getattr(import_extra(module, extra, what, path), name)
+    read = getattr(import_extra(module, extra, what), name)
     with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
         # On damaged files the libraries raise any type of exception.
         try:
             return read(*arguments)
         except Exception as failure:
-            raise RecordingError(f'not {what} ({failure})', path=path) from failure
+            raise RecordingError(f'not {what} ({failure})') from failure
 
 
-def _instance(present: Mapping[int, T], wanted: int | None, what: str, path: Path) -> T:
+def _instance(present: Mapping[int, T], wanted: int | None, what: str) -> T:
     if not present:
-        raise RecordingError(f'the log holds no {what}', path=path)
+        raise RecordingError(f'the log holds no {what}')
     number = min(present) if wanted is None else wanted
     if number not in present:
         numbers = ', '.join(map(str, sorted(present)))
-        raise RecordingError(f'the log holds no {what} {number}; there are: {numbers}', path=path)
+        raise RecordingError(f'the log holds no {what} {number}; there are: {numbers}')
     return present[number]
 
 

@@ -9,20 +9,16 @@ the Imu; as case thermometer, that nearer to a barometer than to the Imu, or els
 """
 
 from pathlib import Path, PurePosixPath
-from typing import Literal
 
 import numpy as np
 
 from ..errors import RecordingError
-from ..recording.chunks import translated
 from ..recording.reader import inspect_recording, read_recording
-from ..recording.topics import Present, Topics, choice_note
+from ..recording.topics import Present, Topics, choice_note, of_kind
 from ..topics import IMU, TEMPERATURE
-from .log import ForeignLog
+from .log import ForeignLog, Unit
 
 _PRESSURE = 'sensor_msgs/msg/FluidPressure'
-
-Unit = Literal['m/s^2', 'g', 'mg']
 
 
 def bag_log(
@@ -34,8 +30,7 @@ def bag_log(
 ) -> ForeignLog:
     """Read a bag; search for the topics given as None; `unit`: unit of the Imu's acceleration."""
     present = inspect_recording(path).topics
-    with translated(path):
-        inputs = find_topics(present, imu, board, case)
+    inputs = find_topics(present, imu, board, case)
     chosen = []
     for (role, name), given in zip(inputs.items(), (imu, board, case), strict=True):
         among = 'only' if role == 'imu' else 'nearest'
@@ -68,7 +63,7 @@ def find_topics(
     present: Present, imu: str | None, board: str | None, case: str | None
 ) -> dict[str, str | None]:
     """Find the topics of ``imu``, ``board`` and ``case``; None for a missing thermometer."""
-    imu = imu or _most(_of_type(present, IMU), 'Imu')
+    imu = imu or _most(of_kind(present, IMU), 'Imu')
     if imu is None:
         raise RecordingError(
             'the bag holds no sensor_msgs/msg/Imu, which convert needs; a bag with accel/counts '
@@ -76,10 +71,10 @@ def find_topics(
         )
 
     def free() -> list[str]:
-        return [name for name in _of_type(present, TEMPERATURE) if name not in (board, case)]
+        return [name for name in of_kind(present, TEMPERATURE) if name not in (board, case)]
 
     if case is None:
-        baros = _of_type(present, _PRESSURE)
+        baros = of_kind(present, _PRESSURE)
         nearer = [name for name in free() if _shared(name, baros) > _shared(name, [imu])]
         case = _most(nearer, 'case')
     if board is None:
@@ -87,10 +82,6 @@ def find_topics(
         board = _most([topic for topic in free() if _shared(topic, [imu]) == beside], 'board')
     case = case or _most(free(), 'case')
     return {'imu': imu, 'board': board, 'case': case}
-
-
-def _of_type(present: Present, kind: str) -> list[str]:
-    return sorted(name for name, (type_, count) in present.items() if type_ == kind and count)
 
 
 def _shared(name: str, others: list[str]) -> int:
@@ -104,7 +95,7 @@ def _shared(name: str, others: list[str]) -> int:
 def _most(names: list[str], what: str) -> str | None:
     if len(names) > 1:
         raise RecordingError(
-            f'several topics may be the {what}: {", ".join(names)}; choose one with '
+            f'several topics may be the {what}: {", ".join(sorted(names))}; choose one with '
             f'--topic {what.lower()}=TOPIC'
         )
     return names[0] if names else None

@@ -24,11 +24,9 @@ from ..recording.blocks import Readings
 from ..recording.topics import is_thermometer
 from ..typing import Floats, Ints
 from ..unit.schema import SchemaError, build
-from .headings import Headings, read_headings
+from .headings import Column, Headings, Triple, read_headings
 from .log import NO_STAMP, PLAUSIBLE_CELSIUS, ForeignLog, Unit, find_stillness, infer_unit
-from .table import STAMP_EXPONENTS, Column, Format, Stamp, Table, TimeUnit, read_parquet, read_text
-
-Triple = tuple[Column, Column, Column]
+from .table import STAMP_EXPONENTS, Format, Stamp, Table, TimeUnit, read_parquet, read_text
 
 #: Slope and offset that convert a temperature of each unit to degC.
 _CELSIUS = {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}
@@ -48,10 +46,10 @@ _FASTEST_K_S = 0.5
 # sensors in a column alternate from row to row, so these numbers change in a larger share of rows.
 _FEW_CHANGES = 0.1
 _RISING = 0.7  # smallest share of rows with a later time than that of the row before
-#: A step from the uppermost to the lowest tenth of a counter's range is an overflow.
+#: A step from the uppermost to the lowest tenth of the range of a 32-bit counter of time, such as
+#: Arduino's micros(), is an overflow (after 71.6 min).
 _WRAP_EDGE = 0.1
 _A_MAP = 'a column map: --columns MAP'
-_GIVE_MAP = f'give {_A_MAP}'
 
 
 @dataclass(frozen=True)
@@ -167,7 +165,7 @@ def table_log(path: Path, columns: ColumnMap) -> ForeignLog:
     thermometers |= {thermometer.name: thermometer for thermometer in columns.further}
     used = {name: column for name, column in thermometers.items() if column is not None}
     wanted = [*accel.columns, *(gyro.columns if gyro else ()), *(t.column for t in used.values())]
-    table = _read(path, list(dict.fromkeys(wanted)), columns.stamp, columns.format)
+    table = _read(path, wanted, columns.stamp, columns.format)
     stamp_ns, continued = _without_wraps(table, columns.stamp.unit)
     known = stamp_ns != NO_STAMP
     temperatures = {}
@@ -200,10 +198,7 @@ def table_log(path: Path, columns: ColumnMap) -> ForeignLog:
 
 
 def _without_wraps(table: Table, unit: TimeUnit | None) -> tuple[Ints, tuple[int, ...]]:
-    """
-    Continue the times of a 32-bit counter that overflows, as Arduino's micros() does after
-    71.6 min; return the stamps, and the numbers of the lines that come first after an overflow.
-    """
+    """Continue 32-bit times after an overflow; return stamps, and lines just after overflows."""
     stamp_ns, rows = table.stamp_ns.copy(), np.flatnonzero(table.stamp_ns != NO_STAMP)
     if unit not in ('ms', 'us') or not len(rows):
         return stamp_ns, ()
@@ -237,12 +232,12 @@ def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
     if table.headings:
         named = read_headings(table.headings, is_plausible)
     else:
-        named = _unnamed(path, len(table.values))
+        named = _unnamed(len(table.values))
     if named is None or (named.time is None and rate_hz is None):
         lacks, instead = ('accelerometer', '') if named is None else ('time', '--rate-hz, or ')
         listed = ', '.join(map(repr, table.headings[:20]))
         problem = f'its headings name no {lacks}: {listed}' if listed else 'the table has no times'
-        raise RecordingError(f'{problem}; give {instead}{_A_MAP}', path=path)
+        raise RecordingError(f'{problem}; give {instead}{_A_MAP}')
     accel = values(named.accel)
     unit = named.accel_unit
     if not unit:
@@ -251,8 +246,7 @@ def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
         unit, reason = infer_unit(still.magnitude)
         if unit == 'unknown':
             raise RecordingError(
-                f'the unit of the accelerometer cannot be guessed, {reason}: {_GIVE_MAP}',
-                path=path,
+                f'the unit of the accelerometer cannot be guessed, {reason}: give {_A_MAP}'
             )
     gyro = None
     if named.gyro is not None and unit != 'counts':
@@ -266,24 +260,20 @@ def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
     }
     times = None if named.time is None else values([named.time])[:, 0]
     span = max((_span(values([item.column])) for item in thermometers.values()), default=0.0)
-    return ColumnMap(
-        _stamp(path, named, times, rate_hz, accel, span),
-        build(Accel, {'columns': list(named.accel), 'unit': unit, 'output': output}),
-        thermometers.pop('board', None),
-        thermometers.pop('case', None),
-        tuple(Further(item.column, item.unit, name=name) for name, item in thermometers.items()),
-        gyro,
-        None if table.headings else Format(header=False),
-    )
+    stamp = _stamp(named, times, rate_hz, accel, span)
+    triad = build(Accel, {'columns': list(named.accel), 'unit': unit, 'output': output})
+    board, case = thermometers.pop('board', None), thermometers.pop('case', None)
+    further = (Further(item.column, item.unit, name=name) for name, item in thermometers.items())
+    style = None if table.headings else Format(header=False)
+    return ColumnMap(stamp, triad, board, case, tuple(further), gyro, style)
 
 
-def _unnamed(path: Path, width: int) -> Headings:
+def _unnamed(width: int) -> Headings:
     """Return the columns ``[t] ax ay az [wx wy wz]``, by their numbers."""
     if width not in (3, 4, 6, 7):
         raise RecordingError(
             f'{width} columns without headings cannot be identified, only 3, 4, 6 or 7 columns '
-            f'[t] ax ay az [wx wy wz]: {_GIVE_MAP}',
-            path=path,
+            f'[t] ax ay az [wx wy wz]: give {_A_MAP}'
         )
     x = int(width in (4, 7))
     gyro = (x + 3, x + 4, x + 5) if width > 4 else None
@@ -301,10 +291,7 @@ def column_map_text(columns: ColumnMap) -> str:
 
 
 def _reads_temperature(values: Floats, unit: str) -> bool:
-    """
-    Whether the values of a column can be temperatures: most values are in the plausible range.
-    Whole numbers, which may number boards or tests, must change, but in under 10 % of rows.
-    """
+    """Whether the values of a column can be temperatures in a unit of `_CELSIUS`."""
     slope, offset = _CELSIUS[unit]
     celsius = values[np.isfinite(values)] * slope + offset
     if not len(celsius):
@@ -317,27 +304,19 @@ def _reads_temperature(values: Floats, unit: str) -> bool:
 
 
 def _span(values: Floats) -> float:
-    """Return the range of a column's values without the lowest and highest 2 %."""
     low, high = np.nanquantile(values, (0.02, 0.98)) if np.isfinite(values).any() else (0.0, 0.0)
     return float(high - low)
 
 
 def _stamp(
-    path: Path,
-    named: Headings,
-    times: Floats | None,
-    rate_hz: float | None,
-    accel: Floats,
-    span: float,
+    named: Headings, times: Floats | None, rate_hz: float | None, accel: Floats, span: float
 ) -> Stamp:
     """Guess the unit of times by heading, or size and interval; `span`: temperature range [K]."""
     if times is None:
         return Stamp(rate_hz=rate_hz)
+    column = f'its column {named.time!r}'
     if rate_hz is not None:
-        raise RecordingError(
-            f'its column {named.time!r} has the times of the samples: leave out --rate-hz',
-            path=path,
-        )
+        raise RecordingError(f'{column} has the times of the samples: leave out --rate-hz')
     times = times[np.isfinite(times)]
     if not len(times):
         return Stamp(named.time, 'iso')
@@ -345,40 +324,32 @@ def _stamp(
         return build(Stamp, {'column': named.time, 'unit': named.time_unit})
     if named.time_unit:
         raise RecordingError(
-            f'its column {named.time!r} is in {named.time_unit}: the times must be in s, ms, us '
-            'or ns, or dates',
-            path=path,
+            f'{column} is in {named.time_unit}: the times must be in s, ms, us or ns, or dates'
         )
     steps = np.diff(times)
-    if len(steps) and (steps > 0.0).mean() > _RISING and (steps >= 0.0).mean() > 0.9:
-        step, first = float(np.median(steps[steps > 0.0])), float(times[0])
-        # Shortest possible duration of the log [s]: temperatures change by `_FASTEST_K_S` at most.
-        shortest_s = span / _FASTEST_K_S
-        longest = _SLOW_S if _turns_at_once(accel) else _STEPS_S[1]
-        # Take the largest unit that gives a plausible interval between samples (5 ms, not 5 s).
-        for unit, exponent in STAMP_EXPONENTS.items():
-            size = 10.0 ** (exponent - 9)
-            begin, step_s = first * size, step * size
-            is_date = _SINCE_1970_S[0] <= begin < _SINCE_1970_S[1] and step_s < _SINCE_1970_STEP_S
-            is_next_too_short = step_s * len(times) / 1000.0 < shortest_s
-            if is_date or (_STEPS_S[0] < step_s and (step_s < longest or is_next_too_short)):
-                return Stamp(named.time, unit)
-    raise RecordingError(_no_time(named.time, steps), path=path)
-
-
-def _no_time(column: Column | None, steps: Floats) -> str:
-    if len(steps) and (steps > 0.0).mean() <= _RISING and (steps >= 0.0).mean() > 0.9:
-        shown = f'{(steps == 0.0).mean():.0%}'
-        return (
-            f'its column {column!r} has the same time as the row before in {shown} of rows: '
-            f'give {_A_MAP}, with `stamp: {{rate_hz: HZ}}` for samples at a fixed rate'
+    if not len(steps) or (steps >= 0.0).mean() <= 0.9:
+        raise RecordingError(f'{column} is not a rising time: give {_A_MAP}')
+    if (steps > 0.0).mean() <= _RISING:
+        raise RecordingError(
+            f'{column} has the same time as the row before in {(steps == 0.0).mean():.0%} of '
+            f'rows: give {_A_MAP}, with `stamp: {{rate_hz: HZ}}` for samples at a fixed rate'
         )
-    if len(steps) and (steps >= 0.0).mean() > 0.9:
-        return (
-            f'its column {column!r} rises by {np.median(steps):.3g} from row to row, which is no '
-            f'plausible interval of samples in s, ms, us or ns: {_GIVE_MAP}'
-        )
-    return f'its column {column!r} is not a rising time: {_GIVE_MAP}'
+    step, first = float(np.median(steps[steps > 0.0])), float(times[0])
+    # Shortest possible duration of the log [s]: temperatures change by `_FASTEST_K_S` at most.
+    shortest_s = span / _FASTEST_K_S
+    longest = _SLOW_S if _turns_at_once(accel) else _STEPS_S[1]
+    # Take the largest unit that gives a plausible interval between samples (5 ms, not 5 s).
+    for unit, exponent in STAMP_EXPONENTS.items():
+        size = 10.0 ** (exponent - 9)
+        begin, step_s = first * size, step * size
+        is_date = _SINCE_1970_S[0] <= begin < _SINCE_1970_S[1] and step_s < _SINCE_1970_STEP_S
+        is_next_too_short = step_s * len(times) / 1000.0 < shortest_s
+        if is_date or (_STEPS_S[0] < step_s and (step_s < longest or is_next_too_short)):
+            return Stamp(named.time, unit)
+    raise RecordingError(
+        f'{column} rises by {np.median(steps):.3g} from row to row, which is no plausible '
+        f'interval of samples in s, ms, us or ns: give {_A_MAP}'
+    )
 
 
 def _turns_at_once(accel: Floats) -> bool:

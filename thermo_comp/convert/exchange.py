@@ -52,8 +52,7 @@ def export_calibration(
         raise ValueError(f'`up` must be a unit vector, got {up}')
     tool, curves = TOOLS[to], _static_curves(calibration)
     if tool.is_thermal:
-        own_reference_c = calibration.reference_temperature_c
-        reference_c = own_reference_c if tool.reference_c is None else tool.reference_c
+        reference_c = tool.reference_c or calibration.reference_temperature_c
         content = _thermal(calibration, curves, reference_c, up)
         K = ' '.join(f'{factor:.6g}' for factor in curves.K)
         of_counts = (
@@ -64,17 +63,11 @@ def export_calibration(
         content = _constant(calibration, curves)
         of_counts = 'the file corrects samples in counts, as the calibration does, not in m/s^2'
     of_type = 'the calibration is the mean of a type of unit, without the deviations of this unit'
-    notes = [
-        *[of_type] * (calibration.provenance.model == unit.POPULATION),
-        *content.notes,
-        *_losses(calibration),
-        *[of_counts] * (calibration.unit.input == 'counts'),
-    ]
-    noise = (
-        max(calibration.noise_density_m_s2_sqrt_hz),
-        max(calibration.slow_noise_m_s2_sqrt_h),
-        1.0 / calibration.unit.cycle_time_s,
-    )
+    notes = [of_type] * (calibration.provenance.model == unit.POPULATION)
+    notes += [*content.notes, *_losses(calibration)]
+    notes += [of_counts] * (calibration.unit.input == 'counts')
+    white, walk = calibration.noise_density_m_s2_sqrt_hz, calibration.slow_noise_m_s2_sqrt_h
+    noise = max(white), max(walk), 1.0 / calibration.unit.cycle_time_s
     content = replace(content, notes=notes, noise=noise)
     text = tool.write(content, number, device_id)
     title = f'Thermal calibration of unit {calibration.unit.serial}, by thermo_comp'
@@ -157,11 +150,9 @@ def _constant(calibration: Calibration, curves: _Curves) -> Content:
     """Return bias, scale and misalignment at the reference temperature, for a tumble test tool."""
     drift = 'the calibration has no correction for temperature'
     if calibration.needs_temperature:
-        drift = (
-            f'over the calibrated range the bias changes by up to '
-            f'{ug_text(float(np.max(np.abs(curves.bias))))}, the scale by '
-            f'{_millionths(curves.scale_drift)} ppm'
-        )
+        bias = ug_text(float(np.max(np.abs(curves.bias))))
+        drift = f'over the calibrated range the bias changes by up to {bias}, the scale by '
+        drift += f'{_millionths(curves.scale_drift)} ppm'
     reference_c = calibration.reference_temperature_c
     notes = [f'the values of the file hold at {reference_c:g} degC: {drift}']
     notes += ['the bias of the angular rate is lost'] * (calibration.gyroscope is not None)
@@ -211,8 +202,7 @@ def import_calibration(
 ) -> Calibration:
     """
     Read the file of one of `TOOLS`, recognised by its content; both regimes get the same curves.
-    `number` chooses a parameter set or IMU, None takes the only set in use; `full_scale` is in
-    m/s^2.
+    `number` chooses a parameter set or IMU, None the only set in use; `full_scale` is in m/s^2.
     """
     readings = (tool.read(text, number) for tool in TOOLS.values())
     content = next((reading for reading in readings if reading is not None), None)
@@ -245,6 +235,7 @@ def import_calibration(
         rates = RateSet(*map(RateCurve, _curves(content.rate_bias)))
         x, y, z = content.rate_bias[:, 0].tolist()
         gyroscope = Gyroscope((x, y, z), rates, rates, (_RATE_NOISE,) * 3)
+    notes = [*content.notes, *rotation_notes(rotation)]
     levels = zip(K.tolist(), content.bias[:, 0].tolist(), strict=True)
     return Calibration(
         format_version=unit.FORMAT_VERSION,
@@ -256,9 +247,7 @@ def import_calibration(
         dynamic=regime,
         noise_density_m_s2_sqrt_hz=(noise_density,) * 3,
         misalignment=((1.0, 0.0, 0.0), (yx, 1.0, 0.0), (zx, zy, 1.0)),
-        provenance=Provenance(
-            model=content.source, notes=(*content.notes, *rotation_notes(rotation))
-        ),
+        provenance=Provenance(model=content.source, notes=tuple(notes)),
         gyroscope=gyroscope,
     )
 

@@ -40,6 +40,7 @@ _OTHER = re.compile('mag|mfield|orient|euler|quat|angle|lin|free|user|grav|pos|v
 _TEMPERATURE = re.compile(
     'temp|tmp|celsius|(^|_)t_?c($|_)|^t_(board|case|imu|die|chip|sensor|air|amb|room|baro)'
 )
+# Places that are not on the board.
 _OUTSIDE = re.compile('case|air|amb|baro|bmp|aht|room|hous|env')
 # Unit of a temperature at the end of a heading; words in headings that are not of a temperature.
 _DEGREES_END = re.compile('(^|_)(deg_?[cfk]|kelvin|fahrenheit)$')
@@ -65,7 +66,7 @@ _DEGREES = {
 _CELSIUS = ('c', '°c', 'ºc', 'degc', 'deg c', 'celsius')
 
 Column = str | int
-Columns = tuple[Column, Column, Column]
+Triple = tuple[Column, Column, Column]
 
 
 @dataclass(frozen=True)
@@ -74,9 +75,9 @@ class Headings:
 
     time: Column | None
     time_unit: str  # a unit of a column map, or min, h, days
-    accel: Columns
+    accel: Triple
     accel_unit: str
-    gyro: Columns | None
+    gyro: Triple | None
     gyro_unit: str
     thermometers: dict[str, tuple[str, str]]  # column and unit by thermometer
 
@@ -94,24 +95,18 @@ def read_headings(
     times.sort(key=lambda text: _LETTER.search(_plain(text)) is None)
     found = dict(_triads(names))
     triads = {key: three for key, three in found.items() if not _OTHER.search(key)}
-    accel = next((key for key in triads if _ACCEL.search(key)), '' if '' in triads else None)
-    if accel is None:
-        accel = next((key for key in found if _ROS_ACCEL.search(key)), None)
-        triads |= {} if accel is None else {accel: found[accel]}
+    accel = next((three for key, three in triads.items() if _ACCEL.search(key)), triads.get(''))
+    accel = accel or next((three for key, three in found.items() if _ROS_ACCEL.search(key)), None)
     if accel is None:
         return None
-    gyro = next((key for key in triads if _GYRO.search(key)), None)
+    gyro = next((three for key, three in triads.items() if _GYRO.search(key)), None)
     time = times[-1] if times else ''
+    time_unit, accel_unit = _stated(time, _TIMES | _LONG_TIMES), _stated(accel[0], _ACCELS)
+    gyro_unit = _stated(gyro[0], _RATES) if gyro else ''
     taken = {time, *(heading for three in found.values() for heading in three)}
-    return Headings(
-        time or None,
-        _stated(time, _TIMES | _LONG_TIMES),
-        triads[accel],
-        _stated(triads[accel][0], _ACCELS),
-        triads[gyro] if gyro is not None else None,
-        _stated(triads[gyro][0], _RATES) if gyro is not None else '',
-        _thermometers([text for text in headings if text not in taken], names, is_plausible),
-    )
+    free = [heading for heading in headings if heading not in taken]
+    thermometers = _thermometers(free, names, is_plausible)
+    return Headings(time or None, time_unit, accel, accel_unit, gyro, gyro_unit, thermometers)
 
 
 def _thermometers(
@@ -132,17 +127,14 @@ def _thermometers(
         elif _PLACE.fullmatch(name) and is_plausible(heading, unit):
             places.append(heading)
     result: dict[str, tuple[str, str]] = {}
-    for heading in sorted((*warm, *places), key=_is_outside):
-        usual = 'case' if result and (_is_outside(heading) or heading in warm) else 'board'
-        if usual in result and heading in places:
-            continue
-        result[usual if usual not in result else f't{len(result)}'] = heading, units[heading]
+    outside = {heading for heading in headings if _OUTSIDE.search(_plain(heading))}
+    for heading in sorted((*warm, *places), key=outside.__contains__):
+        name = 'case' if result and (heading in outside or heading in warm) else 'board'
+        if name not in result:
+            result[name] = heading, units[heading]
+        elif heading in warm:
+            result[f't{len(result)}'] = heading, units[heading]
     return result
-
-
-def _is_outside(heading: str) -> bool:
-    """Whether the heading of a thermometer names a place that is not on the board."""
-    return _OUTSIDE.search(_plain(heading)) is not None
 
 
 def map_lines(columns: Any) -> list[str]:
@@ -165,9 +157,8 @@ def _is_warm(heading: str) -> bool:
     """Whether a heading names a temperature, by its words or by its unit."""
     unit, name = _UNIT.search(heading), _plain(heading)
     is_unit = unit is not None and unit[1].strip().lower() in {*_DEGREES, *_CELSIUS}
-    if is_unit or _DEGREES_END.search(name):
-        return True
-    return _TEMPERATURE.search(name) is not None and _NO_READING.search(name) is None
+    is_name = _TEMPERATURE.search(name) and not _NO_READING.search(name)
+    return bool(is_unit or _DEGREES_END.search(name) or is_name)
 
 
 def _plain(heading: str) -> str:

@@ -7,7 +7,8 @@ At rest the norm of the specific force is gravity in any attitude. A log whose s
 contradicts gravity is refused: otherwise a factor of 9.8 would remain in the calibration.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
@@ -45,7 +46,8 @@ _MOVING_RATIO = 4.0
 _MERGE_NS = 10 * 10**9  # shortest rest between two separate movements [ns]
 
 NO_STAMP = np.iinfo(np.int64).min  # stands for the stamp of a row without a stamp
-#: Range of plausible temperatures [degC]; readings in kelvins or in raw counts are mostly outside.
+#: Range of plausible temperatures [degC]; readings in kelvins or in raw counts are mostly outside,
+#: as is -127 degC of a DS18B20 without contact.
 PLAUSIBLE_CELSIUS = (-90.0, 200.0)
 _RUN_ROWS = 100_000  # number of rows processed at a time, to limit the memory
 _EXAMPLES = 5  # largest number of line numbers in a `Finding`
@@ -77,6 +79,11 @@ class ForeignLog:
     chosen: str | None = None  # note on topics chosen by type, or on samples left out
     guessed: Any = None  # column map, if it was guessed
     hint: str = ''  # advice on how to log better data
+
+    def take(self, rows: Bools) -> 'ForeignLog':
+        """Select samples; all temperatures are kept."""
+        gyro = None if self.gyro is None else self.gyro[rows]
+        return replace(self, stamp_ns=self.stamp_ns[rows], accel=self.accel[rows], gyro=gyro)
 
 
 @dataclass(frozen=True)
@@ -111,15 +118,23 @@ class ConversionReport:
     stillness: Stillness
 
 
-def import_extra(module: str, extra: str, what: str, path: Path) -> Any:
+def import_extra(module: str, extra: str, what: str) -> Any:
     """Import a module of the optional dependency `extra`; RecordingError if it is missing."""
     try:
         return import_module(module)
     except ImportError as failure:
         package = module.partition('.')[0]
-        raise RecordingError(
-            f"{what} needs {package}: pip install 'thermo_comp[{extra}]'", path=path
-        ) from failure
+        reason = f"{what} needs {package}: pip install 'thermo_comp[{extra}]'"
+        raise RecordingError(reason) from failure
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Add the path of a log to RecordingErrors that name no file."""
+    try:
+        yield
+    except RecordingError as error:
+        raise RecordingError(error.message, error.path or path, error.key) from error
 
 
 def write_log(
@@ -129,7 +144,10 @@ def write_log(
     progress: Callable[[float], None] = lambda _: None,
 ) -> ConversionReport:
     """Check a log and write it as a bag: a file ``*.mcap`` or a rosbag2 directory."""
-    _check_serial(log)
+    try:
+        valid_serial(log.serial or 'without')
+    except ValueError as mistake:
+        raise RecordingError(str(mistake), path=log.path) from mistake
     holds_numbers = (log.stamp_ns != NO_STAMP) & np.isfinite(log.accel).all(axis=1)
     if log.gyro is not None:
         holds_numbers &= np.isfinite(log.gyro).all(axis=1)
@@ -145,25 +163,19 @@ def write_log(
     line = np.arange(1, len(usable) + 1) if log.line is None else log.line
     not_numeric = _finding(~holds_numbers, line)
     out_of_range = _finding(holds_numbers & ~usable, line)
-    log = replace(
-        log,
-        stamp_ns=log.stamp_ns[usable],
-        accel=log.accel[usable],
-        gyro=None if log.gyro is None else log.gyro[usable],
-        temperatures={
-            name: part.take(_is_in_range(part.stamp_ns)) for name, part in log.temperatures.items()
-        },
-    )
+    log = _with_readings(log.take(usable), lambda part: _is_in_range(part.stamp_ns))
     line, stamp_ns = line[usable], log.stamp_ns
     stillness = find_stillness(stamp_ns, log.accel)
     _refuse_wrong_units(log, stillness)
-    log, n_impossible = _without_impossible(log)
-    newest = np.maximum.accumulate(stamp_ns)
+    low, high = PLAUSIBLE_CELSIUS
+    n_readings = sum(len(part.celsius) for part in log.temperatures.values())
+    log = _with_readings(log, lambda part: (part.celsius >= low) & (part.celsius <= high))
     _write(log, Path(output), force, progress)
+    newest = np.maximum.accumulate(stamp_ns)
     steps = np.diff(newest)
-    low, high = log.clip or (-np.inf, np.inf)
-    beyond = (log.accel <= low) | (log.accel >= high)
-    counts = {name: len(readings.stamp_ns) for name, readings in log.temperatures.items()}
+    lower, upper = log.clip or (-np.inf, np.inf)
+    is_clipped = np.any((log.accel <= lower) | (log.accel >= upper), axis=1)
+    counts = {name: len(part.celsius) for name, part in log.temperatures.items()}
     return ConversionReport(
         log,
         rows=len(usable) + log.n_short,
@@ -174,8 +186,8 @@ def write_log(
             'short_rows': Finding(log.n_short),
             'non_numeric': not_numeric,
             'out_of_range': out_of_range,
-            'clipped': _finding(np.any(beyond, axis=1), line),
-            'impossible': Finding(n_impossible),
+            'clipped': _finding(is_clipped, line),
+            'impossible': Finding(n_readings - sum(counts.values())),
             'continued': Finding(len(log.continued), log.continued[:_EXAMPLES]),
             'backwards': _finding(np.diff(stamp_ns, prepend=stamp_ns[0]) < 0, line),
             'repeated': _finding(np.diff(stamp_ns, prepend=stamp_ns[0] - 1) == 0, line),
@@ -185,12 +197,9 @@ def write_log(
     )
 
 
-def _check_serial(log: ForeignLog) -> None:
-    if log.serial:
-        try:
-            valid_serial(log.serial)
-        except ValueError as mistake:
-            raise RecordingError(str(mistake), path=log.path) from mistake
+def _with_readings(log: ForeignLog, is_good: Callable[[Readings], Bools]) -> ForeignLog:
+    kept = {name: part.take(is_good(part)) for name, part in log.temperatures.items()}
+    return replace(log, temperatures=kept)
 
 
 def _is_in_range(stamp_ns: Ints) -> Bools:
@@ -205,9 +214,8 @@ def _finding(rows: Bools, line: Ints) -> Finding:
 def _refuse_wrong_units(log: ForeignLog, stillness: Stillness) -> None:
     reason = contradiction(log.unit, stillness.magnitude, log.counts_per_g)
     if reason is not None:
-        raise RecordingError(
-            f'the stated unit of the accelerometer is {log.unit}, but {reason}', path=log.path
-        )
+        reason = f'the stated unit of the accelerometer is {log.unit}, but {reason}'
+        raise RecordingError(reason, path=log.path)
     low, high = PLAUSIBLE_CELSIUS
     for name, readings in log.temperatures.items():
         typical = float(np.nanmedian(readings.celsius)) if len(readings.celsius) else low
@@ -227,24 +235,10 @@ def _log_times(stamp_ns: Ints, shifts: Ints | None = None) -> tuple[Ints, Ints]:
     """
     is_restart = np.diff(stamp_ns, prepend=stamp_ns[:1]) < -_RESTART_NS
     if shifts is None or len(shifts) != is_restart.sum():
-        shifts = np.zeros(int(is_restart.sum()), np.int64)
         newest = np.maximum.reduceat(stamp_ns, [0, *np.flatnonzero(is_restart)])
-        first = stamp_ns[is_restart]
-        for k in range(len(shifts)):
-            shifts[k] = newest[k] + 1 + (shifts[k - 1] if k else 0) - first[k]
+        shifts = np.cumsum(newest[:-1] + 1 - stamp_ns[is_restart])
     moved = stamp_ns + np.concatenate(([0], shifts))[np.cumsum(is_restart)]
     return np.maximum.accumulate(moved), shifts
-
-
-def _without_impossible(log: ForeignLog) -> tuple[ForeignLog, int]:
-    """Leave out and count impossible temperatures, like -127 degC of a DS18B20 without contact."""
-    low, high = PLAUSIBLE_CELSIUS
-    kept, n = {}, 0
-    for name, readings in log.temperatures.items():
-        is_good = (readings.celsius >= low) & (readings.celsius <= high)
-        kept[name] = readings.take(is_good)
-        n += int((~is_good).sum())
-    return replace(log, temperatures=kept), n
 
 
 def _write(log: ForeignLog, output: Path, force: bool, progress: Callable[[float], None]) -> None:

@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 from . import autopilot, bag, column_map
-from .log import ForeignLog, write_log
+from .log import ForeignLog, naming, write_log
 
 #: Keywords that `read_log` takes for each kind of file.
 KEYWORDS: dict[str, tuple[str, ...]] = {
@@ -46,23 +46,20 @@ def read_log(path: Path, **given: Any) -> ForeignLog:
         if name not in KEYWORDS[kind]:
             has = ', '.join(f'`{keyword}`' for keyword in KEYWORDS[kind])
             raise ValueError(f'`{name}` does not apply to a {kind}, which takes {has}')
-    if kind == 'bag':
-        names = keywords.pop('topic', {})
-        if not names.keys() <= {'imu', 'board', 'case'}:
-            raise ValueError(
-                '`topic` takes imu, board and case, which are converted, got '
-                + ', '.join(sorted(names.keys() - {'imu', 'board', 'case'}))
-            )
-        return bag.bag_log(path, **names, **keywords)
-    if kind == 'log':
-        return autopilot.read_autopilot(path, **keywords)
-    columns, rate_hz = keywords.get('columns'), keywords.get('rate_hz')
-    if columns is not None and rate_hz is not None:
+    if others := keywords.get('topic', {}).keys() - {'imu', 'board', 'case'}:
+        listed = ', '.join(sorted(others))
+        raise ValueError(f'`topic` takes imu, board and case, which are converted, got {listed}')
+    if keywords.keys() >= {'columns', 'rate_hz'}:
         raise ValueError('`rate_hz` does not apply if `columns` is given: the map states the rate')
-    if columns is not None:
-        return column_map.table_log(path, column_map.load_column_map(columns))
-    guessed = column_map.guess_columns(path, rate_hz)
-    return replace(column_map.table_log(path, guessed), guessed=guessed)
+    with naming(path):
+        if kind == 'bag':
+            return bag.bag_log(path, **keywords.pop('topic', {}), **keywords)
+        if kind == 'log':
+            return autopilot.read_autopilot(path, **keywords)
+        if 'columns' in keywords:
+            return column_map.table_log(path, column_map.load_column_map(keywords['columns']))
+        guessed = column_map.guess_columns(path, **keywords)
+        return replace(column_map.table_log(path, guessed), guessed=guessed)
 
 
 @contextmanager

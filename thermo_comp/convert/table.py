@@ -29,10 +29,9 @@ from ..errors import RecordingError
 from ..files import open_regular
 from ..quantities import NotNegative, Positive
 from ..typing import Floats, Ints
-from .headings import read_headings
+from .headings import Column, read_headings
 from .log import NO_STAMP, import_extra
 
-Column = str | int
 TimeUnit = Literal['s', 'ms', 'us', 'ns', 'iso']
 
 _SNIFF_BYTES = 65536
@@ -99,14 +98,11 @@ def read_text(
 ) -> Table:
     """Read columns of a text table, by headings or numbers from 0; all if `columns` is None."""
     try:
-        with TextIOWrapper(
-            open_regular(path), encoding='utf-8-sig', errors='replace', newline=''
-        ) as file:
+        with open_regular(path) as raw:
+            file = TextIOWrapper(raw, encoding='utf-8-sig', errors='replace', newline='')
             head = file.read(_SNIFF_BYTES)
-            if not head.strip():
-                raise RecordingError('the table is empty', path=path)
             if '\0' in head:
-                raise RecordingError('not a table of text: it holds zero bytes', path=path)
+                raise RecordingError('not a table of text: it holds zero bytes')
             file.seek(0)
             style = style or Format()
             given = _DELIMITERS.get(style.delimiter or '', style.delimiter)
@@ -114,19 +110,18 @@ def read_text(
             headings, rows = _begin(_rows(file, delimiter), width, style.header)
             if not headings and style.header is None:
                 headings = _commented(head, delimiter, width)
-            return _collect(path, headings, rows, columns, stamp)
+            return _collect(headings, rows, columns, stamp)
     except (UnicodeError, csv.Error) as failure:
-        raise RecordingError(f'not a table of text ({failure})', path=path) from failure
+        raise RecordingError(f'not a table of text ({failure})') from failure
     except OSError as failure:
-        raise RecordingError(failure.strerror or str(failure), path=path) from failure
+        raise RecordingError(failure.strerror or str(failure)) from failure
 
 
 def layout(head: str, delimiter: str | None = None) -> tuple[str, int]:
     """
     Return the delimiter of a text table and the number of cells per row: the delimiter that splits
     most lines into the same number of cells (a blank is any run of white space). Only the last 50
-    lines of `head` count, because a preamble may come first; the very last line, which may be cut,
-    does not count.
+    lines of `head` count, as a preamble may come first, without the last, which may be cut.
     """
     lines = [line for line in head.splitlines() if line.strip() and not _is_comment(line)]
     lines = lines[:-1] if len(lines) > 2 else lines
@@ -143,7 +138,6 @@ def layout(head: str, delimiter: str | None = None) -> tuple[str, int]:
 
 
 def _most_frequent(numbers: Sequence[int]) -> tuple[int, int]:
-    """Return the most frequent number and its frequency."""
     most = max(set(numbers), key=numbers.count, default=0)
     return most, numbers.count(most)
 
@@ -193,10 +187,8 @@ def _begin(rows: _Rows, width: int, has_header: bool | None) -> tuple[list[str],
 
 def _commented(head: str, delimiter: str, width: int) -> list[str]:
     """Return headings from the last comment before a table, where numpy.savetxt writes them."""
-    comments = list(
-        takewhile(lambda line: not line.strip() or _is_comment(line), head.splitlines())
-    )
-    text = next((line for line in reversed(comments) if line.strip()), '').strip().lstrip('#%/ ')
+    lines = (line.strip() for line in head.splitlines() if line.strip())
+    text = [*takewhile(_is_comment, ('#', *lines))][-1].lstrip('#%/ ')
     cells = text.split() if delimiter == ' ' else next(csv.reader([text], delimiter=delimiter), [])
     cells = [cell.strip() for cell in cells]
     return cells if len(cells) == width and read_headings(cells) is not None else []
@@ -211,32 +203,28 @@ def _number(cell: str) -> float | None:
 
 
 def _numbers(cells: list[str]) -> list[float]:
-    """Read cells as numbers, NaN if a cell is not a number."""
     try:
         return list(map(float, cells))
     except ValueError:
-        numbers = map(_number, cells)
-        return [nan if number is None else number for number in numbers]
+        return [nan if (number := _number(cell)) is None else number for cell in cells]
 
 
 def _collect(
-    path: Path, headings: list[str], rows: _Rows, columns: Sequence[Column] | None, stamp: Stamp
+    headings: list[str], rows: _Rows, columns: Sequence[Column] | None, stamp: Stamp
 ) -> Table:
     first = next(rows, None)
     if first is None:
         what = 'has headings but no rows' if headings else 'is empty'
-        raise RecordingError(f'the table {what}', path=path)
+        raise RecordingError(f'the table {what}')
     width = len(first[1])
     wanted = range(width) if columns is None else columns
-    places = {name: _place(path, name, headings, width) for name in wanted}
-    at = None if stamp.column is None else _place(path, stamp.column, headings, width)
+    places = {name: _place(name, headings, width) for name in wanted}
+    at = None if stamp.column is None else _place(stamp.column, headings, width)
     needed = 1 + max([*places.values(), -1 if at is None else at])
     for name, place in places.items():
         if re.fullmatch(r'\s*[+-]?[0-9]+,[0-9]+\s*', first[1][place]):
             why = f'column {name!r} has decimal commas, it begins with {first[1][place].strip()}: '
-            why += 'write decimal points'
-            raise RecordingError(why, path=path)
-
+            raise RecordingError(why + 'write decimal points')
     line, stamps, n_short = array('q'), array('q'), 0
     values = {name: array('d') for name in places}
     rows = chain([first], rows)
@@ -251,8 +239,7 @@ def _collect(
     if at is not None and stamp.unit == 'iso' and stamps and max(stamps) == NO_STAMP:
         raise RecordingError(
             f'no cell of its column {stamp.column!r} is a date of ISO 8601, like '
-            f'2026-03-29T01:30:00.5Z; the first cell is {first[1][at].strip()!r}',
-            path=path,
+            f'2026-03-29T01:30:00.5Z; the first cell is {first[1][at].strip()!r}'
         )
     return Table(
         line=np.array(line),
@@ -264,7 +251,7 @@ def _collect(
     )
 
 
-def _place(path: Path, name: Column, headings: Sequence[str], width: int) -> int:
+def _place(name: Column, headings: Sequence[str], width: int) -> int:
     """Return the index of a column; RecordingError unless the column exists exactly once."""
     if isinstance(name, int):
         if 0 <= name < width:
@@ -278,11 +265,10 @@ def _place(path: Path, name: Column, headings: Sequence[str], width: int) -> int
         why = f'no column {name!r}; there are: {", ".join(map(repr, headings))}'
     else:
         return headings.index(name)
-    raise RecordingError(why, path=path)
+    raise RecordingError(why)
 
 
 def _not_used(headings: Sequence[str], width: int, used: Container[int | None]) -> tuple[str, ...]:
-    """Return the headings, or else the numbers, of the columns that are not used."""
     names = headings or [str(number) for number in range(width)]
     return tuple(name for place, name in enumerate(names) if name and place not in used)
 
@@ -316,48 +302,42 @@ def _iso_ns(text: str) -> int:
 def read_parquet(
     path: Path, columns: Sequence[Column] | None, stamp: Stamp, _style: Format | None = None
 ) -> Table:
-    """
-    Read columns of a Parquet file as `read_text` does; timestamps of Parquet state their unit.
-    If `columns` is None all columns are read, and columns without numbers become NaN.
-    """
-    pq = import_extra('pyarrow.parquet', 'parquet', 'a Parquet file', path)
+    """Read a Parquet file as `read_text` reads a text; of all columns, those of texts are NaN."""
+    pq = import_extra('pyarrow.parquet', 'parquet', 'a Parquet file')
     import pyarrow as pa
 
     try:
         with open_regular(path) as file:
             parquet = pq.ParquetFile(file)
             if parquet.metadata.num_rows > _MOST_ROWS_PER_BYTE * os.fstat(file.fileno()).st_size:
-                raise RecordingError(
-                    f'the file is too small for {parquet.metadata.num_rows} rows', path=path
-                )
+                raise RecordingError(f'the file is too small for {parquet.metadata.num_rows} rows')
             headings = list(parquet.schema_arrow.names)
             wanted = range(len(headings)) if columns is None else columns
             names = [*wanted] if stamp.column is None else [*wanted, stamp.column]
-            places = {name: _place(path, name, headings, len(headings)) for name in names}
+            places = {name: _place(name, headings, len(headings)) for name in names}
             table = parquet.read(columns=[headings[i] for i in sorted(set(places.values()))])
     except RecordingError:
         raise
     except Exception as failure:  # a damaged file may raise any type of exception
         reason = ' '.join(str(failure).split())
-        raise RecordingError(f'not a readable Parquet file ({reason})', path=path) from failure
+        raise RecordingError(f'not a readable Parquet file ({reason})') from failure
     if not table.num_rows:
-        raise RecordingError('the table is empty', path=path)
+        raise RecordingError('the table is empty')
     cells: dict[Column, Any] = {name: table.column(headings[i]) for name, i in places.items()}
     values = {}
     for name in wanted:
         try:
             column = cells[name].cast(pa.float64(), safe=False).to_numpy()
         except (pa.ArrowException, ValueError) as failure:
-            if columns is None:
-                values[name] = np.full(table.num_rows, nan)
-                continue
-            problem = f'column {name!r} holds {cells[name].type}, expected numbers'
-            raise RecordingError(problem, path=path) from failure
+            if columns is not None:
+                problem = f'column {name!r} holds {cells[name].type}, expected numbers'
+                raise RecordingError(problem) from failure
+            column = np.full(table.num_rows, nan)
         values[name] = np.asarray(column, dtype=np.float64)
     stamp_ns = stamp.ticks(table.num_rows)
     if stamp.column is not None:
         stamps, unit = cells[stamp.column], stamp.unit
-        if pa.types.is_timestamp(stamps.type):
+        if pa.types.is_timestamp(stamps.type):  # a timestamp of Parquet states its unit
             unit, stamps = stamps.type.unit, stamps.cast(pa.int64())
         stamp_ns = np.array([exact_ns(cell, unit) for cell in stamps.to_pylist()])
     line = np.arange(1, table.num_rows + 1, dtype=np.int64)

@@ -17,8 +17,7 @@ calibrate a triad at one temperature; with the reading N and the specific force 
     Kalibr      N = M a + b          M lower triangular                               (YAML)
     thermo_comp a = M K^-1 (N - b)   M lower triangular, unit diagonal; K diagonal
 
-If the matrix of a tool is not lower triangular, the frame of the tool is rotated relative to the
-frame of thermo_comp.
+If a tool's matrix is not lower triangular, the tool's frame is rotated relative to thermo_comp's.
 """
 
 import re
@@ -243,7 +242,6 @@ def _write_imu_tk(content: Content, _number: int | None, _device_id: int) -> str
 
 
 def _write_imu_calib(content: Content, _number: int | None, _device_id: int) -> str:
-    """Write imu_calib's YAML: the matrix by rows, then the bias."""
     bias = content.matrix @ content.bias[:, 0]
     return f'SM: {content.matrix.ravel().tolist()}\nbias: {bias.tolist()}\n'
 
@@ -287,11 +285,11 @@ def _read_imu_calib(text: str, _number: int | None) -> Content | None:
 
 def _read_kalibr(text: str, number: int | None) -> Content | None:
     """Read an IMU of Kalibr's YAML, by the number of the IMU; None if no IMU has a matrix."""
-    imus = {
-        str(name): _dictionary(_dictionary(part).get('accelerometers'))
-        for name, part in _mapping(text).items()
-    }
-    imus = {name: part for name, part in imus.items() if 'M' in part}
+    imus = {}
+    for name, part in _mapping(text).items():
+        sensor = _dictionary(_dictionary(part).get('accelerometers'))
+        if 'M' in sensor:
+            imus[name] = sensor
     if not imus:
         return None
     name = next(iter(imus)) if number is None else f'imu{number}'

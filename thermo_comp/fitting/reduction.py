@@ -25,7 +25,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from ..errors import FitError
 from ..recording import stillness
 from ..recording.blocks import RecordingInfo
-from ..recording.causes import CauseCounter
+from ..recording.overview import CauseCounter
 from ..recording.stillness import CellAccumulator, Cells
 from ..thermal.plausibility import CONTINUED_SHARE
 from ..thermal.thermometer import COLDEST, HOTTEST

@@ -40,8 +40,7 @@ _MOST_JUMPS = 100
 _FEWEST_READINGS, _APART_S = 10, 10.0
 #: Time between two equal readings that `Readings.thinned` keeps [ns].
 _REPEAT_NS = 10_000_000_000
-#: Duration of a recording above which the mean interval between messages is limited, and the
-#: largest mean interval [ns].
+#: Longest recording without a limit of the mean interval between messages, and this limit [ns].
 _SPARSE_NS, _SPARSEST_NS = 10 * 86400 * 10**9, 10 * 10**9
 
 
@@ -55,21 +54,18 @@ class Topic(NamedTuple):
 
 
 class BagFile:
-    """
-    An open file of a bag: `topics` by channel number, `definitions` (encoding and text) by message
-    type, a description `truncated` of missing data, and the `path` that errors name.
-    """
+    """An open file of a bag."""
 
     storage = 'mcap'
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        self.topics: dict[int, Topic] = {}
-        self.definitions: dict[str, tuple[str, str]] = {}
+        self.path = path  # the path that errors name
+        self.topics: dict[int, Topic] = {}  # by channel number
+        self.definitions: dict[str, tuple[str, str]] = {}  # encoding and text by message type
         self.metadata: dict[str, str] = {}
         self.start_ns: int | None = None
         self.end_ns: int | None = None
-        self.truncated: str | None = None
+        self.truncated: str | None = None  # description of missing data
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,9 +96,8 @@ class RecordingInfo:
 
 class ImuColumns(NamedTuple):
     """
-    The fields of sensor_msgs/Imu other than stamp and linear acceleration: quaternion x, y, z, w,
-    shape (n, 4), rates [rad/s], shape (n, 3), and covariances, shape (n, 9). For writing, a single
-    row applies to all messages.
+    Fields of sensor_msgs/Imu: quaternion x, y, z, w, shape (n, 4), rates [rad/s], shape (n, 3),
+    covariances, shape (n, 9). For writing, a single row applies to all messages.
     """
 
     orientation: Floats
@@ -187,10 +182,10 @@ class Block:
         """Select messages; `rows` has a mask for ``accel`` and for each thermometer."""
         is_taken = rows['accel']
         n_before = np.concatenate(([0], np.cumsum(is_taken)))
-        temperatures = {}
-        for name, readings in self.temperatures.items():
-            after = n_before[readings.after[rows[name]]]
-            temperatures[name] = readings.take(rows[name])._replace(after=after)
+        temperatures = {
+            name: readings.take(rows[name])._replace(after=n_before[readings.after[rows[name]]])
+            for name, readings in self.temperatures.items()
+        }
         return Block(
             self.accel_stamp_ns[is_taken],
             self.accel[is_taken],
@@ -212,17 +207,14 @@ class Recording(NamedTuple):
 def gathered(blocks: Iterable[Block]) -> Iterator[Block]:
     """Join blocks until they have `BLOCK_MESSAGES` messages, or until `frame_id` changes."""
     waiting: list[Block] = []
-    frame_id: str | None = None
     for block in blocks:
-        if len(block):
-            if frame_id not in {None, block.frame_id}:
-                yield joined(waiting)
-                waiting = []
-            frame_id = block.frame_id
-        waiting.append(block)
-        if sum(block.n_messages for block in waiting) >= BLOCK_MESSAGES:
+        if len({each.frame_id for each in (*waiting, block) if len(each)}) > 1:
             yield joined(waiting)
-            waiting, frame_id = [], None
+            waiting = []
+        waiting.append(block)
+        if sum(each.n_messages for each in waiting) >= BLOCK_MESSAGES:
+            yield joined(waiting)
+            waiting = []
     if waiting:
         yield joined(waiting)
 
@@ -266,18 +258,14 @@ def with_stamps(block: Block, last_ns: int) -> tuple[Block, int]:
             stamp_ns = np.where(is_bare, newest[readings.after], readings.stamp_ns)
             temperatures[name] = readings._replace(stamp_ns=stamp_ns)
             kept[name] = stamp_ns != NO_STAMP_NS
-            if name in block.raw:
-                _restamp(block.raw[name], stamp_ns)
+            if name in block.raw:  # write the stamps into the serialized little-endian headers
+                stamps = np.stack((stamp_ns // 10**9, stamp_ns % 10**9), axis=1).astype('<i4')
+                raw = block.raw[name]
+                scatter(raw.data, raw.start + 4, stamps.view((np.void, 8))[:, 0])
     if kept:
         everything = {role: np.ones(len(times), bool) for role, times in block.log_ns.items()}
         block = replace(block, temperatures=temperatures).take({**everything, **kept})
     return block, int(newest[-1])
-
-
-def _restamp(messages: Messages, stamp_ns: Ints) -> None:
-    """Write stamps into the headers of serialized little-endian messages."""
-    stamps = np.stack((stamp_ns // 10**9, stamp_ns % 10**9), axis=1).astype('<i4')
-    scatter(messages.data, messages.start + 4, stamps.view((np.void, 8))[:, 0])
 
 
 def unstamped(stamp_ns: int) -> str:
@@ -318,9 +306,6 @@ def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
         # Sort readings and samples in reading order: by the number of samples before them.
         places = [*(thermometer.after for thermometer in thermometers), np.arange(len(block))]
         stamps = np.concatenate([*(part.stamp_ns for part in thermometers), block.accel_stamp_ns])
-        if not len(stamps):
-            yield block
-            continue
         order = np.argsort(np.concatenate(places), kind='stable')
         read: Ints = stamps[order]
         steps = np.diff(read, prepend=read[0] if last_ns is None else last_ns)
@@ -334,14 +319,10 @@ def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
             reason = f'{n_messages} messages stamped over {span_ns / 86400e9:.0f} days with '
             reason += f'{n_jumps} jumps by more than an hour: no recording of a thermal test'
             raise RecordingError(clocks_apart(block) or reason, path)
-        offsets = np.empty_like(moved)
-        offsets[order] = moved
-        parts = np.split(offsets, np.cumsum([len(readings.after) for readings in thermometers]))
-        yield replace(
-            block,
-            accel_stamp_ns=block.accel_stamp_ns + parts[-1],
-            temperatures={
-                name: part._replace(stamp_ns=part.stamp_ns + by)
-                for (name, part), by in zip(block.temperatures.items(), parts, strict=False)
-            },
-        )
+        stamps[order] += moved
+        parts = np.split(stamps, np.cumsum([len(readings.after) for readings in thermometers]))
+        temperatures = {
+            name: readings._replace(stamp_ns=stamp_ns)
+            for (name, readings), stamp_ns in zip(block.temperatures.items(), parts, strict=False)
+        }
+        yield replace(block, accel_stamp_ns=parts[-1], temperatures=temperatures)

@@ -93,12 +93,8 @@ class Field:
         self._find(Messages.of([], [], []), self.path)
 
     @property
-    def has_stamp(self) -> bool:
-        """Whether the field `header` is a std_msgs/Header, or a message that contains one."""
-        return bool(self._header)
-
-    @property
-    def _header(self) -> str:
+    def header(self) -> str:
+        """The path to a std_msgs/Header in the message or in its field `header`, or ''."""
         kind, path = self.kind, ''
         for _ in range(2):
             inner = dict(self.definitions[kind][1]).get('header')
@@ -112,35 +108,32 @@ class Field:
     def read(self, messages: Messages) -> tuple[Ints, Floats]:
         """Return stamps [ns] (`NO_STAMP_NS` without a header) and numbers, shape (n,)."""
         values = self._find(messages, self.path).astype(np.float64)
-        if not self.has_stamp:
+        if not self.header:
             return np.full(len(messages), NO_STAMP_NS), values
-        seconds, rest = (
-            self._find(messages, f'{self._header}stamp.{part}') for part in ('sec', 'nanosec')
-        )
+        stamp = f'{self.header}stamp.'
+        seconds, rest = (self._find(messages, stamp + part) for part in ('sec', 'nanosec'))
         return seconds.astype(np.int64) * 10**9 + rest, values
 
     def _find(self, messages: Messages, path: str) -> Any:
-        try:
-            return self._follow(messages, path)
-        except RecursionError as error:
-            raise RecordingError(f'the message type {self.kind} contains itself') from error
-
-    def _follow(self, messages: Messages, path: str) -> Any:
         cursor, kind = _Cursor(messages, self.definitions), self.kind
         description: Any = None
-        for step in path.split('.'):
-            match = _STEP.fullmatch(step)
-            fields = self.definitions[kind][1] if kind else []
-            if match is None or match[1] not in dict(fields):
-                among = ', '.join(name for name, _ in fields[:20]) or 'none'
-                raise RecordingError(f'{kind or "a number"} has the fields {among}, no `{step}`')
-            for name, description in fields:
-                if name == match[1]:
-                    break
-                cursor.skip(description)
-            if match[2] is not None:
-                description = cursor.enter(description, int(match[2]))
-            kind = description[1] if description[0] == _NAME else ''
+        try:
+            for step in path.split('.'):
+                match = _STEP.fullmatch(step)
+                fields = self.definitions[kind][1] if kind else []
+                if match is None or match[1] not in dict(fields):
+                    among = ', '.join(name for name, _ in fields[:20]) or 'none'
+                    kind = kind or 'a number'
+                    raise RecordingError(f'{kind} has the fields {among}, no `{step}`')
+                for name, description in fields:
+                    if name == match[1]:
+                        break
+                    cursor.skip(description)
+                if match[2] is not None:
+                    description = cursor.enter(description, int(match[2]))
+                kind = description[1] if description[0] == _NAME else ''
+        except RecursionError as error:
+            raise RecordingError(f'the message type {self.kind} contains itself') from error
         if description[0] != _BASE or description[1][0] not in _KINDS:
             raise RecordingError(f'`{path}` of {self.kind} is not a number')
         return cursor.number(_KINDS[description[1][0]])
@@ -164,11 +157,8 @@ class _Cursor:
     def number(self, kind: str) -> Any:
         """Read a number of each message, and advance past it."""
         size = int(kind[1:])
-        self._at = (self._at + size - 1) // size * size
-        at, self._at = self._at + 4, self._at + size
-        if (self._at + 4 > self._messages.size).any():
-            raise RecordingError('damaged message: it ends inside a field')
-        rows = gather(self._messages.data, self._messages.start + at, size)
+        self._leap(1, size)
+        rows = gather(self._messages.data, self._messages.start + 4 + self._at - size, size)
         little, big = number_at(rows, 0, f'<{kind}'), number_at(rows, 0, f'>{kind}')
         return np.where(self._is_big, big, little)
 
@@ -183,12 +173,18 @@ class _Cursor:
             kind = _KINDS.get(content[0][1][0]) if content[0][0] == _BASE else None
             if kind:
                 self._leap(counts, int(kind[1:]))
-            else:
-                self._skip_each(content[0], counts)
+                return
+            # Elements of variable size are skipped one by one.
+            while (rows := np.flatnonzero(counts > 0)).size:
+                some = _Cursor(self._messages.take(rows), self._definitions)
+                some._at = self._at[rows]
+                some.skip(content[0])
+                self._at[rows] = some._at
+                counts = counts - 1
         elif content[0] == 'string':
             self._leap(self.number('u4').astype(np.int64), 1)
         elif content[0] in _KINDS:
-            self._leap(np.ones_like(self._at), int(_KINDS[content[0]][1:]))
+            self._leap(1, int(_KINDS[content[0]][1:]))
         else:
             raise RecordingError(f'a {content[0]} field before the number is not supported')
 
@@ -208,17 +204,9 @@ class _Cursor:
             return np.full_like(self._at, description[1][1])
         return np.asarray(self.number('u4').astype(np.int64))
 
-    def _leap(self, counts: Ints, size: int) -> None:
+    def _leap(self, counts: Ints | int, size: int) -> None:
+        """Advance past `counts` numbers of `size` bytes in each message."""
         aligned = (self._at + size - 1) // size * size
         self._at = np.where(counts > 0, aligned + counts * size, self._at)
         if (self._at + 4 > self._messages.size).any():
             raise RecordingError('damaged message: it ends inside a field')
-
-    def _skip_each(self, element: Any, counts: Ints) -> None:
-        """Advance past `counts` elements of variable size in each message."""
-        while (rows := np.flatnonzero(counts > 0)).size:
-            some = _Cursor(self._messages.take(rows), self._definitions)
-            some._at = self._at[rows]
-            some.skip(element)
-            self._at[rows] = some._at
-            counts = counts - 1

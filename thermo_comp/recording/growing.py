@@ -5,8 +5,7 @@ Owns live recording: new messages of a bag that another program writes, and numb
 
 Each pass reads the growing bag from its beginning; the pause after a pass is at least five times
 as long as the pass. New messages are written with the node's topic names to numbered bags, from
-`01.mcap` on. The end of a position is recognised with a delay, so the newest messages are held in
-memory until their position is known.
+`01.mcap` on. The newest messages are held in memory until their position is known.
 """
 
 import re
@@ -39,10 +38,7 @@ News = tuple[Block, RecordingInfo | None]
 def growing_blocks(
     path: Path, topics: Topics, wait: Callable[[float], bool]
 ) -> Iterator[News | None]:
-    """
-    Yield the new blocks of a bag, and None at the end of each pass, until the bag is complete;
-    `wait` waits for a time [s] and returns whether to end.
-    """
+    """Yield new blocks until the bag is complete or `wait(s)` is true; None after each pass."""
     if not path.exists():
         raise RecordingError('no such file or directory', path)
     n_seen: Counter[Role] = Counter()
@@ -52,9 +48,9 @@ def growing_blocks(
         try:
             reader = open_recording(path, topics, require=())
         except RecordingError:
-            # A recorder creates a file before it writes records, so an empty or growing file that
-            # is not a bag yet is no error.
-            before, size = size, _size(path)
+            # A recorder creates a file before it writes records: wait if it is empty or grows.
+            files = path.iterdir() if path.is_dir() else [path]
+            before, size = size, sum(file.stat().st_size for file in files)
             if n_seen or 0 < size == before:
                 raise
             is_whole = False
@@ -74,10 +70,6 @@ def growing_blocks(
         yield None
         if is_whole or wait(max(_PERIOD_S, (time.monotonic() - began) / _SHARE)):
             return
-
-
-def _size(path: Path) -> int:
-    return sum(file.stat().st_size for file in (path.iterdir() if path.is_dir() else [path]))
 
 
 def numbered_bags(folder: Path) -> list[Path]:
@@ -152,20 +144,21 @@ class PositionBags:
             raise
 
     def _write(self, block: Block) -> None:
-        if self._writer is None and block.n_messages:
+        if not block.n_messages:
+            return
+        if self._writer is None:
             path = self._folder / f'{self._number:02d}.mcap'
-            metadata = {} if self._serial is None else {'serial': self._serial}
+            facts = {} if self._serial is None else {'serial': self._serial}
             self._writer = BagWriter(
-                path, metadata=metadata, chunk_bytes=_CHUNK_BYTES, is_precious=True
+                path, metadata=facts, chunk_bytes=_CHUNK_BYTES, is_precious=True
             )
             self.written.append(path)
             self._number += 1
         accel = COUNTS if block.imu is None else IMU_IN
         for role, messages in block.raw.items():
-            is_accel = role == 'accel'
-            topic = accel.name if is_accel else thermometer(role)
-            kind = accel.type if is_accel else TEMPERATURE
-            if self._writer is not None and len(messages):
+            topic = accel.name if role == 'accel' else thermometer(role)
+            kind = accel.type if role == 'accel' else TEMPERATURE
+            if len(messages):
                 self._writer.write_raw(topic, kind, messages.log_ns, messages)
 
     def close(self, before_ns: int = _NEVER_NS) -> None:

@@ -4,19 +4,18 @@
 Owns the reading of an MCAP file chunk by chunk, in bounded memory.
 
 The summary of a complete file lists the spans that hold messages. A file without a usable summary,
-or cut off anywhere, is read record by record, and its messages are counted. Records other than
-messages are read by the `mcap` library.
+or cut off anywhere, is read record by record, and its messages are counted. The `mcap` library
+reads all other records.
 """
 
 import os
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import partial
 from io import BytesIO
 from itertools import pairwise
-from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -50,16 +49,7 @@ _CUTS = {
     -1: 'it ends inside a record; all records before it are read',
 }
 #: Record types other than messages that are read.
-_KINDS: Mapping[int, Any] = {
-    Opcode.SCHEMA: Schema,
-    Opcode.CHANNEL: Channel,
-    Opcode.METADATA: Metadata,
-}
-#: Returns attributes of a chunk index, in the order of the fields of a `Span`.
-_SPAN_FIELDS = attrgetter(
-    *('chunk_start_offset', 'chunk_length', 'message_index_length'),
-    *('uncompressed_size', 'message_start_time', 'message_end_time'),
-)
+_KINDS: Any = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.METADATA: Metadata}
 _new_stream: Any = ReadDataStream  # type hints differ between versions of the `mcap` library
 
 
@@ -149,7 +139,13 @@ class McapFile(BagFile):
         counts, n_messages = text.channel_message_counts, text.message_count
         channels: dict[int, Channel] = {c.id: c for c in records_of.get(Channel, [])}
         chunks = sorted(records_of.get(ChunkIndex, []), key=lambda index: index.chunk_start_offset)
-        spans = [Span(*_SPAN_FIELDS(chunk)) for chunk in chunks]
+        spans = [
+            Span(
+                *(chunk.chunk_start_offset, chunk.chunk_length, chunk.message_index_length),
+                *(chunk.uncompressed_size, chunk.message_start_time, chunk.message_end_time),
+            )
+            for chunk in chunks
+        ]
         if (
             sum(counts.values()) != n_messages
             or not counts.keys() <= channels.keys()
@@ -253,8 +249,7 @@ class McapFile(BagFile):
 
 def _in_order(pieces: Iterable[tuple[int, Messages, int | None]]) -> Iterator[Messages]:
     """Merge numbered pieces by log time; the third item is the next piece's first log time."""
-    # Messages before the first log time of the next piece are final, so only messages of chunks
-    # that overlap in time are held back.
+    # Messages before the first log time of the next piece are final; later messages are held.
     held: dict[int, Messages] = {}
     for row, piece, next_ns in pieces:
         held[row] = piece

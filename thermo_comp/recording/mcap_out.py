@@ -51,10 +51,7 @@ _INDEX_ROW = np.dtype([('log', '<u8'), ('offset', '<u8')])
 
 @lru_cache(maxsize=64)
 def known_definition(kind: str) -> tuple[str, str, str]:
-    """
-    Return encoding, full text (with dependencies) and hash (RIHS01) of a message type of ROS 2
-    Jazzy; RecordingError if Jazzy does not have the type.
-    """
+    """Return encoding, full text and hash (RIHS01) of a type of Jazzy, else RecordingError."""
     store = typestore()
     if kind not in store.fielddefs:
         raise RecordingError(f'the definition of message type {kind} is not known')
@@ -75,8 +72,7 @@ class McapOutput:
         name: str,
     ) -> None:
         self._name, self._metadata, self._chunk_bytes = name, metadata, chunk_bytes
-        self._compression = compression
-        self._level = level
+        self._compression, self._level = compression, level
         self._schemas: dict[str, records.Schema] = {}
         self._channels: dict[str, records.Channel] = {}
         self._counts: Counter[int] = Counter()
@@ -103,16 +99,9 @@ class McapOutput:
             schema = records.Schema(len(self._schemas) + 1, text.encode(), encoding, kind)
             self._schemas[kind] = schema
             self._put_record(schema)
-        channel = records.Channel(
-            id=len(self._channels) + 1,
-            topic=topic,
-            message_encoding='cdr',
-            schema_id=schema.id,
-            metadata={
-                'offered_qos_profiles': dump_yaml([_offered_qos(topic)]).strip(),
-                'topic_type_hash': type_hash,
-            },
-        )
+        qos = dump_yaml([_offered_qos(topic)]).strip()
+        facts = {'offered_qos_profiles': qos, 'topic_type_hash': type_hash}
+        channel = records.Channel(len(self._channels) + 1, topic, 'cdr', facts, schema.id)
         self._channels[topic] = channel
         self._counts[channel.id] = 0
         self._put_record(channel)
@@ -181,7 +170,6 @@ class McapOutput:
         }
 
     def _times(self) -> tuple[int, int]:
-        """Return the log times of the first and the last message."""
         start = min((chunk.message_start_time for chunk in self._chunks), default=0)
         return start, max((chunk.message_end_time for chunk in self._chunks), default=0)
 
@@ -205,7 +193,6 @@ class McapOutput:
         self._metadata_index.append(records.MetadataIndex(begin, self._at - begin, name))
 
     def _put_chunk(self, messages: Messages) -> None:
-        """Write messages as a chunk with its message indexes."""
         log_ns, channel, size = messages.log_ns, messages.channel, messages.size
         laid = messages.packed(MESSAGE_HEAD_BYTES)
         data, at = laid.data, laid.start - MESSAGE_HEAD_BYTES
@@ -215,13 +202,8 @@ class McapOutput:
         scatter(data, at, heads.view(np.dtype((np.void, MESSAGE_HEAD_BYTES))))
         packed = _COMPRESSORS[self._compression](data.data, self._level)
         name = '' if self._compression == 'none' else self._compression
-        start, end = int(np.min(log_ns)), int(np.max(log_ns))
-        begin, n_bytes, checksum = self._at, len(data), zlib.crc32(data.data)
-        head = (Opcode.CHUNK, 40 + len(name) + len(packed), start, end, n_bytes, checksum)
-        self._put(
-            struct.pack(f'<BQQQQII{len(name)}sQ', *head, len(name), name.encode(), len(packed))
-        )
-        self._put(packed)
+        begin, start, end = self._at, int(np.min(log_ns)), int(np.max(log_ns))
+        self._put_record(records.Chunk(name, packed, end, start, zlib.crc32(data.data), len(data)))
         chunk_length = self._at - begin
         offsets: dict[int, int] = {}
         rows = np.empty(len(log_ns), _INDEX_ROW)
@@ -242,7 +224,7 @@ class McapOutput:
                 message_index_length=self._at - begin - chunk_length,
                 message_index_offsets=offsets,
                 message_start_time=start,
-                uncompressed_size=n_bytes,
+                uncompressed_size=len(data),
             )
         )
 

@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the survey of a recording before a fit: duration, rates, temperatures, rests, gaps."""
+"""
+Owns the survey of a recording before a fit: duration, rates, temperatures, rests, gaps, and the
+messages for recordings that are not of an accelerometer at rest.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,11 +15,11 @@ from ..thermal.settings import ADVISED_SPAN_K, RAMP_K_MIN
 from ..thermal.thermometer import COLDEST, HOTTEST
 from ..topics import TEMPERATURE
 from ..typing import Ints
-from .blocks import LONGEST_PAUSE_NS, Readings, RecordingInfo
-from .causes import CauseCounter
+from ..unit.gravity import STANDARD_GRAVITY
+from .blocks import LONGEST_PAUSE_NS, Block, Readings, RecordingInfo, unstamped
 from .fields import temperature_fields
 from .reader import RecordingReader, open_recording
-from .stillness import STILL_SD, CellAccumulator, still_intervals, why_restless
+from .stillness import STILL_SD, CellAccumulator, Cells, still_intervals, why_restless
 from .topics import PLAIN, Topics, shown
 
 #: Range of readings that are probably in kelvins: no board survives such temperatures in degC.
@@ -24,6 +27,11 @@ KELVINS = (180.0, 480.0)
 _RAMP_WINDOW_S = 120.0  # time over which the rate of a ramp is averaged [s]
 _CELL_S, _MIN_REST_S = 0.5, 3.0  # lengths of a cell and of the shortest still interval [s]
 _GAP_INTERVALS = 5.0  # shortest gap, in median intervals between samples
+# Largest share of samples of exactly 0 that is taken for glitches, and share of messages marked as
+# without acceleration above which the whole recording counts as without acceleration.
+_GLITCH_SHARE, _FAULT_SHARE = 0.01, 0.5
+# Ratio of |a| at rest to gravity: range with gravity, upper limit if gravity is subtracted.
+_WITH_GRAVITY, _WITHOUT_GRAVITY = (0.8, 1.25), 0.3
 _NO_SAMPLES = (
     'no accelerometer samples: record accel/counts or imu/uncompensated, or name another topic '
     'with --topic counts=TOPIC or --topic imu=TOPIC'
@@ -45,15 +53,12 @@ class ThermometerSurvey:
 
 @dataclass(frozen=True)
 class Survey:
-    """
-    Summary of a recording. The sample rate is the inverse of the median interval between samples;
-    still intervals last at least 3 s; findings describe obstacles to a fit.
-    """
+    """Summary of a recording: still intervals of 3 s or more, findings on obstacles to a fit."""
 
     info: RecordingInfo
     n: int
     duration_s: float
-    rate_hz: float
+    rate_hz: float  # inverse of the median interval between samples
     n_still: int
     still_s: float
     thermometers: Mapping[str, ThermometerSurvey]
@@ -144,44 +149,18 @@ def survey_recording(
     cause = causes.cause(reduced, STILL_SD) if n > 1 else ''
     surveys = ((name, survey_thermometer(parts)) for name, parts in readings.items())
     thermometers = {name: survey for name, survey in surveys if survey is not None}
-    findings = [
-        (info.truncated, f'cut off: {info.truncated}'),
-        (reader.apart, 'a fit needs one clock for the stamps of all topics'),
-        (not n, _NO_SAMPLES),
-        *((True, finding) for finding in thermal_findings(thermometers, candidates)),
-        (cause, cause),
-        (
-            n and not still and not cause,
-            f'the unit never rests for 3 s, and a fit needs rests: {why_restless(reduced)}',
-        ),
-        (
-            clock.n_backwards,
-            f'samples with a stamp not later than an earlier stamp: {clock.n_backwards}; these '
-            'samples are left out',
-        ),
-        (
-            clock.n_restarts,
-            f'the stamps go back by more than an hour ({clock.n_restarts} times): a fit takes '
-            'each jump for a pause of an hour',
-        ),
-        (
-            clock.n_gaps,
-            f'gaps between samples: {clock.n_gaps}, the longest {clock.longest_gap_s:.3g} s',
-        ),
-    ]
+    if n and not still and not cause:
+        why = why_restless(reduced)
+        cause = f'the unit never rests for 3 s, and a fit needs rests: {why}'
+    findings = [f'cut off: {info.truncated}'] * bool(info.truncated)
+    findings += ['a fit needs one clock for the stamps of all topics'] * bool(reader.apart)
+    findings += [_NO_SAMPLES] * (not n) + thermal_findings(thermometers, candidates)
+    findings += [cause] * bool(cause) + clock.findings()
+    rate_hz = 1e9 / clock.step_ns if clock.step_ns else float('nan')
     duration_s = (clock.last_ns - clock.first_ns) * 1e-9
     # The last cell may extend beyond the samples: limit the time at rest to the duration.
     still_s = min(sum((upper - lower) * reduced.cell_s for lower, upper in still), duration_s)
-    return Survey(
-        info,
-        n,
-        duration_s,
-        1e9 / clock.step_ns if clock.step_ns else float('nan'),
-        len(still),
-        still_s,
-        thermometers,
-        [text for is_so, text in findings if is_so],
-    )
+    return Survey(info, n, duration_s, rate_hz, len(still), still_s, thermometers, findings)
 
 
 @dataclass
@@ -220,6 +199,19 @@ class _Clock:
         self.n_gaps += len(gaps)
         self.longest_gap_s = max(self.longest_gap_s, float(np.max(gaps, initial=0)) * 1e-9)
 
+    def findings(self) -> list[str]:
+        """List the kinds of stamps that do not rise, and the gaps."""
+        texts = {
+            f'samples with a stamp not later than an earlier stamp: {self.n_backwards}; these '
+            'samples are left out': self.n_backwards,
+            f'the stamps go back by more than an hour ({self.n_restarts} times): a fit takes '
+            'each jump for a pause of an hour': self.n_restarts,
+            f'gaps between samples: {self.n_gaps}, the longest {self.longest_gap_s:.3g} s': (
+                self.n_gaps
+            ),
+        }
+        return [text for text, count in texts.items() if count]
+
 
 def survey_thermometer(readings: Sequence[Readings]) -> ThermometerSurvey | None:
     """Describe a thermometer by its readings, given in pieces; None without a finite reading."""
@@ -251,3 +243,62 @@ def survey_thermometer(readings: Sequence[Readings]) -> ThermometerSurvey | None
         steepest_cooling_k_min=min(0.0, float(np.min(rates, initial=0.0))),
         quantum=float(np.min(steps[steps > 0.0], initial=np.inf)),
     )
+
+
+class CauseCounter:
+    """Counts samples that a working accelerometer at rest does not send, block by block."""
+
+    def __init__(self) -> None:
+        self._n = self._n_zero = self._n_absent = 0
+        self._is_imu = False
+        self._stamps_ns: set[int] = set()
+
+    def add(self, block: Block) -> None:
+        """Count zero samples, messages marked as without acceleration, and stamps of a block."""
+        self._n += len(block.accel_stamp_ns)
+        self._n_zero += int(np.count_nonzero(~block.accel.any(axis=1)))
+        if block.imu is not None:
+            self._is_imu = True
+            is_absent = block.imu.linear_acceleration_covariance[:, 0] == -1.0
+            self._n_absent += int(np.count_nonzero(is_absent))
+        if len(self._stamps_ns) < 2:  # two different stamps show that the clock runs
+            self._stamps_ns |= set(np.unique(block.accel_stamp_ns)[:2].tolist())
+
+    def cause(self, cells: Cells, still_sd: float) -> str:
+        """Describe why the samples cannot be those of an accelerometer at rest; '' if they can."""
+        if self._n_absent > _FAULT_SHARE * self._n:
+            return (
+                'the messages are marked as without acceleration '
+                '(linear_acceleration_covariance[0] = -1): use another topic of the driver'
+            )
+        if self._n > 1 and len(self._stamps_ns) == 1:
+            return unstamped(next(iter(self._stamps_ns)))
+        if self._n_zero == self._n and self._n:
+            return 'all samples are exactly zero: the sensor does not answer'
+        if self._n_zero > _GLITCH_SHARE * self._n:
+            return (
+                f'{100.0 * self._n_zero / self._n:.0f} % of the samples are exactly zero, between '
+                'other samples: the topic has two sources, or messages without an acceleration'
+            )
+        return self._unit_of(cells, still_sd) if self._is_imu else ''
+
+    def _unit_of(self, cells: Cells, still_sd: float) -> str:
+        """Name the fault if |a| at rest is near 1 (g), 1000 (mg) or 0 (no gravity); '' if not."""
+        scatter = cells.variance.max(axis=1, initial=0.0)
+        quiet = (cells.count > 1) & (scatter <= np.quantile(scatter, 0.5) if len(scatter) else 0)
+        if not quiet.any():
+            return ''
+        norm = float(np.median(np.linalg.norm(cells.mean[quiet], axis=1)))
+        sd = float(np.sqrt(np.median(scatter[quiet])))
+        for unit, one_g in (('g', 1.0), ('mg', 1000.0)):
+            if _WITH_GRAVITY[0] < norm / one_g < _WITH_GRAVITY[1] and sd < still_sd * one_g:
+                return (
+                    f'samples at rest have the norm {norm:.4g}, not {STANDARD_GRAVITY:.2f} m/s^2: '
+                    f'the samples are in {unit}, convert them to m/s^2 with thermo_comp convert'
+                )
+        if norm < _WITHOUT_GRAVITY * STANDARD_GRAVITY and sd < still_sd * STANDARD_GRAVITY:
+            return (
+                f'samples at rest have the norm {norm:.2g} m/s^2: gravity is subtracted (linear '
+                'or free acceleration), but the fit needs gravity: use another topic of the driver'
+            )
+        return ''

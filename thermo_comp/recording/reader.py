@@ -7,8 +7,6 @@ Reading order is that of a ROS player: log time, and for equal log times the pos
 The files of a split bag are read in the order of its metadata.yaml.
 """
 
-from __future__ import annotations
-
 import re
 from collections import ChainMap, Counter
 from collections.abc import Collection, Iterator, Mapping
@@ -75,18 +73,17 @@ class RecordingReader(ExitStack):
                 selected = select_topics(self.info.topics, topics, require, self.info.metadata)
                 self.topics: Mapping[Role, str] = selected.topics
                 self.fields = dict(self._fields(selected))
-            bare = [role for role, field in self.fields.items() if not field.has_stamp]
+            bare = [role for role, field in self.fields.items() if not field.header]
             note = f'no stamps in {", ".join(bare)}: a reading gets the stamp of the sample before'
-            chosen = '; '.join(filter(None, (selected.chosen, note if bare else '')))
-            self.info = replace(self.info, input=selected.input, chosen=chosen or None)
+            chosen = _notes(selected.chosen, note if bare else '')
+            self.info = replace(self.info, input=selected.input, chosen=chosen)
         except BaseException as error:
             self.close()
             if isinstance(error, OSError):
                 raise RecordingError(f'cannot be opened: {error.strerror}', path) from error
             raise
         self._part = topics.part
-        #: Time from the bag's first sample to the first sample of the selected part [s]; 0 until
-        #: this sample has been read.
+        #: Time from the bag's first sample to that of the part [s]; 0 until both are read.
         self.since_s = 0.0
         self.apart = ''  # warning about stamps that are all equal, or of a second clock
 
@@ -106,44 +103,32 @@ class RecordingReader(ExitStack):
         if described.compression == 'file':
             folder = self.enter_context(TemporaryDirectory(prefix='thermo_comp-'))
         notes = [described.note]
+        is_packed = described.compression == 'message'
         for name in described.files:
             file = name
             if folder:
                 file = Path(folder, name.stem)
                 with translated(name):
                     notes.append(expand(name, file))
-            is_packed = described.compression == 'message'
-            opened: McapFile | ForeignFile
-            if described.storage == 'mcap' and not is_packed:
-                opened = McapFile(file, name)
-            else:
-                opened = ForeignFile(file, name, is_packed=is_packed)
+            is_foreign = described.storage != 'mcap' or is_packed
+            opened = ForeignFile(file, name, is_packed) if is_foreign else McapFile(file, name)
             self.callback(opened.close)
             self._files.append(opened)
             if opened.truncated is not None:
                 front = f'{name.name}: ' if len(described.files) > 1 else ''
                 notes.append(front + opened.truncated)
-        channels: dict[str, list[Topic]] = {}
+        kinds: dict[str, dict[str, None]] = {}  # the types of each topic, without repetitions
+        counts: Counter[str] = Counter()
         for topic in (topic for file in self._files for topic in file.topics.values()):
-            channels.setdefault(topic.name, []).append(topic)
-        topics = {
-            name: (
-                ' | '.join(dict.fromkeys(o.type for o in carriers)),
-                sum(o.n_messages for o in carriers),
-            )
-            for name, carriers in channels.items()
-        }
-        for wanted, n_promised in described.counts.items():
-            notes.append(_loss(wanted, topics.get(wanted, ('', 0))[1], n_promised))
-        return RecordingInfo(
-            path,
-            self._files[0].storage,
-            topics,
-            min((f.start_ns for f in self._files if f.start_ns is not None), default=0),
-            max((f.end_ns for f in self._files if f.end_ns is not None), default=0),
-            '; '.join(filter(None, notes)) or None,
-            dict(ChainMap(*(f.metadata for f in self._files[::-1]), described.custom)),
-        )
+            kinds.setdefault(topic.name, {})[topic.type] = None
+            counts[topic.name] += topic.n_messages
+        topics = {name: (' | '.join(types), counts[name]) for name, types in kinds.items()}
+        notes += [_loss(name, counts[name], n) for name, n in described.counts.items()]
+        start_ns = min((f.start_ns for f in self._files if f.start_ns is not None), default=0)
+        end_ns = max((f.end_ns for f in self._files if f.end_ns is not None), default=0)
+        metadata = dict(ChainMap(*(f.metadata for f in self._files[::-1]), described.custom))
+        storage, missing = self._files[0].storage, _notes(*notes)
+        return RecordingInfo(path, storage, topics, start_ns, end_ns, missing, metadata)
 
     def blocks(self, *, raw: bool = False) -> Iterator[Block]:
         """Read the selected part of the bag (`Topics.part`), in blocks."""
@@ -171,13 +156,12 @@ class RecordingReader(ExitStack):
                 n_read[role] += len(block.log_ns[role])
             if block.n_messages:
                 yield block
-        chosen = '; '.join(filter(None, (self.info.chosen, self.apart)))
-        self.info = replace(self.info, chosen=chosen or None)
+        info = replace(self.info, chosen=_notes(self.info.chosen, self.apart))
         for role, topic in self.topics.items():
-            loss = _loss(topic, n_read[role], self.info.topics[topic][1])
-            if loss and loss not in (self.info.truncated or ''):
-                losses = '; '.join(filter(None, (self.info.truncated, loss)))
-                self.info = replace(self.info, truncated=losses)
+            loss = _loss(topic, n_read[role], info.topics[topic][1])
+            if loss and loss not in (info.truncated or ''):
+                info = replace(info, truncated=_notes(info.truncated, loss))
+        self.info = info
 
     def raw(self, topics: Collection[str]) -> Iterator[tuple[Topic, Messages]]:
         """Read serialized messages of topics (the bag's names) in batches, each split by topic."""
@@ -217,12 +201,11 @@ class RecordingReader(ExitStack):
         last_ns = n_kept = 0
         for block in blocks:
             if len(block):
-                last_ns = int(block.accel_stamp_ns[-1])
                 first_ns = int(block.accel_stamp_ns[0]) if first_ns == inf else first_ns
+                last_ns = int(block.accel_stamp_ns[-1])
             begin, end = self._part.limits_ns(first_ns)
-            left = block.take(
-                {role: (ns >= begin) & (ns < end) for role, ns in block.stamp_ns.items()}
-            )
+            is_in = {role: (ns >= begin) & (ns < end) for role, ns in block.stamp_ns.items()}
+            left = block.take(is_in)
             if len(left) and not n_kept:
                 self.since_s = (int(left.accel_stamp_ns[0]) - first_ns) * 1e-9
             n_kept += len(left)
@@ -255,6 +238,18 @@ def inspect_recording(path: str | Path, topics: Topics | None = None) -> Recordi
         return reader.info
 
 
+@dataclass(frozen=True, slots=True)
+class _Description:
+    """The files of a bag, their compression, message counts by topic, a note on missing parts."""
+
+    storage: str
+    files: tuple[Path, ...]
+    compression: str = ''
+    custom: dict[str, str] = field(default_factory=dict)
+    counts: dict[str, int] = field(default_factory=dict)
+    note: str | None = None
+
+
 def _described(path: Path) -> _Description:
     """Find the files of a bag; RecordingError if the path is not a bag."""
     if not path.exists():
@@ -282,18 +277,6 @@ def _described(path: Path) -> _Description:
             path,
         )
     return _Description(path.suffix[1:], (path,))
-
-
-@dataclass(frozen=True, slots=True)
-class _Description:
-    """The files of a bag, their compression, message counts by topic, a note on missing parts."""
-
-    storage: str
-    files: tuple[Path, ...]
-    compression: str = ''
-    custom: dict[str, str] = field(default_factory=dict)
-    counts: dict[str, int] = field(default_factory=dict)
-    note: str | None = None
 
 
 def _read_metadata(directory: Path) -> _Description | None:
@@ -340,19 +323,19 @@ def _place_of(file: Path) -> tuple[int, str]:
     return (int(number[1]) if number else 0, file.name)
 
 
-def _loss(topic: str, n_read: int, n_promised: int) -> str | None:
-    if n_read >= n_promised:
-        return None
-    return f'{shown(topic)}: {n_read} of {n_promised} listed messages are in the bag'
+def _notes(*notes: str | None) -> str | None:
+    return '; '.join(filter(None, notes)) or None
+
+
+def _loss(topic: str, n_read: int, n_promised: int) -> str:
+    text = f'{shown(topic)}: {n_read} of {n_promised} listed messages are in the bag'
+    return text if n_read < n_promised else ''
 
 
 class ForeignFile(BagFile):
-    """
-    A file that `rosbags` reads: sqlite3, ROS 1, or MCAP with messages that are compressed one by
-    one (`is_packed`).
-    """
+    """A file read by `rosbags`: sqlite3, ROS 1, MCAP with compressed messages (`is_packed`)."""
 
-    def __init__(self, path: Path, name: Path, *, is_packed: bool = False) -> None:
+    def __init__(self, path: Path, name: Path, is_packed: bool) -> None:
         from rosbags.rosbag1 import Reader as Reader1
         from rosbags.rosbag2 import Reader as Reader2
 

@@ -55,6 +55,12 @@ class Messages:
         numbers, times = np.asarray(channel, np.uint16), np.asarray(log_ns, np.int64)
         return cls(data, np.cumsum(size) - size, size, numbers, times)
 
+    @classmethod
+    def of_rows(cls, rows: Bytes, channel: NDArray[np.uint16], log_ns: Ints) -> Messages:
+        """Take the messages from rows of bytes, shape (n, size)."""
+        size = np.full(len(rows), rows.shape[1])
+        return cls(rows.ravel(), np.cumsum(size) - size, size, channel, log_ns)
+
     def __len__(self) -> int:
         return len(self.start)
 
@@ -73,7 +79,7 @@ class Messages:
     def places_of(self, numbers: Collection[int]) -> Ints:
         """Return the indices of the messages of some channels."""
         is_own = np.zeros(len(self), np.bool_)
-        for number in numbers:
+        for number in numbers:  # several times as fast as `np.isin`
             is_own |= self.channel == number
         return np.flatnonzero(is_own)
 

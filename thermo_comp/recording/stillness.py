@@ -11,8 +11,6 @@ not a step. Two tests have absolute limits, because the quietest tenth of a flig
 at rest the sd of samples is below `still_sd`, and the angular rate within 1 deg/s of its median.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -20,14 +18,12 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ..typing import Bools, Floats, Ints
-from .coloured_noise import roughest_at_rest, spread_of_variances
-from .glitches import is_glitch
+from .noise import is_glitch, roughest_at_rest, spread_of_variances
 
 #: Largest variance of a cell at rest (30 samples or more) / the bag's noise variance: white noise
 #: exceeds 4 with a probability below 1e-11, and vibration that must be cut out is far above 4.
 VARIANCE_RATIO = 4.0
-#: Largest sd of samples at rest [g]: above the noise of the noisiest sensors, below the scatter
-#: in most flights.
+#: Largest sd of samples at rest [g]: above the noise of any sensor, below that of most flights.
 STILL_SD = 0.05
 # Largest sd of the angular rate within a cell at rest, and largest distance of a cell's mean rate
 # from the level [rad/s]. The level (medians over `_LEVEL_S` [s], interpolated) follows the bias.
@@ -85,7 +81,7 @@ class Cells:
     rate: Floats
     rate_variance: Floats
 
-    def part(self, which: slice) -> Cells:
+    def part(self, which: slice) -> 'Cells':
         """Select consecutive cells."""
         names = 'time count index mean variance roughness seam rate rate_variance'
         return replace(self, **{name: getattr(self, name)[which] for name in names.split()})
@@ -104,8 +100,8 @@ class CellAccumulator:
         window_s: float | None = None,
         least: int = MIN_SAMPLES,
     ) -> None:
-        self._least = least
-        self._asked_cell_s, self._window_s, self._full_scale = cell_s, window_s, full_scale
+        self._asked_cell_s, self._window_s, self._least = cell_s, window_s, least
+        self._full_scale = full_scale
         self._cell_ns = self._start_ns = 0
         self._last_ns: int | None = None
         self._last = np.zeros((0, 3))  # last sample of the previous block
@@ -113,8 +109,8 @@ class CellAccumulator:
         # Row of a cell: its number, number of samples, sums of times, samples and their squares;
         # change from the cell before; sum of squared changes. The last cell may get more samples.
         self._sums: list[Floats] = [np.empty((0, 15))]
-        self._n_dropped = self._n_saturated = self._n_glitches = self._n_looked_at = 0
-        self._n_repeated = 0
+        self._n_dropped = self._n_saturated = self._n_glitches = self._n_repeated = 0
+        self._n_looked_at = 0
         self._is_integer, self._is_negative = True, False
         self._middle, self._quantum = 0.0, np.zeros(3)
         self._few_changes = [np.zeros(0)] * 3
@@ -124,7 +120,7 @@ class CellAccumulator:
         if not len(stamp_ns):
             return
         use = (np.abs(samples) < _LARGEST).all(axis=1)
-        before = self._last_ns if self._last_ns is not None else int(stamp_ns[0]) - 1
+        before = int(stamp_ns[0]) - 1 if self._last_ns is None else self._last_ns
         use &= stamp_ns > np.maximum.accumulate(np.concatenate(([before], stamp_ns[:-1])))
         self._n_dropped += int((~use).sum())
         self._n_repeated += int((np.diff(stamp_ns, prepend=before) == 0).sum())
@@ -147,12 +143,10 @@ class CellAccumulator:
             if self._n_looked_at >= _QUANTUM_SAMPLES:
                 break
             part = samples[first : first + _QUANTUM_SAMPLES - self._n_looked_at]
-            self._quantum = np.where(
-                self._quantum > 0.0, self._quantum, _quantum_of(part, self._few_changes)
-            )
+            quantum = _quantum_of(part, self._few_changes)
+            self._quantum = np.where(self._quantum > 0.0, self._quantum, quantum)
             self._n_looked_at += int((part[1:] != part[:-1]).any(axis=1).sum()) + 1
-        if self._is_integer:
-            self._is_integer = bool((samples == np.rint(samples)).all())
+        self._is_integer = self._is_integer and bool((samples == np.rint(samples)).all())
         rate = None if rate is None else rate[use]
         glitches = is_glitch(samples, self._quantum)
         if glitches.any():
@@ -173,12 +167,12 @@ class CellAccumulator:
         self._sums = [sums]  # join only once
         index, count = sums[:, 0].astype(np.int64), sums[:, 1]
         total, square = np.split(sums[:, 3:-6], 2, axis=1)
-        pairs = 2.0 * np.maximum(count[:, None] - 1.0, 1.0)
+        n_free = np.maximum(count[:, None] - 1.0, 1.0)
         mean = total / count[:, None]
         # Set a variance below the rounding error of the two sums to 0, as for equal samples.
         spread = square - count[:, None] * mean**2
         spread[spread < np.finfo(np.float64).eps * count[:, None] * square] = 0.0
-        variance = spread / np.maximum(count[:, None] - 1.0, 1.0)
+        variance = spread / n_free
         rate, rate_variance = (
             x[:, 3:] if x.shape[1] > 3 else np.zeros((len(x), 3)) for x in (mean, variance)
         )
@@ -190,9 +184,8 @@ class CellAccumulator:
             *(self._n_dropped, self._n_saturated, self._n_glitches, self._n_repeated),
             *(self._is_integer, quantum, self._middle),
             *(sums[:, 2] / count + index * cell_s, count.astype(np.int64), index),
-            *(mean[:, :3] + self._shift, variance[:, :3], sums[:, -3:] / pairs),
-            sums[:, -6:-3],
-            *(rate, rate_variance),
+            *(mean[:, :3] + self._shift, variance[:, :3], sums[:, -3:] / (2.0 * n_free)),
+            *(sums[:, -6:-3], rate, rate_variance),
         )
 
     def _look_for_sign(self, samples: Floats) -> None:
@@ -233,9 +226,8 @@ class CellAccumulator:
         columns[:, 3 + n : -6] = columns[:, 3 : 3 + n] ** 2
         last = self._sums[-1]
         before = np.concatenate((last[-1:, 0] if len(last) else ids[:1], ids[:-1]))
-        change = np.diff(
-            np.concatenate((self._last if len(last) else samples[:1], samples)), axis=0
-        )
+        previous = self._last if len(last) else samples[:1]
+        change = np.diff(np.concatenate((previous, samples)), axis=0)
         columns[:, -3:] = np.where((ids == before)[:, None], change**2, 0.0)
         columns[:, -6:-3] = np.where((ids == before + 1)[:, None], change, 0.0)
         self._last = samples[-1:]
@@ -329,8 +321,7 @@ def still_runs(
         quiet = plausible & (cells.variance <= ratio * noise + by_drift).all(axis=1)
         roughest = roughest_at_rest(cells, quiet, colour > 1.0, ratio)
         quiet &= (cells.roughness <= roughest).all(axis=1)
-        # At rest the last sample of a cell and the first sample of the next cell differ by at most
-        # `_STEP_SDS` sd of a difference of two samples.
+        # Limit of the change from the last sample of a cell to the first sample of the next cell.
         is_seamless = np.abs(cells.seam[1:]) <= _STEP_SDS * np.sqrt(2.0 * roughest / ratio)
         broken = ~(_is_joined(cells, quiet, drift) & is_seamless.all(axis=1))
         # Exclude cells adjacent to a moving cell or to a step: the motion may extend into them.
@@ -370,16 +361,13 @@ def why_restless(cells: Cells, still_sd: float = STILL_SD) -> str:
     runs = np.flatnonzero(edges < 0) - np.flatnonzero(edges > 0)
     longest_s = float(np.max(runs, initial=0)) * cells.cell_s
     longest = f'{longest_s:.3g}' if longest_s < 999.5 else f'{longest_s:.0f}'
-    return (
-        f'the unit is quiet for {longest} s at most, as if worn or driven, but must rest in each '
-        'position'
-    )
+    text = f'the unit is quiet for {longest} s at most, as if worn or driven, '
+    return text + 'but must rest in each position'
 
 
 def _is_full(cells: Cells) -> Bools:
-    if not len(cells.count):
-        return np.zeros(0, dtype=bool)
-    return np.asarray(cells.count >= max(2.0, 0.5 * float(np.median(cells.count))))
+    usual = float(np.median(cells.count)) if len(cells.count) else 0.0
+    return np.asarray(cells.count >= max(2.0, 0.5 * usual))
 
 
 def _one_g(cells: Cells) -> float:
@@ -429,15 +417,12 @@ def _is_joined(cells: Cells, quiet: Bools, drift: Floats) -> Bools:
     if not both.any():
         return np.zeros(len(step), dtype=bool)
     # With many short rests most steps between cells are turns: limit the spread of the steps.
-    spread = np.minimum(
-        1.4826 * np.median(np.abs(step[both]), axis=0), STILL_SD / _STEP_SDS * _one_g(cells)
-    )
+    spread = 1.4826 * np.median(np.abs(step[both]), axis=0)
+    spread = np.minimum(spread, STILL_SD / _STEP_SDS * _one_g(cells))
     square = cells.variance / cells.count[:, None]
     noise = np.sqrt(np.maximum(2.0 * np.median(square[quiet], axis=0), square[1:] + square[:-1]))
     # Samples that are mostly equal change by a whole quantum without a knock.
     is_stuck = np.median(cells.variance[quiet], axis=0) < (_STUCK * cells.quantum) ** 2
-    limit = np.maximum(
-        _STEP_SDS * np.maximum(spread, noise), np.where(is_stuck, 1.1 * cells.quantum, 0.0)
-    )
-    joined: Bools = both & (np.abs(step) <= limit).all(axis=1)
-    return joined
+    change = np.where(is_stuck, 1.1 * cells.quantum, 0.0)
+    limit = np.maximum(_STEP_SDS * np.maximum(spread, noise), change)
+    return np.asarray(both & (np.abs(step) <= limit).all(axis=1))

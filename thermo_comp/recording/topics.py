@@ -2,14 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the search for the inputs' topics in a bag, and error messages for missing topics."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import inf, isfinite
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Literal, NamedTuple, cast
 
 from ..errors import RecordingError, ThermoCompError
@@ -105,7 +102,7 @@ class Topics:
     input: Input = 'auto'  # 'auto' prefers counts to an Imu
 
     @classmethod
-    def named(cls, names: Mapping[str, str], **others: Any) -> Topics:
+    def named(cls, names: Mapping[str, str], **others: Any) -> 'Topics':
         """
         Build from topics by input: ``counts``, ``imu``, ``board``, ``case``, ``temperature/NAME``.
         If the topic of only one of ``counts`` and ``imu`` is given, this input is read.
@@ -178,23 +175,19 @@ def shown(name: str) -> str:
     return one_line(name if len(name) <= _MAX_SHOWN else name[:_MAX_SHOWN] + '...')
 
 
-def choice_note(name: str, key: str, wanted: str, among: str = 'only') -> str:
+def choice_note(name: str, key: str, wanted: str, among: str) -> str:
     """Note that a topic was chosen for an input by its type; '' if its name is the wanted name."""
-    kind = _TYPES[key].rpartition('/')[2]
-    is_named = is_called(name, split_field(wanted)[0])
-    return '' if is_named else f'{shown(name)}, its {among} {kind}, is taken for {key}'
+    if is_called(name, split_field(wanted)[0]):
+        return ''
+    return f'{shown(name)}, its {among} {_TYPES[key].rpartition("/")[2]}, is taken for {key}'
 
 
 def select_topics(
-    present: Present,
-    topics: Topics,
-    require: Collection[Role],
-    metadata: Mapping[str, str] = MappingProxyType({}),
+    present: Present, topics: Topics, require: Collection[Role], metadata: Mapping[str, str]
 ) -> Selected:
     """
-    Find the topic of each role (``accel`` or a thermometer) among the topics with messages, the
-    input of samples (counts or imu), and a note on topics chosen by their type. RecordingError for
-    a topic that is ambiguous, has a wrong type, or is in `require` and missing.
+    Find the topic of each role among the topics with messages. RecordingError for a topic that is
+    ambiguous, has a wrong type, is used twice, or is in `require` and missing.
     """
     if require and not any(count for _, count in present.values()):
         raise RecordingError('the bag holds no messages')
@@ -213,35 +206,27 @@ def select_topics(
                 raise RecordingError('the topic has no messages', key=shown(name))
         elif role in require:
             raise _missing(present, {key: getattr(topics, key) for key in wanted}, corrected)
-    among = ["driver's", 'only']  # note: topic named as in REP 145, or only topic of its type
-    chosen = [
-        choice_note(
-            name_of[role], key, getattr(topics, key), among[not is_called(name_of[role], _RAW)]
-        )
-        for role, key in keys.items()
-    ]
+    chosen = []
+    for role, key in keys.items():
+        name = name_of[role]
+        among = "driver's" if is_called(name, _RAW) else 'only'  # named as in REP 145, or by type
+        chosen.append(choice_note(name, key, getattr(topics, key), among))
     if corrected and 'accel' not in name_of:
         chosen.append(_text_of_corrected(corrected))
     name_of |= _further(present, topics, name_of, is_read=bool(require))
     if 'accel' in name_of and 'board' not in name_of:
         chosen.append(_text_of_unnamed(present, topics.board, set(name_of.values())))
     named = {**topics.further, 'board': topics.board, 'case': topics.case}
-    fields = {role: split_field(named.get(role, ''))[1] for role in name_of if role != 'accel'}
-    fields = {
-        role: field or PLAIN.get(present[name_of[role]][0], '') for role, field in fields.items()
-    }
-    fields = {role: field for role, field in fields.items() if field}
-    _check_twins(name_of, fields)
+    fields: dict[Role, str] = {}
+    roles: dict[tuple[str, str], Role] = {}
+    for role, name in name_of.items():
+        field = split_field(named.get(role, ''))[1] or PLAIN.get(present[name][0], '')
+        if (twin := roles.setdefault((name, field), role)) != role:
+            raise RecordingError(TWINS.format(twin, role), key=shown(name))
+        if field:
+            fields[role] = field
     text = '; '.join(filter(None, chosen)) or None
     return Selected(name_of, fields, cast(Any, keys.get('accel')), text)
-
-
-def _check_twins(topics_of: Mapping[Role, str], fields: Mapping[Role, str]) -> None:
-    """Refuse the same topic and field for two inputs."""
-    roles: dict[tuple[str, str], Role] = {}
-    for role, name in topics_of.items():
-        if (twin := roles.setdefault((name, fields.get(role, '')), role)) != role:
-            raise RecordingError(TWINS.format(twin, role), key=shown(name))
 
 
 def _candidates(
@@ -260,20 +245,21 @@ def _candidates(
             continue
         of_type = [
             name
-            for name, (kind, count) in present.items()
-            if count
-            and kind == _TYPES[key]
-            and name != corrected
-            and not any(is_called(name, other) for other in taken)
+            for name in of_kind(present, _TYPES[key])
+            if name != corrected and not any(is_called(name, other) for other in taken)
         ]
-        raw = [name for name in of_type if is_called(name, _RAW)]
-        only = raw or of_type
+        only = [name for name in of_type if is_called(name, _RAW)] or of_type
         if key == 'counts':
             only = [name for name in only if not _NO_FORCE.search(name)]
         if len(only) == 1:
             yield key, only[0]
         if of_type and key == 'imu':
             return  # with several Imu topics, do not choose counts instead
+
+
+def of_kind(present: Present, kind: str) -> list[str]:
+    """List the topics of a type that have messages."""
+    return [name for name, (type_, count) in present.items() if type_ == kind and count]
 
 
 def _corrected(present: Present, metadata: Mapping[str, str]) -> str:
@@ -292,15 +278,10 @@ def _text_of_corrected(name: str) -> str:
 
 def _text_of_unnamed(present: Present, board: str, taken: Collection[str]) -> str:
     """Return advice on unused temperature topics, one of which may be the board's, or ''."""
-    names = [
-        shown(name)
-        for name, (kind, count) in present.items()
-        if count and kind == TEMPERATURE and name not in taken
-    ]
-    if not names:
-        return ''
-    text = ' or '.join(sorted(names))
-    return f'no {board}: if the board thermometer is {text}, give --topic board=TOPIC'
+    names = sorted(shown(name) for name in of_kind(present, TEMPERATURE) if name not in taken)
+    among = ' or '.join(names)
+    text = f'no {board}: if the board thermometer is {among}, give --topic board=TOPIC'
+    return text if names else ''
 
 
 def _further(
@@ -318,10 +299,9 @@ def _further(
     namespace, is_usual, _ = beside.rpartition('temperature/')
     front = f'{namespace}temperature/' if is_usual else '/temperature/'
     taken = {*topics_of.values(), *both.values()}
-    for name, (kind, count) in present.items():
+    for name in of_kind(present, TEMPERATURE):
         sensor = name.removeprefix(front)
-        is_beside = kind == TEMPERATURE and count and sensor != name and name not in taken
-        if is_beside and is_thermometer(sensor):
+        if sensor != name and name not in taken and is_thermometer(sensor):
             both.setdefault(sensor, name)
     return dict(sorted(both.items()))
 
@@ -366,7 +346,5 @@ def _missing(present: Present, wanted: Mapping[str, str], corrected: str = '') -
     if wanted.keys() == {'imu'} and any(is_called(name, _USUAL.counts) for name in present):
         listed += '; the calibration or --input requires an Imu in m/s^2, not counts'
     option = ' or '.join(f'--topic {key}=TOPIC' for key in wanted)
-    return RecordingError(
-        f'no such topic; the bag has {listed}; name another with {option}',
-        key=' or '.join(wanted.values()),
-    )
+    reason = f'no such topic; the bag has {listed}; name another with {option}'
+    return RecordingError(reason, key=' or '.join(wanted.values()))

@@ -72,7 +72,9 @@ def decode_blocks(
             if role in topics and topics[role].encoding == 'ros1':
                 taken = as_cdr(taken, topics[role].type)
             if role in fields:
-                taken = _as_temperatures(taken, *fields[role].read(taken))
+                read_ns, values = fields[role].read(taken)
+                rows = encode_stamped(read_ns, '', N_NUMBERS[kind], [(0, values[:, None])])
+                taken = Messages.of_rows(rows, taken.channel, taken.log_ns)
             stamp_ns, numbers, frame = decode_stamped(taken, kind)
         except RecordingError as error:
             raise RecordingError(error.message, key=shown(topics[role].name)) from error
@@ -92,32 +94,14 @@ def decode_blocks(
         log_ns[role] = taken.log_ns
         if keep_raw and len(taken):
             raw[role] = taken.packed()
-    return [
-        Block(
-            samples_ns,
-            np.ascontiguousarray(samples[:, _IMU_ACCELERATION]) if is_imu else samples,
-            frames[0].decode('utf-8', 'replace') if len(frames) else '',
-            ImuColumns(*(samples[:, c] for c in _IMU_COLUMNS)) if is_imu else None,
-            temperatures,
-            log_ns,
-            raw,
-        )
-    ]
-
-
-def _as_temperatures(messages: Messages, stamp_ns: Ints, values: Floats) -> Messages:
-    """Serialize readings as Temperature messages with the channels and log times of `messages`."""
-    rows = encode_stamped(stamp_ns, '', N_NUMBERS[TEMPERATURE], [(0, values[:, None])])
-    size = np.full(len(rows), rows.shape[1])
-    begins = np.cumsum(size) - size
-    return Messages(rows.ravel(), begins, size, messages.channel, messages.log_ns)
+    imu = ImuColumns(*(samples[:, c] for c in _IMU_COLUMNS)) if is_imu else None
+    samples = np.ascontiguousarray(samples[:, _IMU_ACCELERATION]) if is_imu else samples
+    frame_id = frames[0].decode('utf-8', 'replace') if len(frames) else ''
+    return [Block(samples_ns, samples, frame_id, imu, temperatures, log_ns, raw)]
 
 
 def decode_stamped(messages: Messages, kind: str) -> tuple[Ints, Floats, NDArray[Any]]:
-    """
-    Decode messages of `kind`, a key of `N_NUMBERS` (a header and k float64 numbers), to stamps,
-    numbers, shape (n, k), and values of `frame_id`.
-    """
+    """Decode a header and k float64 numbers to stamps, numbers, shape (n, k), and frame_ids."""
     n, n_numbers, size = len(messages), N_NUMBERS[kind], messages.size
     if not n:
         return size, np.empty((0, n_numbers)), np.empty(0, 'S1')
@@ -137,10 +121,8 @@ def decode_stamped(messages: Messages, kind: str) -> tuple[Ints, Floats, NDArray
             return columns
     representation = int(number_at(rows, 0, '>u2')[0])
     if representation > 1:
-        raise RecordingError(
-            f'serialized with representation {representation:#06x}, '
-            'expected plain CDR (0x0000 or 0x0001)'
-        )
+        reason = f'serialized with representation {representation:#06x}, '
+        raise RecordingError(reason + 'expected plain CDR (0x0000 or 0x0001)')
     endian = '<' if representation else '>'
     frame_size = int(number_at(rows, 12, f'{endian}u4')[0])
     # The numbers start (12 + length of frame_id + 7) // 8 * 8 bytes after the encapsulation.
@@ -170,7 +152,7 @@ def encode_stamped(
     head = pack('<BBHiII', 0, 1, 0, 0, 0, len(text)) + text
     body = 4 + (len(head) + 3) // 8 * 8
     row = np.frombuffer(bytearray(head.ljust(body, b'\0') + bytes(8 * n_numbers)), np.uint8)
-    # Write values that are equal in all messages to the template row, which is then copied.
+    # Values that are equal in all messages are in the row that is copied: this saves much time.
     for column, values in pieces:
         if values.ndim == 1:
             row[body:].view('<f8')[column : column + len(values)] = values

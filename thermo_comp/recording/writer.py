@@ -4,12 +4,10 @@
 Owns the writing of columns to a rosbag2 directory or a bare MCAP file, or block by block to a
 table in CSV or Parquet (with the optional dependency ``parquet``).
 
-A bag or table gets its name only when it is complete; if writing fails, an older file of this name
-stays.
+A bag or table gets its name when it is complete; if writing fails, an older file stays.
 """
 
 import csv
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import replace
@@ -20,8 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import OutputError, RecordingError
-from ..files import CSV, PARQUET, Draft, Kind, bag_kind, drafted
-from ..topics import BOOL, IMU, N_NUMBERS, TEMPERATURE, VECTOR3_STAMPED
+from ..files import CSV, PARQUET, Draft, Kind, bag_kind, drafted, sync
+from ..topics import IMU, N_NUMBERS, TEMPERATURE, VECTOR3_STAMPED
 from ..typing import Ints
 from .blocks import ImuColumns
 from .mcap_out import Compression, McapOutput, dump_yaml, known_definition
@@ -117,11 +115,6 @@ class BagWriter(AbstractContextManager['BagWriter']):
         columns += [(at, f'imu.{name}', part, width) for at, name, part, width in places]
         self._write_stamped(topic, IMU, stamp_ns, log_ns, frame_id, columns)
 
-    def write_bool(self, topic: str, log_ns: ArrayLike, values: ArrayLike) -> None:
-        """Write std_msgs/Bool messages."""
-        rows = [b'\0\1\0\0' + bytes([flag]) for flag in np.asarray(values, np.bool_).tolist()]
-        self.write_raw(topic, BOOL, log_ns, rows)
-
     def write_raw(
         self,
         topic: str,
@@ -153,10 +146,9 @@ class BagWriter(AbstractContextManager['BagWriter']):
                 information = self._file.finish()
                 if not self._is_file:
                     text = dump_yaml({'rosbag2_bagfile_information': information})
-                    with (self._draft.partial / 'metadata.yaml').open('wb') as file:
-                        file.write(text.encode())
-                        file.flush()
-                        os.fsync(file.fileno())
+                    path = self._draft.partial / 'metadata.yaml'
+                    path.write_bytes(text.encode())
+                    sync(path)
             self._draft.publish()
             self._file = None
         except BaseException:
@@ -201,10 +193,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
                 )
             pieces.append((at, numbers))
         rows = encode_stamped(stamps, frame_id, N_NUMBERS[kind], pieces)
-        size = np.full(len(rows), rows.shape[1])
-        channel = np.zeros(len(rows), np.uint16)
-        messages = Messages(rows.ravel(), np.cumsum(size) - size, size, channel, times)
-        self._add(topic, kind, messages)
+        self._add(topic, kind, Messages.of_rows(rows, np.zeros(len(rows), np.uint16), times))
 
     def _add(
         self, topic: str, kind: str, messages: Messages, definition: tuple[str, str] | None = None
@@ -263,13 +252,12 @@ def table_writer(
         writer: Any = None
         if kind is CSV:
             text = stack.enter_context(partial.open('w', encoding='utf-8', newline=''))
+            lines = csv.writer(text, lineterminator='\n')
 
             def write_lines(columns: Mapping[str, NDArray[Any]]) -> None:
-                nonlocal writer
-                if writer is None:
-                    writer = csv.writer(text, lineterminator='\n')
-                    writer.writerow(columns)
-                writer.writerows(zip(*(col.tolist() for col in columns.values()), strict=True))
+                if not text.tell():
+                    lines.writerow(columns)
+                lines.writerows(zip(*(col.tolist() for col in columns.values()), strict=True))
 
             yield write_lines
             return

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the limits of a cell's variance and roughness at rest, if a low pass has coloured the noise.
+Owns the noise of samples at rest: glitches, single samples with wrong bits as after a transfer
+error, and the limits of a cell's variance and roughness if a low pass has coloured the noise.
 
 A cell is a run of about 0.5 s of samples; its roughness is half the mean square change from sample
 to sample, which equals the variance for white noise.
@@ -18,12 +19,46 @@ from ..typing import Bools, Floats
 if TYPE_CHECKING:
     from .stillness import Cells
 
+# Smallest distance of a glitch from the mean of its neighbours, in sd of the noise.
+_SDS = 25.0
+# Smallest distance of a glitch from the mean of its neighbours, divided by the samples' norm: the
+# carried remainder of a converter changes single samples by a count, which is no glitch.
+_LEAST = 0.02
+# Smallest number of samples from which the noise is estimated; with fewer no glitch is searched.
+_FEWEST = 30
 # Standard normal quantiles of the probabilities 0.1 and 1 - 1e-11.
 _TENTH, _NEVER = -1.2816, 6.7
 # Noise is coloured if a cell's degrees of freedom are below this fraction of those of white noise;
 # smallest number of degrees of freedom of a cell; number of iterations in `spread_of_variances`
 # and of trial values in `roughest_at_rest`.
 _COLOURED, _FEWEST_FREE, _ITERATIONS = 0.5, 2.0, 30
+
+
+def is_glitch(samples: Floats, quantum: Floats) -> Bools:
+    """
+    Return which samples, shape (n, 3), are glitches: a glitch is far from its two neighbours, the
+    neighbours agree, and no motion is near. A glitch left in the data would end a rest.
+    """
+    result = np.zeros(len(samples), dtype=bool)
+    if len(samples) < _FEWEST:
+        return result
+    # Noise and norm are estimated from at most 4000 samples, to save time.
+    every = slice(None, None, max(len(samples) // 2000, 1))
+    least = _LEAST * float(np.median(np.linalg.norm(samples[every], axis=1)))
+    x = np.ascontiguousarray(samples.T)
+    bend = np.abs(x[:, 1:-1] - 0.5 * (x[:, 2:] + x[:, :-2]))
+    noise = np.maximum(np.median(bend[:, every], axis=1) / 0.6745, quantum)
+    limit = np.maximum(_SDS * noise, least)[:, np.newaxis]
+    is_moving = np.pad((bend > limit / 3.0).any(axis=0), 1)
+    is_far = bend > limit
+    if is_far.any():
+        is_far &= np.abs(x[:, 2:] - x[:, :-2]) < 0.5 * bend
+    at = 1 + np.flatnonzero(is_far.any(axis=0))
+    # The second to fourth sample on each side of a glitch must show no motion.
+    beside = np.array([-4, -3, -2, 2, 3, 4])
+    around = np.clip(at[:, np.newaxis] + beside, 0, len(samples) - 1)
+    result[at[~is_moving[around].any(axis=1)]] = True
+    return result
 
 
 def spread_of_variances(cells: Cells, plausible: Bools, level: Floats) -> Floats:
