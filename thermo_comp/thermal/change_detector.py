@@ -3,15 +3,12 @@
 """
 Owns the detection of departures: a temperature's rate leaves the baseline, its rate in a soak.
 
-Two Kalman filters of temperature and rate, one with a long and one with a short memory, have white
-noise as second derivative. A rate has departed if it differs from the baseline, away from 0, by
-more than swing, error of the baseline and a multiple of the sd of the noise; the multiple follows
-from the permitted rate of false alarms (Rice's formula, docs/regime.md). The swing is the
-amplitude of the rate's oscillation in a soak: the ripple of the surroundings (a setting) divided
-by the lag of the sensor, or the observed amplitude if larger.
-
-The readings of a sensor with a quantum lie in cells of one quantum. If noise cannot cross a cell,
-the filters are not used: two edges of cells crossed in the same direction give the mean rate.
+docs/regime.md derives the test. Two Kalman filters of temperature and rate, one with a long and one
+with a short memory, have white noise as second derivative. A rate has departed if it differs from
+the baseline, away from 0, by more than swing, error of the baseline and a multiple of the sd of
+the noise; the multiple follows from the permitted rate of false alarms (Rice's formula [1]_). If
+noise cannot move the readings of a quantized sensor across a cell of one quantum, the filters are
+not used: two edges of cells crossed in the same direction give the mean rate.
 
 References
 ----------
@@ -73,14 +70,7 @@ class ChangeDetector:
         self._has_cells = sensor.has_cells
         self._by_edges = sensor.has_wide_cells
         self._stamp_ns: int | None = None
-        self._n_restarts = -1
-        self._filters: list[tuple[float, float, float, float, float]] = []
         self._dt = 0.0
-        self._thresholds: list[float] = []
-        self._noise_share = 0.0
-        self._edge_margin = 0.0
-        self._settled_s = 0.0
-        self._age_s = 0.0
         self.rate = 0.0
         self.swing = self._ripple_rate
         self._baseline = 0.0
@@ -89,11 +79,7 @@ class ChangeDetector:
         self._trend = 0.0
         self._is_above = False
         self._turned_s = 0.0
-        self._peak = 0.0
-        self._peak_before = 0.0
-        self._edge = nan
-        self._edge_ns = 0
-        self._reading = nan
+        self._peak = self._peak_before = 0.0
 
     def settle(self, sensor: Thermometer, least_error: float = 0.0) -> None:
         """Begin a soak: the rate becomes the baseline, with at least the error `least_error`."""
@@ -138,9 +124,7 @@ class ChangeDetector:
         if self._by_edges:
             departure = self._watch_edges(stamp_ns, sensor, low, high)
         else:
-            departure = self._watch_filters(
-                dt, sensor.measured, sensor.measured_variance, low, high
-            )
+            departure = self._watch_filters(dt, sensor, low, high)
         if self._age_s < self._settled_s:
             self.settle(sensor)
             self._trend = self.rate
@@ -163,8 +147,7 @@ class ChangeDetector:
     def _tune(self, dt: float) -> None:
         """Set the squared threshold of each filter, relative to the filter's rate variance."""
         self._dt = dt
-        self._thresholds = []
-        squared = 1.0
+        self._thresholds: list[float] = []
         for power in self._powers[::-1]:
             pace = dt * math.pow(power / (self._noise * dt), 0.25)
             correlation = max(1.0 - sqrt(2.0) * pace, -1.0)
@@ -175,11 +158,9 @@ class ChangeDetector:
         self._edge_margin = sqrt(squared) * self._edge_noise
         self._settled_s = SETTLING_MEMORIES * math.pow(self._noise * dt / self._powers[0], 0.25)
 
-    def _watch_filters(
-        self, dt: float, measured: float, variance: float, low: float, high: float
-    ) -> int:
-        departure = 0
-        filters = self._filters
+    def _watch_filters(self, dt: float, sensor: Thermometer, low: float, high: float) -> int:
+        departure, filters = 0, self._filters
+        measured, variance = sensor.measured, sensor.measured_variance
         for k in (1, 0):
             power = self._powers[k]
             t, v, p00, p01, p11 = filters[k]
@@ -230,35 +211,21 @@ class ChangeDetector:
         return departure
 
     def _follow(self, rate: float, dt: float) -> None:
-        """
-        Move the baseline towards a rate that has lasted for `dt` [s]. The difference counts as at
-        most the sum of swing and error of the baseline.
-        """
+        """Move the baseline towards a rate that has lasted for `dt` [s]."""
         baseline, error = self._baseline, self._baseline_error
         limit = self.swing + error
         share = dt / (dt + self._baseline_s)
-        step = rate - baseline
-        if not -limit <= step <= limit:
-            step = limit if step > 0.0 else -limit
-        moved = baseline + share * step
+        moved = baseline + share * min(max(rate - baseline, -limit), limit)
         # The slow onset of a ramp must not raise the baseline to the rate of the ramp.
-        farthest = self._largest_baseline
-        if not -farthest <= moved <= farthest:
-            farthest = max(farthest, abs(baseline))
-            moved = min(max(moved, -farthest), farthest)
-        self._baseline = moved
+        farthest = max(self._largest_baseline, abs(baseline))
+        self._baseline = min(max(moved, -farthest), farthest)
         self._baseline_error = error - share * error
 
     def _learn_swing(self, dt: float) -> None:
-        """
-        Update the swing: an upper estimate of the amplitude of an oscillation of the rate about
-        its trend.
-        """
-        rate = self.rate
-        trend = self._trend
-        self._trend = trend = trend + dt / (dt + self._baseline_s) * (rate - trend)
+        """Update the swing: an upper estimate of the rate's amplitude about its trend."""
+        self._trend += dt / (dt + self._baseline_s) * (self.rate - self._trend)
         self.swing += dt / (dt + self._swing_memory_s) * (self._ripple_rate - self.swing)
-        apart = rate - trend
+        apart = self.rate - self._trend
         if (apart > 0.0) == self._is_above:
             self._peak = max(self._peak, abs(apart))
             return

@@ -8,7 +8,7 @@ less the lag. For two stages in series, of time constants ``tau_1 > tau_2``, and
 a weighted sum of the m of two first-order lags,
 ``m = ((tau_1 - theta) m_1 - (tau_2 - theta) m_2) / (tau_1 - tau_2)``. A part between the board and
 a sensor s lags the temperature ``T + v G``, with ``G = T_s - T``, so that ``m = T - L(T + v G)``,
-which is ``T - L(T)`` less v times ``L(G)``. The section "Parts" of docs/theory.md explains the model.
+which is ``T - L(T)`` less v times ``L(G)``. docs/theory.md explains the model ("Parts").
 """
 
 import math
