@@ -3,12 +3,12 @@
 """
 Owns the detection of departures: a temperature's rate leaves the baseline, its rate in a soak.
 
-docs/regime.md derives the test. Two Kalman filters of temperature and rate, one with a long and one
-with a short memory, have white noise as second derivative. A rate has departed if it differs from
-the baseline, away from 0, by more than swing, error of the baseline and a multiple of the sd of
-the noise; the multiple follows from the permitted rate of false alarms (Rice's formula [1]_). If
-noise cannot move the readings of a quantized sensor across a cell of one quantum, the filters are
-not used: two edges of cells crossed in the same direction give the mean rate.
+Two Kalman filters of temperature and rate, one with a long and one with a short memory, have white
+noise as second derivative. A rate has departed if it differs from the baseline, away from 0, by
+more than swing, error of the baseline and a multiple of the sd of the noise; the multiple follows
+from the permitted rate of false alarms (Rice's formula [1]_, docs/regime.md). If noise cannot move
+the readings of a quantized sensor across a cell of one quantum, the filters are not used: two
+edges of cells crossed in the same direction give the mean rate.
 
 References
 ----------
