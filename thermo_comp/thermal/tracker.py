@@ -45,7 +45,6 @@ class ThermalTracker:
     ) -> None:
         self.settings = detector
         self.spec = memory or MemorySpec()
-        self._configure(config or ThermalConfig(), board_lag_s, rest_gradient_range_k)
         self.board = Thermometer(detector.board)
         others = {name: Thermometer(detector.case) for name in self.spec.sensors}
         self.thermometers = {BOARD_INPUT: self.board, **others}
@@ -66,22 +65,11 @@ class ThermalTracker:
         #: Last gradient in the static regime less board lag times board rate, by sensor [K].
         self._rest_gradients: dict[str, float] = {}
         self._begin_watch()
+        self.reconfigure(config or ThermalConfig(), board_lag_s, rest_gradient_range_k, None)
 
     def _begin_watch(self) -> None:
         self.detector = RegimeDetector(self.settings)
         self.lead = LeadCheck(self.case, self.board, self.settings.relaxed_rate_k_min)
-
-    def _configure(
-        self, config: ThermalConfig, board_lag_s: float, rest_gradient_range_k: tuple[float, float]
-    ) -> None:
-        self.config = config
-        self._rest_gradient_range = rest_gradient_range_k
-        #: Lag of the board behind the case [s], for the gradient without readings of the case.
-        self._board_lag_s = board_lag_s
-        lag_s = self.settings.case.lag_s
-        usual_s = max(UNWATCHED_SHARE * lag_s, config.case_timeout_s)
-        #: Time without a decision after which the regime is unknown [s].
-        self._unwatched_s = min(usual_s, max(lag_s, self.settings.board.lag_s))
 
     def reconfigure(
         self,
@@ -94,7 +82,14 @@ class ThermalTracker:
         if stamp_ns is not None:
             self._weight = self.weight_at(stamp_ns)
             self._weight_ns = stamp_ns
-        self._configure(config, board_lag_s, rest_gradient_range_k)
+        self.config = config
+        self._rest_gradient_range = rest_gradient_range_k
+        #: Lag of the board behind the case [s], for the gradient without readings of the case.
+        self._board_lag_s = board_lag_s
+        lag_s = self.settings.case.lag_s
+        usual_s = max(UNWATCHED_SHARE * lag_s, config.case_timeout_s)
+        #: Time without a decision after which the regime is unknown [s].
+        self._unwatched_s = min(usual_s, max(lag_s, self.settings.board.lag_s))
         # The check of the board's readings is copied: another tracker may share the original.
         self.checks = {**self.checks, BOARD_INPUT: copy(self.checks[BOARD_INPUT])}
         self.checks[BOARD_INPUT].lag_s = board_lag_s
