@@ -47,12 +47,12 @@ class ChangeDetector:
     def __init__(
         self, sensor: ThermometerSettings, smallest_rate: float, ripple: float, false_alarms: float
     ) -> None:
+        self._settings = sensor
         self._largest_swing = 0.5 * smallest_rate
         self._largest_baseline = LARGEST_BASELINE_SHARE * smallest_rate
         self._ripple_rate = min(ripple / sensor.lag_s, self._largest_swing)
         self._baseline_s = 0.5 * sensor.lag_s
         self._swing_memory_s = SWING_MEMORY_LAGS * sensor.lag_s
-        self._rate_variance = (sensor.fastest_ramp_k_min / 60.0) ** 2
         # Memory (1 / tracking frequency) of each filter [s]: the memory that detects a second
         # derivative ``share * onset`` of the temperature [K/s^2] soonest in readings at 1 Hz. The
         # memory determines the spectral density of this derivative for any interval of readings.
@@ -65,9 +65,6 @@ class ChangeDetector:
         # False alarms per second at a threshold of h sd: acos(rho) / (2 pi dt) exp(-h^2 / 2) for
         # each filter and sign, rho the correlation of the noise of rates dt apart.
         self._log_crossings = -log(2.0 * pi * false_alarms / (2.0 * len(self._powers)))
-        self._edge_noise = sensor.noise_sd_c * sqrt(2.0)
-        self._quantum = sensor.quantum_c
-        self._has_cells = sensor.has_cells
         self._by_edges = sensor.has_wide_cells
         self._stamp_ns: int | None = None
         self._dt = 0.0
@@ -139,7 +136,8 @@ class ChangeDetector:
         self._stamp_ns = stamp_ns
         self._n_restarts = sensor.n_restarts
         self._age_s = 0.0
-        self._filters = [(sensor.temperature, 0.0, self._noise, 0.0, self._rate_variance)] * 2
+        rate_variance = (self._settings.fastest_ramp_k_min / 60.0) ** 2
+        self._filters = [(sensor.temperature, 0.0, self._noise, 0.0, rate_variance)] * 2
         self._edge = nan
         self._edge_ns = stamp_ns
         self._reading = sensor.reading
@@ -152,10 +150,10 @@ class ChangeDetector:
             pace = dt * math.pow(power / (self._noise * dt), 0.25)
             correlation = max(1.0 - sqrt(2.0) * pace, -1.0)
             squared = max(2.0 * (self._log_crossings + log(acos(correlation) / dt)), 1.0)
-            share = CELL_NOISE_SHARE if self._has_cells else 0.25 + 0.08 * min(pace, 1.0)
+            share = CELL_NOISE_SHARE if self._settings.has_cells else 0.25 + 0.08 * min(pace, 1.0)
             self._thresholds.insert(0, squared * share)
             self._noise_share = share
-        self._edge_margin = sqrt(squared) * self._edge_noise
+        self._edge_margin = sqrt(squared) * (self._settings.noise_sd_c * sqrt(2.0))
         self._settled_s = SETTLING_MEMORIES * math.pow(self._noise * dt / self._powers[0], 0.25)
 
     def _watch_filters(self, dt: float, sensor: Thermometer, low: float, high: float) -> int:
@@ -193,7 +191,7 @@ class ChangeDetector:
         if reading == before:
             # As no edge of a cell was crossed, the rate is at most a quantum divided by the time
             # since the last crossing.
-            bound = self._quantum / apart
+            bound = self._settings.quantum_c / apart
             if bound < self._baseline_error + abs(self._baseline):
                 self._baseline_error = max(min(self._baseline_error, bound), self.swing)
                 self._baseline = min(max(self._baseline, -bound), bound)

@@ -35,7 +35,6 @@ class LagBank:
     def __init__(self, taus: tuple[float, ...]) -> None:
         self.taus = taus
         self._sparse_s = SPARSE_SHARE * min(self.taus, default=math.inf)
-        self._nil = [0.0] * len(self.taus)
         self.forget()
 
     def forget(self) -> None:
@@ -43,11 +42,8 @@ class LagBank:
         self.stamp_ns: int | None = None
         self.start_ns: int | None = None
         self.input = 0.0
-        self.lagging: list[float] = self._nil
-        self.extra: list[float] = self._nil
-        #: Whether the lags have a variance `extra` in addition to the variance of their initial
-        #: states.
-        self.has_extra = False
+        #: Input less each lag [K]; its variance in addition to that of the initial state [K^2].
+        self.lagging = self.extra = [0.0] * len(self.taus)
 
     def step(self, stamp_ns: int, value: float, sd: float = 0.0) -> None:
         """Use the next input value [K], of error sd `sd`; the input is linear between values."""
@@ -68,7 +64,6 @@ class LagBank:
         self.input = value
 
     def _add_variances(self, decays: list[float], dt: float, change: float, sd: float) -> None:
-        self.has_extra = True
         result = []
         for variance, e, tau in zip(self.extra, decays, self.taus, strict=True):
             grown = variance
@@ -83,9 +78,7 @@ class LagBank:
 
     def note_jump(self, change: float) -> None:
         """Add to the variances the effect of a change of the input that was a sensor's error."""
-        if self.taus:
-            self.has_extra = True
-            self.extra = [variance + change * change for variance in self.extra]
+        self.extra = [variance + change * change for variance in self.extra]
 
     def at(self, stamp_ns: int, value: float) -> tuple[list[float], list[float]]:
         """Return ``u - L`` [K], u = `value`, and its variance without that of the first state."""
@@ -97,8 +90,6 @@ class LagBank:
         lagging = [
             m * e + change * gain for m, e, gain in zip(self.lagging, decays, gains, strict=True)
         ]
-        if not self.has_extra:
-            return lagging, self.extra
         return lagging, [v * e * e for v, e in zip(self.extra, decays, strict=True)]
 
 

@@ -95,7 +95,6 @@ class SensorCheck:
         self._quantum = settings.quantum_c
         self._has_cells = settings.has_cells
         self._n_still = still_readings(settings)
-        self._rate = settings.fastest_ramp_k_min / 60.0
         self._decay = 1e-9 / max(settings.lag_s, other.settings.lag_s)
         self._largest_noise = self._quantum + _NOISE_SDS * settings.noise_sd_c
         self._n_doubtful = min(DOUBTFUL_READINGS, self._n_still)
@@ -241,7 +240,8 @@ class SensorCheck:
         if changed_ns is None or is_explained or self._n_same < self._n_doubtful:
             return 0.0, 0.0
         still_s = max(stamp_ns - changed_ns, 0) * 1e-9
-        return min(self._rate * still_s, LARGEST_ERROR), still_s
+        fastest_rate = self.sensor.settings.fastest_ramp_k_min / 60.0
+        return min(fastest_rate * still_s, LARGEST_ERROR), still_s
 
 
 def still_readings(settings: ThermometerSettings) -> int:

@@ -51,7 +51,6 @@ class RegimeDetector:
         self.settings = settings
         self._relaxed_rate = settings.relaxed_rate_k_min / 60.0
         self._dwell_ns = round(settings.dwell_s * 1e9)
-        self._needs_calm_board = settings.end_condition == 'board'
         self._case = _Watch(settings, settings.case)
         self._board = _Watch(settings, settings.board)
         self.regime = Regime.UNKNOWN
@@ -65,7 +64,7 @@ class RegimeDetector:
         """Decide the regime after a reading of the case or, if `case` is None, of the board."""
         if case is not None:
             lead, change = case, self._case.change
-            if not self._needs_calm_board:
+            if self.settings.end_condition == 'case':
                 board = None
         elif board is not None:
             lead, change = board, self._board.change
