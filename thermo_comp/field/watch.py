@@ -66,7 +66,7 @@ class Watch:
     inside_since: first day after the last time outside the claim; None if there was no such time,
         or if the unit is outside its claim
     forecast: quantiles (10, 50, 90 %) of the time from the last rest until the unit's error
-        exceeds its claim [days]; infinite if later than ten years; () if unknown or outside
+        exceeds its claim [days]; infinite if later than ten years; () if unknown or exceeded
     interval: the same quantiles if the calibration is updated at the last rest
     """
 

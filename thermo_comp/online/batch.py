@@ -124,8 +124,8 @@ def _push(
     while arrivals and arrivals[-1][0] <= place:
         _, _, name, stamp_ns, celsius = arrivals.pop()
         if len(thermal.queue) >= PENDING_LIMIT:
-            # The node applies waiting readings while no samples come. Here the old readings of a
-            # full queue are applied; after the first sample only those up to the next stamp.
+            # The node applies waiting readings while no samples come. A batch applies old readings
+            # if the queue is full, but once it has a sample, none later than the next sample.
             limit_ns = NEVER_NS if compensator.now_ns is None else due_ns
             thermal.flush(min(limit_ns, stamp_ns - DISORDER_NS))
         thermal.push(name, stamp_ns, celsius)
