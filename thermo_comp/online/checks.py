@@ -65,9 +65,9 @@ REFUTING_SIGMAS: Final = 5.0
 
 
 #: Run of equal readings of an axis: its first sample with the stamp [ns], number of samples after
-#: the first, the largest change since then that both other axes have made [input unit], and, from
-#: the `STUCK_SAMPLES`th repeat on, the changes of the other axes from sample to sample: number of
-#: changes that noise explains and the smallest change, the converter's step [input unit].
+#: the first, the largest change since then that both other axes have made [input unit], and, after
+#: the `STUCK_SAMPLES`th repeat, the changes of the other axes from sample to sample: number of
+#: changes by `NOISY_SDS` sd or more; smallest change, the converter's step [input unit].
 Run: TypeAlias = tuple[tuple[float, float, float, int], int, float, int, float]
 
 
@@ -177,7 +177,7 @@ class StuckCheck:
         self, run: Run, columns: Floats, here: slice, equal: Ints, axis: int
     ) -> tuple[Floats, Ints, Floats]:
         """
-        Return the last three values of a run after each sample of `here` in `columns`, (3, n);
+        Return `moved`, `n_noisy`, `step` of a run after each of the samples `here` of `columns`;
         `equal`: number of repeats of the first reading of the run up to each sample.
         """
         first, _, moved, n_noisy, step = run

@@ -200,7 +200,7 @@ def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
     Return the positions of a test in recording order: 'chamber-18' (18 positions of 9.5 h),
     'chamber-9' (9 positions of 3 h), 'tumble' (18 positions of 20 min at room temperature),
     'tumble-3' or 'tumble-1' ('tumble', then 3 positions or 1 of 3 h in the chamber), 'held-out' (3
-    with ramps and attitudes that no other plan has), 'centrifuge' or 'rate-table' (12 mountings,
+    positions with ramps and attitudes of no other plan), 'centrifuge', 'rate-table' (12 mountings,
     each at rest and at four rates in three soaks). `seed` determines attitudes and temperatures.
     """
     if name not in PLAN_NAMES:

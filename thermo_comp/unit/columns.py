@@ -302,7 +302,7 @@ class ColumnTable:
         return hold(raw, *self._range)
 
     def excess(self, raw: Floats) -> Floats:
-        """Return the excess of u over its range [half ranges]; for a power, that of its root."""
+        """Return the excess of u over its range [half ranges]; of squares, cubes: of the root."""
         lower, upper = self._range
         excess = np.asarray(np.abs(raw - self.held(raw)) / ((upper - lower) / 2.0))
         for order in {*self._orders.tolist()} - {1}:

@@ -191,9 +191,9 @@ class Correction:
 
         `slow` is the slowly varying error covariance, shape (n_slow, n), see
         `SlowUncertainty.at`. Returns (52,) or (52, n): by axis bias and its change over the
-        segment (1 s), scale and its change, then the coefficients of the covariance with the noise
-        of a sample, see `covariance.covariance_at`. A nonlinearity adds 15 rows to `slow` and 21
-        to the result: K2, Kq, K3 by axis, coefficients of x^3 to x^6 in the variance by axis.
+        segment (1 s), scale and its change, then the coefficients of the covariance, including the
+        noise of a sample, see `covariance.covariance_at`. A nonlinearity adds 15 rows to `slow`,
+        21 to the result: K2, Kq, K3 by axis, coefficients of x^3 to x^6 in the variance by axis.
         """
         ends = np.array((start, end), dtype=np.float64)
         n = ends[0, 0].size
