@@ -23,7 +23,7 @@ LARGEST_RATIO = 2.0
 WIDE_PART = 0.5
 # Smallest number of windows of a regime that is judged separately.
 _FEWEST_WINDOWS = 6
-# Largest ratio of a known |f| to the next smaller known |f| whose windows share one section.
+# Largest ratio of successive known |f|, in ascending order, whose windows share a section.
 _LEVEL_RATIO = 1.02
 
 SECTIONS = ('static', 'dynamic', 'all', 'outside')

@@ -104,7 +104,7 @@ def sum_length(window_s: float) -> float:
 
 
 def usual_window(bags: Sequence[ReducedBag]) -> float:
-    """Return a window of 60 s or more, a multiple of the longest partial sums in the bags [s]."""
+    """Return the length of windows: 60 s or more, a multiple of the longest partial sum [s]."""
     longest = max(bag.window_s for bag in bags)
     return float(np.ceil(WINDOW_S / longest - 1e-6)) * longest
 

@@ -254,7 +254,7 @@ class Correction:
         static_weight, beyond_range = 1.0 - weight, raw - held
         excess, _, relative, by_rate = self.curves.excess(states)
         if not self._has_lags:
-            # Count a rate outside its range only without lags: the lags would be outside theirs.
+            # With lags, those beyond their ranges count instead of the rate: see `columns_out`.
             relative = relative + by_rate
         outside = static_weight * relative[0] + weight * relative[1]
         shares = np.array([static_weight + unknown * weight, weight + unknown * static_weight])
