@@ -205,7 +205,7 @@ def _widened(
     is_of_means = np.mean(within**2, axis=0) < np.mean((regression.columns - within) ** 2, axis=0)
     weights = np.where(is_of_means, of_means.weights, state.weights)
     other = replace(of_means, weights=weights)
-    # Columns that only the fit to the means has need rows in the covariance: give them a tiny sd.
+    # Columns active only in the fit to the means need rows in the covariance: set a tiny sd.
     is_used = other.weights.any(axis=1) & (prior.column_sd == 0.0)
     prior = replace(prior, column_sd=np.where(is_used, 1e-9, prior.column_sd))
     with_unseen = regression.solve(state, prior, n_steps=0)
@@ -222,7 +222,7 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
     sqrt(S)``, S being the information about the weight given the active columns. A column whose
     bound exceeds two sd of a window's noise enters the covariance with zero weight, and with
     the bound, or its prior sd if smaller, as sd. In this comparison the bound of a nearly constant
-    column is scaled to the RMS of t [K].
+    column is scaled to the RMS of the board temperature t [K].
     """
     groups, prior = np.array(regression.windows.groups), posterior.prior
     kelvins = regression.windows.kelvins
@@ -256,7 +256,7 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
     share = np.sqrt(np.maximum(is_lag.sum(axis=1, keepdims=True), 1))
     sd = np.where(is_lag, np.minimum(sd, typical / share), sd)
     units = np.array([[1.0], [1.0 / (regression.gravity or 1.0)]])
-    # A column counts as constant if its temperature change (`kelvins`) is below 1 % of that of t.
+    # A column is nearly constant if its temperature change (`kelvins`) is below 1 % of that of t.
     is_constant = kelvins < 0.01 * float(kelvins[0])
     ratio = np.where(is_constant, float(kelvins[0]) / np.maximum(kelvins, 1e-9), 1.0)
     matters = (sd > 0.0) & (sd * ratio > 2.0 * float(np.mean(prior.sigma)) * units)
@@ -325,7 +325,7 @@ def _norm_evidence(
     regression: Regression, posterior: PosteriorMode, offset_sd: Floats, by_drifts: Floats
 ) -> Floats:
     """
-    Return the log evidence, up to a constant, of mountings' mean norms for k offset sds, (k,).
+    Return the log evidence, up to a constant, of the mountings' mean |f| for k offset sds, (k,).
 
     `by_drifts`: root of the unit's covariance at the largest offset sd, at which drifts alone
     determine the thermal weights; only the rows of these weights are used

@@ -44,7 +44,7 @@ def _is_far_above(square: Floats | float, usual: float) -> Bools:
 
 def contradicting_bag(fit: Fit) -> list[int]:
     """
-    Return, in a list, the number of a bag that may be of another environment; [] if none may.
+    Return, in a list, the index of a bag that may be of another environment; [] if none may.
 
     A bag is suspect if its left-out drift exceeds five times both the median over the bags and the
     white noise of a window. If the other bags do not determine the drift of exactly one bag, and
@@ -80,7 +80,7 @@ def contradiction(
     windows: ThermalWindows, known: Calibration, options: FitOptions
 ) -> tuple[list[int], bool]:
     """
-    Return the numbers of the bags whose drift the calibration `known` of their unit does not
+    Return the indices of the bags whose drift the calibration `known` of their unit does not
     explain with any lag states at start, or of all bags if these are more than half of the bags;
     and whether the bags can update `known`: ``|f| - g`` is far above the drift and the claimed sd
     of |f|, so that bias or scale has changed, too, or the bags have the six attitudes that

@@ -93,7 +93,7 @@ def residual_rows(fit: Fit) -> tuple[tuple[ResidualRow, ...], Floats, Floats]:
     ]
     sizes = regression.norms(state)[regression.windows.position]
     residuals = [norm_residual(regression.force(step), sizes) for step in steps]
-    # If other positions do not determine the norm, the left-out error is the drift, RMS of axes.
+    # If other positions do not determine |f|, the left-out error is the RMS drift of the axes.
     norm = norm_residual(selected.score.force, sizes)
     drift = np.sqrt(np.mean(selected.score.drift**2, axis=1))
     left_out = np.where(np.isfinite(norm), norm, drift)

@@ -92,7 +92,7 @@ class Folds:
         before, after = ((folds.square * folds.windows)[known] + 1e-300 for folds in (self, other))
         of_sums = float(np.log(before.sum() / after.sum()))
         if n == 1:
-            # The standard error of a single fold is unknown: the least log ratio that matters.
+            # The standard error of a single fold is unknown: use the largest negligible log ratio.
             return of_sums, _NEGLIGIBLE_LOG_RATIO
         each = np.log(before / after)
         others = (np.maximum(square.sum() - square, 1e-300) for square in (before, after))
@@ -116,9 +116,9 @@ class Score:
     Left-out errors of a model.
 
     positions, sections: drift of left-out positions, and of left-out sections of the test
-    norms: ``|f| - g`` of left-out positions whose norm the other positions determine
-    force: force in each window, corrected by a fit without the window's position; NaN if the norm
-        of this position is not scored, shape (n, 3)
+    norms: ``|f| - g`` of left-out positions in which the other positions determine |f|
+    force: force in each window, corrected by a fit without the window's position; NaN if |f| of
+        this position is not scored, shape (n, 3)
     drift: drift of each window by a fit without its position or, if that fit does not determine
         the drift, without its section, shape (n, 3)
     halves: drift of left-out halves of the test, at temperatures that occur in the other half
@@ -265,7 +265,7 @@ def score_of(regression: Regression, posterior: PosteriorMode) -> Score:
 def _by_positions(
     regression: Regression, posterior: PosteriorMode
 ) -> tuple[Folds, Folds, Floats, Floats]:
-    """Leave out each mounting; return folds of drift and norm, corrected force, and drift."""
+    """Leave out each mounting; return folds of drift and |f|, force and drift of windows."""
     windows, share = regression.windows, regression.weight / regression.windows.weight
     point, edges = regression.at(posterior.state, posterior.prior), windows.edges
     counts = np.diff(edges).astype(np.float64)
@@ -317,7 +317,7 @@ def _is_drift_determined(
 
 def _is_norm_determined(point: Point, posterior: PosteriorMode, root: Floats, p: int) -> bool:
     """
-    Whether the variance of the norm of position `p`, by a fit of covariance ``root @ root.T``, is
+    Whether the variance of |f| in position `p`, by a fit of covariance ``root @ root.T``, is
     below ten times the sum of this variance by a fit of all positions and of the offsets.
     """
     if not point.regression.gravity:

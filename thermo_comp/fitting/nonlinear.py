@@ -181,7 +181,7 @@ class _TermFits:
         return self.posterior(used).log_evidence - self.posterior(used - dropped).log_evidence
 
     def left_out_gain(self, used: _Active, dropped: _Active) -> tuple[float, float]:
-        """Return the gain (`Folds.gain_of`) by `dropped` in the errors of left-out norms."""
+        """Return the gain (`Folds.gain_of`) in left-out |f| by the coefficients `dropped`."""
         return self.score(used - dropped).norms.gain_of(self.score(used).norms) or (0.0, 0.0)
 
     def is_determined(self, used: _Active, at: int) -> bool:
@@ -203,7 +203,7 @@ class _TermFits:
 def choose(
     regression: Regression, selected: Selected, options: FitOptions
 ) -> tuple[Selected, tuple[NonlinearTerm, ...]]:
-    """Choose the nonlinear terms, and which depend on temperature; a prior's terms are kept."""
+    """Choose the terms, and those that depend on temperature; a prior's terms are kept."""
     forces = regression.forces
     if forces is None or options.prior is not None:
         return selected, ()

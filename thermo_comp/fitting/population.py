@@ -44,7 +44,7 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     """
     Make the prior of a type of unit from calibrations of at least three units.
 
-    Raises FitError for fewer than three calibrations, for two of one unit or one without
+    Raises FitError for fewer than three calibrations, two of the same unit, a calibration without
     covariance, or if the calibrations differ in the input unit, the reference temperature, the
     sensors or the form of the curves.
     """

@@ -67,7 +67,7 @@ def constants_of(calibration: Calibration) -> ConstantCalibration:
 
 
 def offset_sd_of(calibration: Calibration) -> float:
-    """Return the smallest sd of any axis of a mounting's or turn-on's bias offset [m/s^2]."""
+    """Return the sd of the bias offset of a mounting or turn-on, least of the axes [m/s^2]."""
     axes = [axis for part in calibration.regime_sets() for axis in part.axes()]
     return min(axis.residual_sd_m_s2 for axis in axes)
 
@@ -106,8 +106,8 @@ def informative_priors(
             'the prior has no covariance: use a calibration that was fitted to bags; an imported '
             'calibration cannot be a prior'
         )
-    # The priors to try: stated ageing, or ageing, the sd of the biases [g] and of the scale
-    # factors; and `share`, the ratio of uncorrelated variances to add to those of the prior.
+    # Pairs to try: the ageing, as sd of biases [g] and of scale factors (0: as the user states); and
+    # `share`, the ratio of uncorrelated variances to add to the variances of the prior.
     tried = [(0.0, share) for share in (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)]
     # The fit begins with the last, widest prior: in a first fit with a narrow prior, the noise
     # would absorb changes of the unit.

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the reduction of a bag: still intervals and their windows, temperature readings, counters.
+Owns the statistics of a bag: still intervals, their windows, temperature readings, counters.
 
 The blocks of a bag are read once, in bounded memory. Samples are averaged to cells of about half a
 second (see `stillness`), and the cells of a still interval to windows of ten seconds. Windows of a
@@ -92,7 +92,7 @@ class ReducedBag:
     since_s: time from the bag's first sample to the part of the bag that was read [s]
     restless: reason why the bag cannot be used, such as no rests; '' if the bag can be used
     angular_rate: whether none, a part or all of the bag's samples have a finite angular rate
-    n_spikes: number of readings of each thermometer left out, over 10 K from those about them
+    n_spikes: number of left-out readings of each thermometer, over 10 K from their neighbours
     n_glitches: number of single samples far from their neighbours, which are left out
     n_repeated: number of dropped samples with the same stamp as the preceding sample
     parts: the bags that were joined to this recording, see `joining`; () for a single bag
@@ -232,7 +232,7 @@ def _reduced(
     still_sd: float,
     fewest_windows: int,
 ) -> tuple[ReducedBag, float]:
-    """Reduce a source with the cells of `accumulator`; return also the length of a cell [s]."""
+    """Return a source's statistics from the cells of `accumulator`, and a cell's length [s]."""
     reading = _Pass(source, accumulator)
     cells = reading.cells
     if source.force is None:
@@ -299,7 +299,7 @@ def _cycle_s(cells: Cells) -> float:
 
 
 def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
-    """Keep plausible readings with rising stamps; average those of over 10 Hz over 0.2 s."""
+    """Keep plausible readings with rising stamps; average those at over 10 Hz over 0.2 s."""
     stamp_ns, value = np.asarray(stamp_ns, np.int64), np.asarray(value, np.float64)
     before = np.concatenate((last_ns if len(last_ns) else stamp_ns[:1] - 1, stamp_ns[:-1]))
     use = (value >= COLDEST) & (value <= HOTTEST)
@@ -344,7 +344,7 @@ def _max_abs(cells: Cells) -> float:
 def _rests(cells: Cells, min_rest_s: float | None, still_sd: float) -> list[tuple[int, int]]:
     """Find the rests, with the thresholds whose rests determine bias and scale best."""
     candidates: list[list[tuple[int, int]]] = []
-    # Largest ratio of a rest's variance to that of the quietest cells; smallest length of a rest.
+    # Values to try for the largest variance of a rest, relative to that of the quietest cells.
     ratios = tuple(stillness.VARIANCE_RATIO * 2.0**power for power in range(6))
     of_ratios = stillness.still_runs(cells, still_sd, ratios)
     for shortest_s in (3.0, 2.0, 1.0) if min_rest_s is None else (min_rest_s,):

@@ -177,19 +177,19 @@ class Growth:
             progress(1.0 - part)
             if not better:
                 return chosen
-            # The smallest model that is not significantly worse than that of the largest gain.
+            # Choose the smallest model not significantly worse than the model of the largest gain.
             best = max(better, key=lambda trial: gain(chosen.score, trial.score))
             better.sort(key=lambda trial: len(trial.groups))
             chosen = next(t for t in better if t is best or not is_better(t.score, best.score))
 
     def with_bends(self, before: Trial, groups: Sequence[str]) -> list[Trial]:
-        """Fit `before` with further groups, then also with columns of `BEND`; return all fits."""
+        """Fit model `before` plus groups, then also with columns of `BEND`; return all fits."""
         added = tuple(group for group in groups if group in self.free)
         smooth = self.extended(before, added, self._candidates.typical)
         return [smooth, *self.trials(smooth, [BEND])]
 
     def lowest_degree(self, constants: Trial) -> Trial:
-        """Fit the curve with its first column, and with more if the log density clearly rises."""
+        """Fit the curve's first column, and further ones if the log density clearly rises."""
         prior, state = constants.posterior.prior, constants.posterior.state
         prior = replace(prior, offset_sd=prior.offset_scale or prior.offset_sd)
         number = np.cumsum(self._names == CURVE)

@@ -151,7 +151,7 @@ class Whitener:
 
 
 def _vertex(values: Floats, at: int) -> float:
-    """Return the vertex of the parabola through the smallest value, `at`, and its neighbours."""
+    """Return the offset from `at` of the vertex of the parabola through `at` +- 1; 0 at an end."""
     if not 0 < at < len(values) - 1:
         return 0.0
     before, here, after = values[at - 1 : at + 2].tolist()
@@ -166,8 +166,8 @@ class Base:
     lag its derivative w.r.t. the initial state of the lag; t, if there are nonlinear terms; the
     functions `Windows.tilt`; the readings of the three axes less their mean in the position.
 
-    columns: numbers of the active columns; lagged: indices in `columns` of columns with a lag
-    lag: number of the lag of each column in `lagged`
+    columns: indices of the active columns; lagged: indices in `columns` of columns with a lag
+    lag: index of the lag of each column in `lagged`
     at_start, t, tilts, measured: indices of the derivatives w.r.t. the initial lag states, of t,
         (1,) or (0,), of the functions `Windows.tilt`, and of the readings, in the base series
     """
@@ -182,7 +182,7 @@ class Base:
 
     @classmethod
     def of(cls, columns: Ints, lags: Ints, n_t: int, n_tilts: int) -> Base:
-        """Assign indices to the series; `lags`: number of the lag of each column, -1 for none."""
+        """Assign indices to the series; `lags`: index of each column's lag, -1 for none."""
         lagged = np.flatnonzero(lags[columns] >= 0)
         counts = 1 + len(columns), len(lagged), n_t, n_tilts, 3
         _, *places = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
@@ -201,7 +201,7 @@ class Products:
 
     means: mean of each series (not whitened) in each position, shape (n_positions, n_base)
     cells: sums over each cell, the windows of one position and section, (n_cells, n_base, n_base)
-    first: index of the first cell of each position; section: section number of each cell
+    first: index of each position's first cell; section: index of each cell's section
     """
 
     base: Base

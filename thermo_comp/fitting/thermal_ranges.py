@@ -104,7 +104,7 @@ def _has_gradients(windows: ThermalWindows) -> bool:
 
 
 def usable_board_lag(windows: ThermalWindows) -> float:
-    """Return the lag of the board behind the case [s]; `USUAL_BOARD_LAG_S` if not 1..1e5 s."""
+    """Return the lag of the board behind the case [s]; outside 1..1e5 s the usual lag."""
     lag = _slope_of_gradient(windows)
     return lag if 1.0 <= lag <= 1e5 else USUAL_BOARD_LAG_S
 
