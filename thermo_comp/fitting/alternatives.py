@@ -87,7 +87,7 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     closed = replace(model, detector=replace(model.detector, end_condition='case'))
     undisturbed = fit.windows.data.undisturbed
     early = regress(windows_of(bags, closed, options, undisturbed=undisturbed), problem)
-    # Errors of left-out halves serve to limit the number of columns, not to compare detectors.
+    # Errors of left-out halves of the program limit the columns; they do not compare detectors.
     return early if is_better(fit.selected.score, early.selected.score, by_halves=False) else fit
 
 

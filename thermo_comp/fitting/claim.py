@@ -6,7 +6,7 @@ not determine, and for effects that the model lacks.
 
 The standard deviation of mounting and turn-on offsets, unless the user states it, is marginalised:
 the covariance is that of a mixture of fits on a grid of this standard deviation. The weight of a
-fit is the fit's evidence, limited by the evidence of the positions' norms, times a prior of the
+fit is the fit's evidence, limited by the evidence of |f| in the positions, times a prior of the
 offset sd (half-Student [1]_ without a prior calibration). An error of local gravity, included in
 the covariance, changes all scale factors by the same ratio.
 
@@ -101,8 +101,8 @@ def claim_of(
         by_offset = np.array([point.by_offset(axis) for axis in range(3)])
         covariance = covariance + turn_on_variance * (by_offset.T @ by_offset)
     if candidates is not None:
-        # `_widened` computes the covariance for the mounting sd of the mode, so the variance that
-        # mixtures, jackknife and turn-ons have added is added to the result.
+        # `_widened` computes the covariance for the sd of mounting offsets at the mode, so the
+        # variance that mixtures, jackknife and turn-ons have added is added to its result.
         excess = covariance - posterior.covariance
         layout, covariance = _widened(regression, posterior, candidates, of_means)
         at = _places(posterior.layout, layout)
@@ -249,7 +249,7 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
         slopes = np.sqrt(np.sum(square[:, is_curve] / kelvins[is_curve] ** 2, axis=1))
         of_curve = np.outer(slopes, kelvins)
         typical = np.minimum(typical, of_curve)
-        # A curve column that the data do not determine changes this slope by up to half the slope.
+        # A curve column that the data do not determine changes the curve's slope by up to a half.
         sd = np.where(groups == CURVE, np.minimum(sd, 0.5 * of_curve), sd)
     # The variance of n lags is limited to that of one lag, so each lag gets 1 / n of the variance.
     is_lag = is_of_lags & (sd > 0.0)
@@ -278,8 +278,8 @@ def _over_mountings(
         return _fits(regression, posterior, priors)
 
     fits = fits_with(tried)
-    # With a large mounting sd the attitudes absorb errors of the model, which increases the log
-    # evidence; at most the increase of the norms' log evidence plus `CLEAR_GAIN` counts.
+    # With a large sd of mounting offsets the attitudes absorb errors of the model, which raises the
+    # log evidence; at most the rise of the log evidence of |f| plus `CLEAR_GAIN` counts.
     of_data = np.array([fit.log_evidence for fit in fits])
     of_norms = _norm_evidence(regression, posterior, tried, fits[-1].root)
     nearest = int(np.argmin(np.abs(np.log(tried * n_rests**0.5 / prior.offset_sd))))
@@ -336,7 +336,7 @@ def _norm_evidence(
     weight = np.add.reduceat(regression.weight, first)
     residual = regression.weight[:, None] * regression.residual(state, layout)
     residual = np.add.reduceat(residual, first) / weight[:, None]
-    # Covariance of the norms, without the mounting offsets.
+    # Derivatives and errors of |f|, averaged over each mounting; the errors contain its offset.
     errors = np.sum(point.norm_by_axes * (residual + state.offset), axis=1)
     first = np.flatnonzero(np.diff(regression.windows.mounting, prepend=-1))
     rows = np.column_stack((along, errors, np.ones(len(along))))
