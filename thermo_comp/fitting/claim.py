@@ -278,7 +278,7 @@ def _over_mountings(
         return _fits(regression, posterior, priors)
 
     fits = fits_with(tried)
-    # With a large sd of mounting offsets the attitudes absorb errors of the model, which raises the
+    # With a large sd of mounting offsets attitudes absorb errors of the model, which raises the
     # log evidence; at most the rise of the log evidence of |f| plus `CLEAR_GAIN` counts.
     of_data = np.array([fit.log_evidence for fit in fits])
     of_norms = _norm_evidence(regression, posterior, tried, fits[-1].root)

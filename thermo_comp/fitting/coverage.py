@@ -64,8 +64,8 @@ def next_direction(covariance: Floats, sd: float, positions: Floats) -> Floats:
     force, averaged over all attitudes.
 
     A face of a cube, which is the easiest to hold, is preferred if it reduces this variance at
-    least half as much as the best direction, then an edge, then a corner. Directions closer than 20 degrees to a
-    direction in `positions`, shape (n, 3), are not proposed.
+    least half as much as the best direction, then an edge, then a corner. Directions closer than
+    20 degrees to a direction in `positions`, shape (n, 3), are not proposed.
     """
     columns = force_columns(_SPHERE)
     weight = np.einsum('nij,nik->jk', columns, columns) / len(columns)

@@ -82,7 +82,7 @@ def contradiction(
     """
     Return the indices of the bags whose drift the calibration `known` of their unit does not
     explain with any lag states at start, or of all bags if these are more than half of the bags;
-    and whether the bags can update `known`: ``|f| - g`` is far above the drift and the claimed sd
+    and whether the bags can update `known`: ``|f| - g`` far exceeds the drift and the published sd
     of |f|, so that bias or scale has changed, too, or the bags have the six attitudes that
     determine bias and scale.
     """
@@ -114,7 +114,7 @@ def contradiction(
     may_update = bool(_is_far_above(float(np.mean(norm**2)), usual))
     is_far = _is_far_above(mean, 1.0)
     if np.mean(is_far) > 0.5:
-        # All bags are of one environment, whose effect on drifts is small in some attitudes.
+        # All bags count as of one environment: its effect on drifts is small in some attitudes.
         is_far[:] = True
     may_update |= len(distinct_directions(state.up)) >= POSITIONS_NEEDED
     return np.flatnonzero(is_far).tolist(), may_update

@@ -218,7 +218,7 @@ class Equations(Series):
         return np.asarray(np.einsum('nb,nib->ni', series, self.misfit(state, base)[position]))
 
     def force(self, state: State, rows: slice = slice(None)) -> Floats:
-        """Correct windows as the compensator does, with no mounting offsets, shape (n, 3)."""
+        """Return the force of windows, corrected as by the compensator, (n, 3) [m/s^2]."""
         active = np.flatnonzero(state.weights.any(axis=(0, 1)))
         columns, (on_bias, on_scale) = self.columns[rows, active], state.weights[:, :, active]
         along = self.measured[rows] - state.bias - columns @ on_bias.T

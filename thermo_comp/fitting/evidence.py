@@ -12,7 +12,7 @@ The lack of fit in a regime, near a temperature, is the mean square of the left-
 noise and the published variance of this drift. The lack of fit covers effects that no column
 describes, such as a kink of the curve, a tilt of the support or a drift of the bias. For models
 whose score is at most one standard error worse than that of the chosen model, half of the largest
-squared difference between the drift of such a model and that of the chosen model is added.
+squared difference of such a model's drift from the chosen model's is added to the lack of fit.
 """
 
 from __future__ import annotations

@@ -253,10 +253,10 @@ def _noise_in_1_hz(windows: ThermalWindows, scale: Floats) -> float:
 
 
 def _mounting_scale(noise: float) -> float:
-    """Return the prior scale of mounting offsets [m/s^2]: 3 times the noise in 1 Hz, bounded."""
+    """Return the prior scale of mounting offsets [m/s^2], from the noise in a 1 Hz bandwidth."""
     # Bounds of the scale: 30 ug, typical of navigation grade, and 0.5 mg, of consumer MEMS; the
     # tail of the Student prior allows for larger offsets. With almost no noise the lower bound is
-    # 100 times the noise in 1 Hz, because an offset 1e6 times as large as the noise cannot be
+    # 100 times this noise, because an offset 1e6 times as large as the noise cannot be
     # estimated in double precision.
     least, most = max(min(3e-4, 100.0 * noise), 1e-7), 5e-3
     return float(np.clip(3.0 * noise, least, most))

@@ -12,7 +12,7 @@ is almost constant in a rotation, or a gyroscope measures no rotation during the
 If a sensor has a low-pass filter, neighbouring samples have a correlation r, and the slow noise of
 the samples hides a step. The noise of the differences ``a_i - r a_(i-1)`` is white (generalised
 least squares for first-order noise), so a step within one sample is significant in these
-differences. A shock that decays is also significant there, so for a jump the mean levels of the
+differences. A decaying shock is also significant in them, so for a jump the mean levels of the
 quiet samples before and after the step must differ, too.
 """
 
@@ -28,7 +28,7 @@ from ..typing import Floats
 from .reduction import ReducedBag
 from .sources import angular_velocity
 
-# Shortest time for the mean level before or after a gap [s].
+# Shortest time over which the level before or after a gap is averaged [s].
 _MARGIN_S = 10.0
 # Smallest number of samples before a step, and after it, for a test of the step.
 _FEWEST_SAMPLES = 8
@@ -216,8 +216,8 @@ def _place_of_step(time: Floats, accel: Floats, quiet_sd: Floats, r: float) -> i
     residual = residual - trend @ (trend.T @ residual)
     candidates = np.arange(_FEWEST_SAMPLES, n - _FEWEST_SAMPLES + 1)
     # A unit step at sample k, whitened for the lag-1 correlation r, is 1 at k and 1 - r after k.
-    # Its product with a residual is a sum over the samples from k on. The square of the whitened
-    # step, after removal of the trend, follows from such sums of the trend.
+    # The step's product with a residual is a sum over the samples from k on. The square of this
+    # whitened step, after removal of the trend, follows from such sums of the trend.
     tail = _sums_behind(residual, r)[candidates]
     trend_tail = _sums_behind(trend, r)[candidates]
     square = 1.0 + (1.0 - r) ** 2 * (n - candidates - 1) - (trend_tail**2).sum(axis=1)

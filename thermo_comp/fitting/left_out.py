@@ -175,9 +175,9 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
 
     The gain is the sum of the log ratios (`Folds.gain_of`) of the drift of positions and of
     sections. If the drifts of both models agree to 5 %, the gain is the log ratio of the errors of
-    left-out norms, if that exceeds two standard errors. `by_halves`: whether an increased error of
+    left-out |f|, if that exceeds two standard errors. `by_halves`: whether an increased error of
     left-out halves of the chamber program, a sign of too many columns, excludes a gain. Increased
-    errors of left-out norms exclude a gain, and so does an increased expected error of the settled
+    errors of left-out |f| exclude a gain, and so does an increased expected error of the settled
     bias, unless noise explains the drift. A drift that noise explains need not decrease: left-out
     bags of soaks contain no effects of ramps.
     """
@@ -204,7 +204,7 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
 
 
 def is_worse_by_norms(before: Score, after: Score) -> bool:
-    """Whether errors of left-out norms are larger in `after`, by more than a standard error."""
+    """Whether errors of left-out |f| are larger in `after`, by more than a standard error."""
     norms = before.norms.gain_of(after.norms)
     return norms is not None and norms[0] < -norms[1]
 
@@ -212,7 +212,7 @@ def is_worse_by_norms(before: Score, after: Score) -> bool:
 def is_undecided(before: Score, after: Score) -> bool:
     """
     Whether left-out data do not decide between two models, of which `after` is not better: the
-    drifts agree to 5 %, and errors of norms are not scored for both models, or are smaller in
+    drifts agree to 5 %, and errors of |f| are not scored for both models, or are smaller in
     `after` by one to two standard errors.
     """
     *drift, norms = _beyond_thermometer(before, after)

@@ -70,7 +70,7 @@ class FitOptions:
     serial: serial of the unit, or None for the serial of the sources
     input: unit of the samples
     full_scale: magnitude of a saturated sample [input units], or None for 32767 counts or, in
-        m/s^2, for the smallest usual range that contains the data
+        m/s^2, for the smallest usual range 10 % above all samples
     offset: code at zero force, such as 32768, or None to estimate it from the bags
     reference_temperature: T_ref [degC], 20 in Golovach's paper
     detector: thermometer and detector settings, or None to estimate them from the bags

@@ -31,7 +31,7 @@ from .windows import Model, Sets
 
 
 def prior_columns(calibration: Calibration) -> tuple[Column, ...]:
-    """Return the response columns; FitError for a term of one regime, as in format version 1."""
+    """Return the response columns; FitError for a term of one regime only (format version 1)."""
     for term in calibration.response:
         if term.during != 'always':
             raise FitError(
@@ -96,7 +96,7 @@ def informative_priors(
     usual_ageing: float = 1.0,
 ) -> Iterator[InformativePrior]:
     """
-    Return priors from a calibration for several amounts of ageing. The fit compares their log
+    Return priors from a calibration for several amounts of ageing. The fit compares priors by log
     evidence plus the log density of the ageing: half-Student, of scale `usual_ageing` [m/s^2].
 
     The fit begins with the last, widest prior. A calibration without covariance raises FitError.

@@ -318,7 +318,7 @@ def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
 
 
 def is_spike(value: Floats) -> Bools:
-    """Return which readings are over 10 K from the median of the five about them, shape (n,)."""
+    """Return which readings are over 10 K from the median of five readings about them, (n,)."""
     # A thermometer with a loose contact reads -127 or 85 degC for a moment. The fit estimates its
     # noise without such readings, so that the tracker rejects them as outliers.
     far = np.zeros(len(value), dtype=bool)

@@ -213,7 +213,7 @@ class Point:
     def linear_step(self) -> Floats:
         """Return the step in which damping keeps the nonlinear unknowns almost constant."""
         layout, local, unit = self.layout, self.normal.local.copy(), self.normal.unit.copy()
-        # A diagonal multiplied by 1e6 divides the step of these unknowns by about 1e6. With an
+        # A factor 1e6 on the diagonal divides the step of nonlinear unknowns by about 1e6. With an
         # informative prior, which correlates the unknowns, a factor far above 1e6 would cause
         # errors of double precision.
         at = [*range(2 + layout.stretch.shape[1]), *range(layout.of_axis.shape[1], layout.n_local)]

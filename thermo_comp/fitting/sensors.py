@@ -227,7 +227,7 @@ def gradients_at_rest(bags: Sequence[ReducedBag], sensors: Sequence[str]) -> dic
 
 
 def without_copies(bags: Sequence[ReducedBag]) -> tuple[list[ReducedBag], list[str]]:
-    """Return bags less thermometers that repeat the board's readings; and these' names."""
+    """Return the bags less copies of the board's thermometer, and the names of the copies."""
     names = sorted(set.intersection(*({*bag.temperatures} for bag in bags)) - {'board'})
     copies = [
         name

@@ -47,7 +47,7 @@ class Whitener:
         n_steps = int(lengths.max())
         step = np.arange(n_steps)[:, None]
         self._is_there = step < lengths
-        #: Number of the window at each step in each position; 0 after a position's last window.
+        #: Index of the window at each step in each position; 0 after a position's last window.
         self._row = np.where(self._is_there, starts + step, 0)
         self._n = len(position)
         since = np.diff(time[self._row], axis=0, prepend=time[self._row[:1]])
@@ -63,7 +63,7 @@ class Whitener:
             time_s *= 10.0**0.5
         #: Upper bound of the correlation time in a search: half a decade above `times_s` [s].
         self._longest_s = time_s
-        #: Number of processes of flicker noise. Their correlation times are 3 windows times powers
+        #: Number of processes of flicker noise, with correlation times of 3 windows times powers
         #: of ten, up to a time at least as long as a position.
         self.n_flicker = 1 + math.ceil(math.log10(max(span_s / (3.0 * typical_s), 1.0)))
 
@@ -79,7 +79,7 @@ class Whitener:
         """
         Run the Kalman filter over series, (n, m), for k noises with equal numbers of processes.
 
-        Yields for step j: number of the j-th window of each position, whether the position has j
+        Yields for step j: index of the j-th window of each position, whether the position has j
         windows, innovations, (k, n_positions, m), and their variances [sigma^2], (k, n_positions).
         """
         times_s = np.array([[noise.times_s] for noise in noises])

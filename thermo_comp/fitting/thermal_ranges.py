@@ -122,7 +122,7 @@ def with_unseen_axes(
     """
     Add the error of extrapolated scale factors to the lack of fit of each regime, `lacks`.
 
-    `known`: calibration that was the prior, or None. At temperatures at which no position of the
+    `known`: calibration used as prior, or None. At temperatures at which no position of the
     bags determines the scale of an axis, the lack of fit of the axis is at least the prior's.
     """
     (lower, upper), (new_lower, new_upper) = _known_ranges(fit, known), _seen(fit, None)

@@ -28,9 +28,9 @@ MISALIGNMENT_SD = 1e-3
 
 def misalignment_scale(noise: float) -> float:
     """
-    Return the built-in prior sd of an element of the misalignment [rad], by the noise in 1 Hz
-    [m/s^2]. The sd is 1 mrad for a noise up to 10 ug (navigation grade, machined faces) and
-    proportional to a larger noise, up to 10 mrad (cross-axis sensitivity of consumer MEMS).
+    Return the built-in prior sd of an element of the misalignment [rad], by the noise in a 1 Hz
+    bandwidth [m/s^2]. The sd is 1 mrad for a noise up to 10 ug (navigation grade, machined faces),
+    and proportional to a larger noise, up to 10 mrad (cross-axis sensitivity of consumer MEMS).
     """
     return float(np.clip(10.0 * noise, MISALIGNMENT_SD, 1e-2))
 
@@ -111,7 +111,7 @@ class Windows:
 
     @cached_property
     def edges(self) -> Ints:
-        """First window of each position, then the number of windows, shape (n_positions + 1,)."""
+        """Index of each position's first window, then number of windows, (n_positions + 1,)."""
         return np.searchsorted(self.position, np.arange(self.n_positions + 1))
 
     @cached_property

@@ -169,7 +169,7 @@ class ThermalWindows:
     The windows of a regression with their thermal states.
 
     data: means of the samples, and columns, for the regression
-    temperature, rate: of the board [degC, K/s], shape (n,); weight: of the dynamic set, shape (n,)
+    temperature, rate: board temperature [degC], its rate [K/s]; weight: of the dynamic set; (n,)
     gradient: T_case - T_board [K], shape (n,)
     raw: values u of the columns of the response, before they are limited to their ranges and
         multiplied by powers of t, shape (n, k)
