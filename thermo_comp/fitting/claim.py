@@ -256,7 +256,7 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
     share = np.sqrt(np.maximum(is_lag.sum(axis=1, keepdims=True), 1))
     sd = np.where(is_lag, np.minimum(sd, typical / share), sd)
     units = np.array([[1.0], [1.0 / (regression.gravity or 1.0)]])
-    # A column is nearly constant if its temperature change (`kelvins`) is below 1 % of that of t.
+    # A column is nearly constant if its temperature change (`kelvins`) is below 1 % of t's change.
     is_constant = kelvins < 0.01 * float(kelvins[0])
     ratio = np.where(is_constant, float(kelvins[0]) / np.maximum(kelvins, 1e-9), 1.0)
     matters = (sd > 0.0) & (sd * ratio > 2.0 * float(np.mean(prior.sigma)) * units)

@@ -63,7 +63,7 @@ def next_direction(covariance: Floats, sd: float, positions: Floats) -> Floats:
     Find the direction of a new position, of noise `sd` [g], that most reduces the variance of the
     force, averaged over all attitudes.
 
-    A face of a cube, which is the easiest to hold, is preferred if it reduces this variance at
+    A face of a cube, the easiest to hold, is preferred if it reduces the variance of the force at
     least half as much as the best direction, then an edge, then a corner. Directions closer than
     20 degrees to a direction in `positions`, shape (n, 3), are not proposed.
     """

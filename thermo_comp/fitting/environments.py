@@ -114,7 +114,7 @@ def contradiction(
     may_update = bool(_is_far_above(float(np.mean(norm**2)), usual))
     is_far = _is_far_above(mean, 1.0)
     if np.mean(is_far) > 0.5:
-        # All bags count as of one environment: its effect on drifts is small in some attitudes.
+        # If most bags are far, all are of one environment: its effect is small in some attitudes.
         is_far[:] = True
     may_update |= len(distinct_directions(state.up)) >= POSITIONS_NEEDED
     return np.flatnonzero(is_far).tolist(), may_update
@@ -141,8 +141,8 @@ def with_excluded_error(
     calibration: Calibration, bags: Sequence[ReducedBag], others: str, *, is_updated: bool
 ) -> tuple[Calibration, Finding]:
     """
-    Add the drift, and the error of |f|, that remain in `bags` after the correction to the lack of
-    fit of both regimes.
+    Add to the lack of fit of both regimes the drift, and the error of |f|, that remain in `bags`
+    after the correction.
 
     `others`: text that names what these bags contradict, other bags or the prior; `is_updated`:
     whether `bags` were used in the fit

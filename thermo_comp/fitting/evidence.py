@@ -69,7 +69,7 @@ class ResidualRow:
     one_set: corrected with one curve for both regimes; empty if each regime has its own curve
     two_sets: corrected with a curve for each regime
     fitted: corrected with the calibration, in sample
-    left_out: corrected by fits without the position; RMS drifts where these do not determine |f|
+    left_out: corrected by fits without the position; drift if such a fit does not determine |f|
     """
 
     section: str

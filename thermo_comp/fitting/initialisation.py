@@ -222,7 +222,7 @@ def _with_faces(prior: Prior, up: Floats) -> Prior:
 def _narrowed(prior: Prior, regression: Regression, state: State) -> Prior:
     """
     Return the prior for the selection of the columns: the sds of bias and scale are five times the
-    largest error of |f|, but 5 % to 100 % of those of `prior`. With wider priors, bias and scale
+    largest error of |f|, within 5..100 % of the sds of `prior`. With wider priors, bias and scale
     would take large values in a model that lacks columns, as few attitudes do not determine both.
     """
     norms = np.linalg.norm(position_means(regression.windows) / regression.nominal_scale, axis=1)
@@ -316,7 +316,7 @@ def _steepness(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool) -
         change = within_positions(windows.temperature[:, None], data.position)
         return drift / (float(np.sqrt(np.mean(change**2))) or 1.0)
     kelvins = float(np.std(windows.temperature)) or 1.0
-    # If the temperature differs between rests only, the drift appears in differences of their |f|.
+    # If only rests differ in temperature, the drift appears in differences of |f| between rests.
     force = (position_means(data) - start.bias) / start.scale
     sizes, norms = sizes_of(windows, problem.options), np.linalg.norm(force, axis=1)
     errors = norms - sizes

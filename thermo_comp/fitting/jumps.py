@@ -12,7 +12,7 @@ is almost constant in a rotation, or a gyroscope measures no rotation during the
 If a sensor has a low-pass filter, neighbouring samples have a correlation r, and the slow noise of
 the samples hides a step. The noise of the differences ``a_i - r a_(i-1)`` is white (generalised
 least squares for first-order noise), so a step within one sample is significant in these
-differences. A decaying shock is also significant in them, so for a jump the mean levels of the
+differences. A decaying shock is as significant as a step, so for a jump the mean levels of the
 quiet samples before and after the step must differ, too.
 """
 

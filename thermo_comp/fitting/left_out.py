@@ -229,8 +229,8 @@ def is_near(chosen: Score, other: Score) -> bool:
 def _beyond_thermometer(before: Score, after: Score) -> list[tuple[float, float] | None]:
     """
     Return the log ratios of `Score.kinds` (`Folds.gain_of`), None for a kind whose errors a coarse
-    thermometer explains. Such errors repeat in all bags of one chamber program: a model of
-    these errors is better on left-out bags, but fails in another program.
+    thermometer explains. Errors of a thermometer repeat in all bags of one chamber program: their
+    model is better on left-out bags, but fails in another program.
     """
     is_known = before.norms.rms > _NOISE_RATIO * before.by_thermometer
     keep = (not before.is_by_thermometer, not before.is_by_thermometer, is_known)

@@ -228,8 +228,8 @@ class _PartCurves:
         Add a share of the gradient to a lag or, without a case thermometer, a positive lead time,
         if the residual then is significantly smaller.
 
-        The residual is linearised in the time constant and in the share or lead. The sum of its
-        squares must decrease by a factor that white residuals reach with a probability of 1e-5.
+        The residual is linearised in time constant and in share or lead. The sum of squared
+        residuals must decrease by a factor that white residuals reach with a probability of 1e-5.
         """
         tau = lag.tau_s
         if not tau:
@@ -356,7 +356,7 @@ class _PartCurves:
         """Return the residuals of an axis times the roots of the windows' weights, shape (n,)."""
         series, measured = self._series(lag, axis), self._measured[:, axis]
         normal, right = series.T @ series, series.T @ measured
-        # Regressors of any magnitude are divided by their size.
+        # Regressors are divided by their norms, because their magnitudes differ.
         size = np.sqrt(np.diag(normal)) + 1e-12
         normal = normal / np.outer(size, size)
         normal[np.diag_indices_from(normal)] += 1e-7  # a ridge, for nearly collinear regressors

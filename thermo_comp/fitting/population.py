@@ -48,7 +48,7 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     covariance, or if the calibrations differ in the input unit, the reference temperature, the
     sensors or the form of the curves.
     """
-    # Nonlinear terms are left out: few calibrations have them, as a centrifuge determines them.
+    # Leave out nonlinear terms: they need |f| above 1 g, as in a centrifuge; few units have any.
     calibrations = [without_terms(each) for each in calibrations]
     _check_alike(calibrations)
     keys: dict[Column, list[Column]] = {}

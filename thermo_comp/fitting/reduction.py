@@ -54,7 +54,7 @@ class StillInterval:
     start_ns, end_ns: stamps of the middles of the interval's first and last cell
     begin_s: start of the interval's first window, since the bag's first sample [s]
     n_whole: number of windows of full length; a shorter last window may follow them
-    time, count, mean: by window, mean time since the first sample [s], number and mean of samples
+    time, count, mean: each window's time since the first sample [s], number and mean of samples
     sample_sd: root of the median over the cells of the variance of single samples, shape (3,)
     rounding_sd: sd of the error of the mean by rounding; 0 if samples have noise, shape (3,)
     angular_rate: mean angular rate of each window [rad/s], or None if samples of the bag lack it
@@ -299,7 +299,7 @@ def _cycle_s(cells: Cells) -> float:
 
 
 def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
-    """Keep plausible readings with rising stamps; average those at over 10 Hz over 0.2 s."""
+    """Keep plausible readings with rising stamps; average readings above 10 Hz over 0.2 s."""
     stamp_ns, value = np.asarray(stamp_ns, np.int64), np.asarray(value, np.float64)
     before = np.concatenate((last_ns if len(last_ns) else stamp_ns[:1] - 1, stamp_ns[:-1]))
     use = (value >= COLDEST) & (value <= HOTTEST)
@@ -319,14 +319,14 @@ def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
 
 def is_spike(value: Floats) -> Bools:
     """Return which readings are over 10 K from the median of five readings about them, (n,)."""
-    # A thermometer with a loose contact reads -127 or 85 degC for a moment. The fit estimates its
-    # noise without such readings, so that the tracker rejects them as outliers.
+    # A thermometer with a loose contact reads -127 or 85 degC for a moment. Thermometer noise is
+    # estimated without such spikes, so that the tracker rejects them as outliers.
     far = np.zeros(len(value), dtype=bool)
     if len(value) > 4:
         middle = np.median(sliding_window_view(value, 5), axis=1)
         far[2:-2] = np.abs(value[2:-2] - middle) > 10.0
-        # The first reading, and the last, has neighbours on one side only. A large step to its
-        # neighbour belongs to a ramp if the following step is similar.
+        # The first reading, and the last, has neighbours on one side only. A large step at
+        # an end of the readings belongs to a ramp if the following step is similar.
         for place, nearest in ((0, value[:3]), (-1, value[:-4:-1])):
             step, after = np.abs(np.diff(nearest)).tolist()
             far[place] = step > 10.0 and after < CONTINUED_SHARE * step

@@ -3,8 +3,8 @@
 """
 Owns the estimation of thermometer and detector settings from bags.
 
-The rates of temperature here are central differences over two minutes, which are not causal and
-need a recording. The lag and the ramps of the test that these rates show, and the noise of the
+Rates of temperature are central differences over two minutes, which are not causal and so need a
+recording. The lag and the ramps of the test that the rates show, and the noise of the
 readings, become settings of the thermometers and of the regime detector, which are causal.
 """
 

@@ -43,7 +43,7 @@ class Windows:
     position, bag: index of each window's position (within one bag), and of its bag, shape (n,)
     section: index of each window's section of its position, see `windows.N_SECTIONS`, shape (n,)
     time: time since the bag's first sample [s], shape (n,)
-    weight: number of samples divided by the median number of a window, shape (n,)
+    weight: number of samples of each window, divided by the median of these numbers, shape (n,)
     mean: mean raw samples, in input units, shape (n, 3)
     columns: values of the columns in their physical units, with the initial lag states at their
         prior mean, shape (n, m)

@@ -89,7 +89,7 @@ class Model:
 
     name: name of the model in the provenance
     parts: the lag of the part of each axis, or None in a model without one lag per axis
-    sensors: thermometers other than the board's; the first is the case's
+    sensors: thermometers other than the board's; the first is that of the case
     """
 
     name: str
