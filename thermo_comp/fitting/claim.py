@@ -129,7 +129,7 @@ def _over_offsets(
     n_mountings = int(windows.mounting[-1]) + 1
     is_single = windows.n_turn_ons == 1 < n_mountings
     if scale <= 0.0:
-        # A stated offset sd also holds for the turn-on. The regression's offsets of m mountings
+        # A stated offset sd also holds for a turn-on. The regression's offsets of m mountings
         # have a mean with 1 / m of the variance; 1 - 1 / m of the variance is added.
         variance = offset_sd**2 * (1.0 - 1.0 / n_mountings) if is_single else 0.0
         return posterior.covariance, offset_sd, variance
@@ -286,7 +286,7 @@ def _over_mountings(
     of_data, of_norms = of_data - of_data[nearest], of_norms - of_norms[nearest]
     evidence = np.minimum(of_data, of_norms + CLEAR_GAIN)
     if n_rests > 1.0:
-        # The rests of a mounting share its offset: only the means of mountings determine the sd.
+        # The rests of a mounting share its offset: only mountings' means determine the offset sd.
         fits, evidence = fits_with(n_rests**0.5 * tried), of_norms
     covariance, weight = _mixture(posterior, fits, evidence + log_prior)
     return covariance, float(np.sqrt(weight @ tried**2))

@@ -206,7 +206,7 @@ class LeastKnown:
 
 
 def least_known(calibration: Calibration, up: Floats) -> LeastKnown | None:
-    """Find the attitude of largest sd of |f|; None without covariance; `up`: the positions'."""
+    """Find the attitude of largest sd of |f|; None without covariance; `up`: of the positions."""
     if calibration.posterior is None:
         return None
     layout = parameter_layout(calibration)

@@ -67,7 +67,7 @@ def constants_of(calibration: Calibration) -> ConstantCalibration:
 
 
 def offset_sd_of(calibration: Calibration) -> float:
-    """Return the sd of the bias offset of a mounting or turn-on, least of the axes [m/s^2]."""
+    """Return the sd of the bias offset of a mounting or turn-on, smallest of axes [m/s^2]."""
     axes = [axis for part in calibration.regime_sets() for axis in part.axes()]
     return min(axis.residual_sd_m_s2 for axis in axes)
 

@@ -181,7 +181,7 @@ class Point:
         return step - self.solution[0][: self.layout.n_unit]
 
     def unit_step(self, matrix: Floats) -> tuple[Floats, Floats]:
-        """Return step and Hessian's Cholesky factor of unit unknowns, by `Reduced.matrix`."""
+        """Return the unit unknowns' step and Hessian's Cholesky factor; see `Reduced.matrix`."""
         n = self.layout.n_unit
         information, gradient, deviation = matrix[:n, :n], matrix[:n, n], self.deviation[:n]
         if not np.isfinite(information).all():

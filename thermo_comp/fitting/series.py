@@ -151,7 +151,7 @@ class Whitener:
 
 
 def _vertex(values: Floats, at: int) -> float:
-    """Return the offset from `at` of the vertex of the parabola through `at` +- 1; 0 at an end."""
+    """Return the vertex, relative to `at`, of the parabola through three values; 0 at an end."""
     if not 0 < at < len(values) - 1:
         return 0.0
     before, here, after = values[at - 1 : at + 2].tolist()
