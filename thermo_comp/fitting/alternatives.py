@@ -43,7 +43,7 @@ def model_of(
         {name for name, readings in bag.temperatures.items() if len(readings.value)}
         for bag in bags
     )
-    # The case thermometer, even if no bag has it, and thermometers of every bag but the board's.
+    # Case thermometer, recorded or not, and all thermometers but the board's that every bag has.
     sensors = 'case', *sorted(set.intersection(*recorded) - {'board', 'case'})
     detector = options.detector or learn_detector(bags)
     columns: tuple[Column, ...] = ()

@@ -129,8 +129,8 @@ def _over_offsets(
     n_mountings = int(windows.mounting[-1]) + 1
     is_single = windows.n_turn_ons == 1 < n_mountings
     if scale <= 0.0:
-        # A stated offset sd also holds for a turn-on. The regression's offsets of m mountings
-        # have a mean with 1 / m of the variance; 1 - 1 / m of the variance is added.
+        # A stated offset sd also holds for a turn-on. The mean of the regression's m mounting
+        # offsets has 1 / m of the variance; the remaining 1 - 1 / m of the variance is added.
         variance = offset_sd**2 * (1.0 - 1.0 / n_mountings) if is_single else 0.0
         return posterior.covariance, offset_sd, variance
     kind = 'mounting' if is_single or windows.has_turn_ons else 'both'
@@ -238,7 +238,7 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
     sd[inactive.part, inactive.column] = 1.0 / np.sqrt(np.maximum(information, 1e-300))
     is_of_lags = np.isin(groups, LAGS)
     if not regression.windows.has_drifts:
-        # At constant temperatures only thermometer errors change the lags: no bound on weights.
+        # At constant temperatures only thermometer errors change lags, and do not bound weights.
         sd = np.where((sd > 0.0) & (regression.windows.lag >= 0), np.inf, sd)
     sd = np.where(is_of_lags, sd, np.minimum(sd, typical))
     if CURVE in active:

@@ -177,7 +177,7 @@ class Equations(Series):
         Return index and factor (as in `Tangent`) of each active nonlinear coefficient's series.
 
         The factor 1 + S s of the scale multiplies the terms at the reference temperature. In the
-        terms' change per kelvin this factor is left out, as its effect is negligible.
+        terms' change per kelvin the factor of the scale is left out, as its effect is negligible.
         """
         active = np.flatnonzero(layout.nonlinear[0] >= 0)
         if self.forces is None or not len(active):

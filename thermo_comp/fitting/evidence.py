@@ -62,7 +62,7 @@ class PositionReport:
 @dataclass(frozen=True)
 class ResidualRow:
     """
-    Statistics of ``|f| - g`` over the windows of one section, after each step of the correction.
+    Statistics of ``|f| - g`` over the windows of a regime, after each step of the correction.
 
     section: regime of the windows, ``static``, ``dynamic`` or ``all``
     raw: corrected with the constants at the reference temperature

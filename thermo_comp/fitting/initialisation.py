@@ -205,8 +205,8 @@ def _initial_prior(windows: ThermalWindows, problem: Problem) -> Prior:
 
 def _with_faces(prior: Prior, up: Floats) -> Prior:
     """
-    Return the prior with a smaller misalignment sd if a noisy sensor is only held on its faces:
-    there misalignments of some degrees would, to second order, explain any errors of |f|. The
+    Return the prior with a smaller misalignment sd if a noisy sensor is only held on its faces,
+    where misalignments of some degrees would, to second order, explain any errors of |f|. The
     published covariance keeps the sd of `prior`.
     """
     by_element = up[:, [1, 2, 2]] * up[:, [0, 0, 1]]
@@ -308,7 +308,7 @@ def _typical_slopes(steepness: float, steepest: Floats, gravity: float) -> Float
 
 
 def _steepness(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool) -> float:
-    """Return the RMS change of a reading per kelvin, taken for a change of bias [m/s^2 per K]."""
+    """Return the RMS change of a reading per kelvin, attributed to the bias [m/s^2 per K]."""
     data, start = windows.data, problem.start
     within = within_positions(data.mean / start.scale, data.position)
     drift = float(np.sqrt(np.mean(within**2, axis=0)).max())

@@ -265,7 +265,7 @@ def score_of(regression: Regression, posterior: PosteriorMode) -> Score:
 def _by_positions(
     regression: Regression, posterior: PosteriorMode
 ) -> tuple[Folds, Folds, Floats, Floats]:
-    """Leave out each mounting; return folds of drift and |f|, force and drift of windows."""
+    """Leave out each mounting; return `Folds` of drift and |f|, windows' force and drift."""
     windows, share = regression.windows, regression.weight / regression.windows.weight
     point, edges = regression.at(posterior.state, posterior.prior), windows.edges
     counts = np.diff(edges).astype(np.float64)

@@ -401,7 +401,7 @@ class _PartCurves:
 
 def _in_two_stages(lag: Part) -> Part:
     """Split a lag of one stage into two stages, as the start of a search."""
-    # Two stages have almost the residual of one stage with the sum of their time constants.
+    # Two stages leave almost the same residual as one stage with the sum of both time constants.
     tau, _, share, lead = lag
     return Part(0.8 * tau + 1.0, 0.2 * tau + 1.0, share, lead)
 

@@ -57,7 +57,7 @@ def temperature_range(windows: ThermalWindows) -> Range:
 def soak_gradient(windows: ThermalWindows, known: Calibration | None) -> Range | None:
     """
     Return the gradient of the first sensor in soaks and its robust scatter [K]; both are those of
-    the prior calibration, `known`, if it has both. None without the sensor or without a soak.
+    the prior calibration, `known`, if it has both; None without the sensor or without a soak.
     """
     if known is not None and known.soak_gradient_k is not None:
         return known.soak_gradient_k
