@@ -159,7 +159,7 @@ def _why_dead(bags: Sequence[ReducedBag], dead: Sequence[_DeadAxis]) -> str:
     is_at_top = np.isclose([abs(axis.value) for axis in dead], largest, rtol=1e-4, atol=0.0)
     ends = {(axis.axis, axis.value > 0.0) for axis in dead}
     if not largest or not is_at_top.all() or len(ends) == 1:
-        return 'the axis is dead there, leave out a bag with a dead axis'
+        return 'the axis is dead; leave out each bag with a dead axis'
     # The advised full scale is just below the clipped reading, which counts as saturated.
     limit = f'--full-scale {largest * (1.0 - 1e-4):.5g}'
     return (
