@@ -10,7 +10,7 @@ for 60 days: random walks of the bias (15 ug per root day) and scale (10 ppm per
 offsets at turn-on (sd 20 ug) and one shock (sd 300 ug). On six days the calibration is updated
 with all earlier rests, as in `thermo_comp update`, and judged on the rests of the next day. After
 the last day the errors of the updated calibration are compared with those of a Kalman filter that
-is given these sd and the time of the shock. With --recordings FOLDER, the real recordings in
+is given the true sd and the time of the shock. With --recordings FOLDER, the real recordings in
 FOLDER are cut into parts, and an update with all earlier parts is judged on the next part.
 """
 
@@ -199,8 +199,8 @@ def simulated(kind: str, n_units: int, days: int) -> None:
     print(f'  error / claimed sd of |f| {ratio:.2f} (goal 0.7 .. 1.4)')
     days_after = np.array([pair for result in results for pair in result[1]])
     print(
-        f'  day after an update: {len(days_after)} days, error larger than without the update by '
-        f'the standard error {days_after[:, 0].sum()} (filter: {days_after[:, 1].sum()})'
+        f'  {len(days_after)} days after an update; error larger by a standard error than without '
+        f'the update on {days_after[:, 0].sum()} days (filter: {days_after[:, 1].sum()})'
     )
     print(f'  time of an update: {max(result[2] for result in results):.1f} s at most')
 

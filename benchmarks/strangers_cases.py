@@ -385,7 +385,7 @@ def flicker(number: int) -> Iterator[Study]:
 
 
 def third_node(number: int) -> Iterator[Study]:
-    """Let the bias depend on a node without a thermometer; chamber bags and a still-air bag."""
+    """Let the bias depend on a thermal node without thermometer, in a chamber and in still air."""
     rng = rng_of('third-node', number)
     unit = navigation(rng, hidden_bias=signed(rng, 20, 60), hidden_s=rng.uniform(900, 2500))
     fit = positions(unit, HALF, spread(12, rng), rng)

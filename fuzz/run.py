@@ -23,7 +23,7 @@ NAMES = ('calibration', 'mcap', 'cdr', 'parameters', 'db3', 'zstd', 'csv', 'parq
 
 
 def main() -> int:
-    """Run one target here, or all of them one after the other."""
+    """Run one target in this process, or all targets one after the other."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
     parser.add_argument('target', choices=(*NAMES, 'all'), nargs='?', default='all')
     parser.add_argument('--seconds', type=int, default=60, help='time per target (default 60)')

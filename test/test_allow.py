@@ -122,7 +122,7 @@ def in_whole_degrees(rest):
     ],
 )
 def test_bags_without_usable_numbers_are_refused_with_a_message(rng, spoil, text):
-    # WHY: for such bags the fit ended with a traceback.
+    # WHY: the fit to bags without usable numbers ended with a traceback.
     with pytest.raises(FitError, match=text):
         fit(spoilt(rng, spoil), FORCE)
 

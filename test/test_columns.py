@@ -121,7 +121,7 @@ def test_the_value_of_each_kind_of_column_agrees_with_hand_numbers():
         0.25, 0.49 * 3.0, 0.7, 0.5 * 3.0, 1.0, 0.5, 0.0,
     ]  # fmt: skip
     assert values == pytest.approx(expected)
-    # In a product with t, t is limited to calibrated temperatures; the column `board` has no t.
+    # In products t is limited to calibrated temperatures; the column `board` has no factor t.
     at_edge = ColumnTable(columns, spec, 20.0, (-10.0, 22.0)).values(state)[:, 0]
     assert at_edge[4] == pytest.approx(-0.6)
     assert at_edge[2] == 0.5

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The compensator agrees with hand calculations; a switch of sets or calibration is smooth."""
+"""The compensator agrees with hand calculations; a change of regime or calibration is smooth."""
 
 import math
 import random

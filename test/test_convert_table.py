@@ -348,7 +348,7 @@ def test_a_stated_unit_that_may_be_true_is_not_contradicted():
     # Any |a| at rest above 50 may be in counts, because converters differ in their bits.
     assert contradiction('counts', 2941.7, None) is None
     assert contradiction('counts', 2060.0, 2048.0) is None
-    # Without a rest |a| is unknown, and no unit is refused.
+    # Without a rest |a| at rest is unknown, and no unit is refused.
     assert contradiction('g', float('nan'), None) is None
 
 

@@ -234,7 +234,7 @@ def test_positions_without_a_thermometer_give_constants_and_wide_temperature_slo
 
 
 def test_a_fit_that_cannot_determine_the_repeatability_of_mountings_reports_its_assumption(rng):
-    # The nine constants of a triad fit nine norms exactly, so nine norms do not show offsets.
+    # The nine constants of a triad fit nine norms exactly, so they show no mounting offset.
     assert 'mountings' in names_of(tumbled(9))
     stated = fit([turned(rng, positions(9, 3))], replace(OPTIONS, mounting_sd=1e-3))
     assert 'mountings' not in names_of(stated)
@@ -288,8 +288,8 @@ def test_the_claimed_variance_of_a_curve_contains_that_of_turn_ons_at_each_tempe
     for bag in (bags[0], bags[2]):
         out = unit.correct(bag.time_s, bag.counts, board=bag.temperatures['board'])
         # At the ends of the range a curve through three equidistant points has 5/6 (line) to 1
-        # (parabola) of the variance of a turn-on; the next turn-on adds 1. If `mounting_sd` is the
-        # sd of nine independent mountings, bias and scale add 1/3 each.
+        # (parabola) times the variance of a turn-on, which the next turn-on adds once more. If
+        # `mounting_sd` is the sd of nine independent mountings, bias and scale add 1/3 each.
         variance = np.diagonal(out.covariance[-dwell:].mean(axis=0)) - 1e-3**2
         assert ((1.0 + 5.0 / 6.0) * turn_on**2 < variance).all()
         assert (variance < (1.0 + 1.0 + 2.0 / 3.0) * turn_on**2).all()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Samples are reduced to cells, rests and windows; thermometer settings are estimated."""
+"""Samples are averaged over windows in rests; thermometer settings are estimated."""
 
 from dataclasses import replace
 
@@ -89,7 +89,7 @@ def test_short_rests_of_slow_samples_are_found(rng, rest_s):
 
 @pytest.mark.parametrize('cycle_s', [0.01, 0.02, 0.04, 0.05, 0.1, 0.3, 1.0])
 def test_the_estimated_interval_between_samples_is_right_to_0_1_percent(rng, cycle_s):
-    # WHY: at 10 Hz a cell has 33 or 34 samples, and the rate was computed as 9.9 Hz.
+    # WHY: at 10 Hz averages have 33 or 34 samples; the rate was computed as 9.9 Hz.
     n = round(1800.0 / cycle_s)
     kept = rng.random(n) > 2.0 / n  # a few samples are lost
     samples = 9.8 + 0.01 * rng.standard_normal((n, 3))
@@ -102,7 +102,7 @@ def test_windows_are_means_of_their_samples(rng):
     (interval,) = reduced([block(samples)]).intervals
     assert interval.count.sum() == len(samples)
     assert len(interval.time) == 6
-    # A window of 10 s consists of 20 cells of 0.5 s with 50 samples each.
+    # A window of 10 s has 20 averages over 0.5 s (50 samples).
     np.testing.assert_allclose(interval.mean[2], samples[2000:3000].mean(axis=0), atol=1e-10)
     assert interval.time[2] == pytest.approx(24.995, abs=1e-9)
     np.testing.assert_allclose(interval.sample_sd, 0.3, rtol=0.1)
@@ -234,7 +234,7 @@ def test_the_reduction_does_not_depend_on_the_origin_of_time(rng):
 
 @pytest.mark.parametrize(
     ('rate_hz', 'cell_s', 'window_s'),
-    # At 100 Hz 20 cells of 0.5 s make a window of 10 s; at 4 Hz and 1 Hz a window is one cell.
+    # At 100 Hz 20 means over 0.5 s make a window of 10 s; at 4 and 1 Hz a window is one mean.
     [(100.0, 0.5, 10.0), (20.0, 10.0 / 6.0, 10.0), (4.0, 10.0, 10.0), (1.0, 30.0, 30.0)],
 )
 def test_windows_of_a_fit_have_the_stated_length(rate_hz, cell_s, window_s, rng):
@@ -314,8 +314,8 @@ def soak_ramp_soak(quantum, noise, rng):
 def test_thermometer_settings_are_estimated_from_readings(quantum, noise, rng):
     learned = learn_thermometer([soak_ramp_soak(quantum, noise, rng)], ThermometerSettings())
     assert learned.quantum_c == pytest.approx(quantum, rel=1e-6)
-    # If readings have steps, only edges that are passed slowly, at the end of the ramp, show
-    # noise.
+    # Rounded readings show noise only at the rounding edges that they pass slowly, at the end of
+    # the ramp.
     assert learned.noise_sd_c == pytest.approx(noise, rel=0.4 if quantum else 0.1)
     # Means over 60 s determine the lag of the thermometer, 300 s, to a third.
     assert learned.lag_s == pytest.approx(300.0, rel=0.35)
@@ -325,7 +325,7 @@ def test_thermometer_settings_are_estimated_from_readings(quantum, noise, rng):
 @pytest.mark.parametrize('noise', [0.02, 0.05, 0.09])
 def test_readings_that_alternate_at_edges_of_1_k_steps_show_their_noise(noise, rng):
     learned = learn_thermometer([soak_ramp_soak(1.0, noise, rng)], ThermometerSettings())
-    # The readings pass each of 30 edges once; only the two slowest passes show the noise.
+    # The readings pass each of 30 rounding edges once; only the two slowest passes show noise.
     assert learned.noise_sd_c == pytest.approx(noise, rel=0.3)
 
 

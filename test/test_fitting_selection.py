@@ -189,7 +189,7 @@ def test_the_estimated_prior_sd_of_a_column_is_the_rms_of_its_true_weights(calm)
 
 
 def test_the_prior_sd_of_a_slope_stays_below_the_steepest_plausible_slope():
-    # The slope of the unit is ten times the limit of the prior sd.
+    # The unit's bias slope is ten times the largest allowed prior sd of a bias slope.
     truth = Truth(on_bias=10.0 * STEEPEST[0] * np.outer([1.0, -1.0, 1.0], np.arange(6) == 0))
     windows, up = table_of(truth, 12, np.random.default_rng(2), n_windows=20)
     regression, state = begin(windows, up)
@@ -204,7 +204,7 @@ def test_the_prior_sd_of_a_slope_stays_below_the_steepest_plausible_slope():
 def test_errors_of_fitted_parameters_in_claimed_sd_have_an_rms_near_1(noisy):
     regression, chosen, truth = noisy
     errors = truth.errors(regression, chosen.posterior)
-    # Weights that the fit pruned have no sd and no entry here.
+    # Weights that the fit pruned have no sd and are not in `errors`.
     every = np.concatenate([*errors.values()])
     # The RMS of 30 values of error / sd is uncertain by 13 %; estimated prior sd lower the RMS.
     assert len(every) > 20
