@@ -5,7 +5,7 @@ Owns the figures of docs/regime.md: the regime detector in simulated ramps and s
 
 A ramp of a chamber, with control ripple and a drift by self-heating, changes the temperatures of a
 case (first-order lag of the chamber) and of a board (first-order lag of the case). Sensors of
-several noises, quanta and rates read these temperatures. The detector's settings are the defaults
+several noises, quanta and rates read case and board. The detector's settings are the defaults
 except for noise, quantum, lags and ripple, which are those of the scene. All runs are seeded, so
 the command always prints the same figures, except for CPU times.
 

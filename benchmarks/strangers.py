@@ -205,8 +205,8 @@ def bias_score(calibration: thermo_comp.Calibration, study: Study) -> Score:
     bag = Bag('zero', time_s, zero, temperatures)
     out = corrected(calibration, bag, config)
     error = out.force[len(out.force) // 2 :].mean(axis=0)
-    # The Cramer-Rao bound is that of the parameters alone: subtract the claimed variance of a
-    # calibration without a posterior, which is that of thermometer noise and of a turn-on.
+    # The Cramer-Rao bound does not include thermometer noise and turn-ons: subtract their claimed
+    # variance, which is that of the calibration without a posterior.
     exact = corrected(replace(calibration, posterior=None), bag, config)
     sd = np.sqrt(np.maximum(np.diag(out.claim[-1] - exact.claim[-1]), 0.0))
     return Score(

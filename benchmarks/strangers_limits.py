@@ -89,7 +89,7 @@ class Limit:
     claim : float
         Largest claimed sd / error.
     than, times : str, float
-        End of the title of another row of the case, and largest error / error of that row.
+        End of the title of a second row of the case, and largest error / error of this second row.
     bound_ratio : float
         Largest error of the bias / its Cramer-Rao bound.
 

@@ -219,7 +219,7 @@ def test_all_readings_of_two_minutes_without_samples_are_applied(n_before, ahead
         for k in range(4, 20 * 120)
         for name in ('board', 'case')
     ]
-    # If `ahead_s` is 2, readings of 2 s have later stamps than the first sample after them.
+    # If `ahead_s` is 2, the last 2 s of readings have later stamps than the sample after them.
     after_ns = (120 - ahead_s) * SECOND_NS
     last = [('accel', after_ns + k * SECOND_NS // 100, (1.0, 2.0 + k, 2930.0)) for k in range(5)]
     block, live = (Compensator(replace(rich_calibration(), gyroscope=None)) for _ in range(2))

@@ -175,7 +175,7 @@ def test_rests_at_three_temperatures_give_the_bias_slope_despite_a_warm_up_of_th
 @pytest.mark.slow
 def test_the_drift_error_of_a_sensor_that_follows_half_of_a_warm_up_is_within_three_claimed_sd():
     # WHY: a curve fitted to the drifts within rests was wrong by 7 claimed sd over the range of
-    # temperatures. Seed 2 gives an error above the sd that follows from these drifts.
+    # temperatures. Seed 2 gives an error above the sd of the curve fitted to drifts.
     rng, slopes, bags = np.random.default_rng(2), 0.1 * MG * SLOPE, []
     for celsius in (5.0, 20.0, 35.0):
         for up in positions(6, 3):

@@ -117,7 +117,7 @@ def test_positions_in_one_bag_are_separated(rng):
     first, second = reduced([block(accel)]).intervals
     np.testing.assert_allclose(first.mean[0], (0.0, 0.0, 3000.0), atol=0.1)
     np.testing.assert_allclose(second.mean[-1], (3000.0, 0.0, 0.0), atol=0.1)
-    # Up to two cells (1 s) before and after the motion are left out of the rests.
+    # Up to 1 s (two means) before and after the motion is left out of the rests.
     assert (first.end_ns - first.start_ns) * 1e-9 == pytest.approx(40.0, abs=1.6)
     assert (second.end_ns - second.start_ns) * 1e-9 == pytest.approx(30.0, abs=1.6)
 
@@ -184,8 +184,8 @@ def test_glitches_are_counted_and_end_no_rest(rng):
 
 
 def test_a_rest_is_found_in_samples_that_arrive_in_bursts(rng):
-    # WHY: the length of a cell followed from the median step of stamps, 0.3 ms, so cells between
-    # bursts were empty, and a unit at rest for 22 min was reported as worn or driven.
+    # WHY: the averaging time followed from the median step of stamps, 0.3 ms, so no samples were
+    # averaged between bursts, and a unit at rest for 22 min was reported as worn or driven.
     whole = block(still(rng, 600.0, (0.0, 0.0, 3000.0)))
     number = np.arange(len(whole.accel))
     for size in (20, 100, 200):
@@ -391,8 +391,8 @@ def test_a_drift_averages_the_error_of_rounding(rng):
 
 @pytest.mark.parametrize('step', [1.0, 0.04])
 def test_steps_of_a_converter_after_a_constant_soak_do_not_divide_a_rest(rng, step):
-    # WHY: the step of the converter was searched in the first 20000 samples. These were constant,
-    # and each later step of the converter began a new rest.
+    # WHY: the step of the converter was searched in the first 20000 samples only. If these samples
+    # were constant, each later step of the converter began a new rest.
     rest = Rest(rng, duration_s=3600.0, sd=0.0)
     ramp = np.maximum(rest.time - 1800.0, 0.0) / 1800.0
     rest.accel = np.rint(rest.accel / 0.04 + 6.0 * np.outer(ramp, (1.0, -1.3, 0.7))) * step
@@ -401,7 +401,7 @@ def test_steps_of_a_converter_after_a_constant_soak_do_not_divide_a_rest(rng, st
 
 
 def test_a_turn_between_constant_samples_is_not_taken_for_a_step_of_the_converter(rng):
-    # WHY: the samples change at a turn only, and this change was taken for the converter's step.
+    # WHY: if samples change only at a turn, this change was taken for the converter's step.
     rest = Rest(rng, sd=0.0)
     rest.accel[rest.time > 300.0] = (GRAVITY, 0.0, 0.0)
     bag = reduce_source(rest.source(), full_scale=None)

@@ -384,7 +384,7 @@ def test_thermal_tilts_of_supports_are_separated_from_the_drift_of_the_unit():
 
 
 def test_the_estimated_tilt_of_a_stiff_support_is_below_the_noise(calm):
-    # A mean over 60 windows with a noise of 2 ug each does not show a smaller tilt.
+    # A tilt below the noise of a mean over 60 windows (2 ug / sqrt(60)) cannot be measured.
     _, chosen, truth = calm
     hidden = truth.sigma[0] / np.sqrt(60.0)
     tilt = GRAVITY * chosen.posterior.state.tilt
