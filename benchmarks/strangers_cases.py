@@ -208,7 +208,7 @@ def mems(number: int) -> Iterator[Study]:
 def sessions(number: int) -> Iterator[Study]:
     """
     Turn a MEMS unit by hand every 8 min in two recordings, each with a random bias offset of
-    0.3 mg. Fit the first recording; both; the second, with the fit of the first as prior.
+    0.3 mg. Fit the first recording, both, and the second with the first fit as prior.
     """
     rng, hold_s, rate_hz = rng_of('sessions', number), 480.0, 10.0
     unit, up = consumer_grade(rng), spread(12, rng)

@@ -115,7 +115,7 @@ def test_one_position_gives_bias_over_temperature_on_three_axes(one_position):
     at = np.array([-3.0, 12.0])
     for axis, slope in zip(one_position.calibration.static.axes(), SLOPE, strict=True):
         fitted = np.diff(axis.bias_function.value(at))[0] / 15.0 / MG
-        # 15000 samples (noise 3 mg) over 16 K determine a slope to some hundredths of a mg/K.
+        # 15000 samples (noise 3 mg) over 19 K determine a slope to 0.01 mg/K.
         assert fitted == pytest.approx(slope, abs=0.2)
 
 
@@ -234,7 +234,7 @@ def test_positions_without_a_thermometer_give_constants_and_wide_temperature_slo
 
 
 def test_a_fit_that_cannot_determine_the_repeatability_of_mountings_reports_its_assumption(rng):
-    # The nine constants of a triad fit nine norms exactly, so they show no mounting offset.
+    # The nine constants of a triad fit nine norms exactly, so nine norms show no mounting offset.
     assert 'mountings' in names_of(tumbled(9))
     stated = fit([turned(rng, positions(9, 3))], replace(OPTIONS, mounting_sd=1e-3))
     assert 'mountings' not in names_of(stated)
