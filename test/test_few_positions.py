@@ -413,7 +413,7 @@ def test_the_claimed_sd_from_six_faces_contains_the_cross_axis_sensitivity_of_a_
     out = calibration.correct(np.arange(1.0, len(reading) + 1.0), reading)
     sd = np.sqrt(np.diagonal(out.covariance, axis1=1, axis2=2))
     ratio = (out.specific_force - corners)[:, 1:] / sd[:, 1:]
-    # The RMS of three random numbers is within a factor of 2 of their sd in 95 % of the draws.
+    # The RMS of three normal numbers is within a factor of 2 of their sd in 85 % of the draws.
     assert 0.5 < np.sqrt(np.mean(ratio**2)) < 2.0
 
 

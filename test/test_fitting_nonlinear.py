@@ -281,7 +281,7 @@ def test_runs_of_a_centrifuge_determine_nonlinear_terms_that_a_later_fit_keeps()
         replace(again, unit=replace(again.unit, serial=f'{k}'), gyroscope=None) for k in range(3)
     ]
     assert population(siblings).nonlinearity is None
-    # A fit to positions at 1 g alone keeps the stated sd of K2, and reports this.
+    # A fit to positions at 1 g alone keeps the stated sd of K2, which is reported.
     alone = fit(tumble, FitOptions(gravity=G, model='golovach', k2_sd=5e-5))
     assert [finding.name for finding in alone.findings].count('nonlinearity') == 1
     (square, *_) = nonlinear_coefficients(alone.calibration)

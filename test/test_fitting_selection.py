@@ -137,7 +137,7 @@ def test_estimated_noise_parameters_agree_with_the_truth(noisy):
     _, chosen, truth = noisy
     prior = chosen.posterior.prior
     assert {'curve', 'board'} <= chosen_groups(chosen)
-    # 1080 windows per axis determine the sd of white noise to 3 %, with slow noise less well.
+    # 1080 windows per axis determine the sd of white noise to 2 %, with slow noise less well.
     np.testing.assert_allclose(prior.sigma, truth.sigma, rtol=0.15)
     # A position lasts six correlation times of the noise, and the curves fit part of the noise.
     assert 0.5 < prior.noise.ratio / truth.noise.ratio < 2.0
