@@ -106,14 +106,14 @@ def main() -> None:
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
     parser.add_argument('--quick', action='store_true', help='three rates, one run of 3 s each')
-    parser.add_argument('--seconds', type=float, help='length of a run (default 10)')
+    parser.add_argument('--seconds', type=float, help='length of a run [s] (default 10)')
     parser.add_argument('--repeats', type=int, help='runs of each case (default 3)')
     parser.add_argument('--rates', type=int, nargs='+', help=f'default {RATES}')
     parser.add_argument(
         '--floor', action='store_true', help='also measure a relay that only copies bytes'
     )
     parser.add_argument('--core', type=int, default=-1, help='core of the relays (default any)')
-    parser.add_argument('--depth', type=int, default=100, help='queue of the source (default 100)')
+    parser.add_argument('--depth', type=int, default=100, help='samples kept to resend (100)')
     parser.add_argument('--sleep', action='store_true', help='let idle cores sleep')
     parser.add_argument('--json', help='file for the figures')
     arguments = parser.parse_args()

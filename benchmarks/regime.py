@@ -228,7 +228,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument('parts', nargs='*', help=f'all by default: {", ".join(PARTS)}')
-    parser.add_argument('--quick', action='store_true', help='small runs, for some seconds')
+    parser.add_argument('--quick', action='store_true', help='fewer runs, done in seconds')
     parser.add_argument('--seed', type=int, default=1)
     parser.add_argument('--workers', type=int, default=1, help='number of processes')
     parser.add_argument('--soak-hours', type=float, default=1100.0)

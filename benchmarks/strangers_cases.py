@@ -129,7 +129,7 @@ def plain(number: int) -> Iterator[Study]:
 
 
 def one_pose(number: int) -> Iterator[Study]:
-    """Record a single pose for 9.5 h; the parts lag the board by 500 to 1500 s."""
+    """Record a single pose for 9.1 h; the parts lag the board by 500 to 1500 s."""
     rng = rng_of('one-pose', number)
     unit = navigation(rng)
     up = spread(1, rng)
