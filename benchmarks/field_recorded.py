@@ -91,7 +91,7 @@ def cases(folder: Path, work: Path) -> Iterator[tuple[str, Path, list[float], fl
 
 
 def judge_recordings(folder: Path) -> None:
-    """Print for each recording the RMS of |f| - g, before and after updates by earlier parts."""
+    """Print for each recording the RMS of |f| - g without and with updates by earlier parts."""
     print('\nreal recordings: an update with all earlier parts, judged on the next part')
     with tempfile.TemporaryDirectory() as work:
         for name, bag, edges, window in cases(folder, Path(work)):

@@ -111,8 +111,8 @@ def at_seconds(*events):
     ]
 
 
-# In the explicit examples the compensator must find that stored readings have stamps of another
-# clock: by a reading that it has applied, or by a reading one day later.
+# In the explicit examples a reading that was applied before, or a reading one day later, shows
+# that stored readings have stamps of another clock.
 @given(event_lists, st.integers(3, 30), st.sampled_from([0.0, 5.0]))
 @example(at_seconds('A', 3, 'A', 0, 'B', 2, 'B', 86_400, 'C', 0, 'A', 0), 5, 0.0)
 @example(at_seconds('B', 26, 'B', 21, 'A', 23, 'B', 16.5), 1, 0.0)

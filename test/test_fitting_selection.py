@@ -94,7 +94,7 @@ def test_each_tried_model_has_a_left_out_error(calm):
     assert rms[()] > 2.0 * rms['curve',] > 10.0 * rms['curve', 'board']
     (chosen,) = (trial for trial in selected.trials if trial.is_chosen)
     assert chosen.score is selected.score
-    # The left-out error is white noise plus the error of the fit, at most 15 % in total.
+    # By errors of the fit the left-out error is above the white noise, by 15 % at most.
     assert 1.0 < selected.score.rms / truth.sigma[0] < 1.15
     assert all(is_better(trial.score, selected.score) for trial in selected.trials[:2])
 
