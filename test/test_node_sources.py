@@ -71,7 +71,7 @@ def test_samples_of_a_second_publisher_are_never_published(peer, unit):
         assert all(stamp_of(imu) % CYCLE_NS == 0 for imu in samples.heard)
 
 
-#: A driver process: it sends at 100 Hz as soon as it has a subscriber; frame_id is its name.
+#: A driver process: it sends at 100 Hz once it has a subscriber, with its name as frame_id.
 DRIVER = """
 import sys, time, rclpy
 from geometry_msgs.msg import Vector3Stamped
@@ -208,11 +208,11 @@ def test_a_driver_with_incompatible_qos_or_type_is_named(peer, unit):
 
 
 def test_reports_more_frequent_than_samples_report_no_missing_samples(peer, tmp_path):
-    # WHY: with a diagnostics_period below the sample interval, reports without samples were ERROR.
+    # WHY: with a diagnostics_period below the sample interval, reports between samples were ERROR.
     from thermo_comp.unit.calibration import Unit
 
     slow = tmp_path / 'slow.yaml'
-    # Missing samples are an error after 5 cycles, 1.5 s: no busy machine delays a sample as long.
+    # An error is reported after 5 cycles without a sample, 1.5 s, which no busy machine causes.
     save_calibration(calibration(unit=Unit('T-1', 'counts', 32767.0, 0.3)), slow)
     with node_in_thread(*node_arguments(slow, 'diagnostics_period:=0.01')) as node:
         heard = peer.listen(DiagnosticArray, '/diagnostics')

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fits to unsigned and to signed words differ by the offset in the bias only."""
+"""Fits to unsigned and to signed integer samples differ only in the bias, by the offset."""
 
 from dataclasses import replace
 

@@ -57,7 +57,7 @@ def small_bag(compression, use_chunking=True):
 
 
 def every_cut(content, position, length):
-    """List the bytes at which to cut: all of the last chunk, every 17th after this chunk."""
+    """List the bytes at which to cut: all in the last chunk, and every 17th after this chunk."""
     end = position + length
     return [*range(position, end), *range(end, len(content), 17), len(content) - 1]
 

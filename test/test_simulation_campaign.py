@@ -57,7 +57,7 @@ def test_the_true_thermal_model_leaves_only_noise(kind):
         # determine the RMS to a factor of two.
         assert 4.0 < vector < 20.0
     else:
-        # The RMS of 1311 means is uncertain by 2 % (norm) and 1.2 % (vector); limits: 5 times.
+        # The RMS of 1311 means is uncertain by 2 % (norm) and 1.2 % (vector); limits: 5 sd.
         assert np.sqrt(np.mean(np.concatenate(norms) ** 2)) == pytest.approx(0.65, abs=0.065)
         assert vector == pytest.approx(1.12, abs=0.07)
 
@@ -75,7 +75,7 @@ def test_plans_have_the_stated_durations_and_attitudes():
         ups = np.array([p.up for p in plan(name, 1)])
         np.testing.assert_allclose(np.linalg.norm(ups, axis=1), 1.0)
         assert np.any(ups != np.array([p.up for p in plan(name, 2)]))
-    # From position to position of the chamber in tumble-3, f of each axis varies by over 0.5 g.
+    # Between the chamber positions of plan tumble-3 the force on each axis varies by over 0.5 g.
     assert np.ptp(np.array([p.up for p in plan('tumble-3', 1)][18:]), axis=0).min() > 0.5
     fitted = np.array([p.up for p in plan('chamber-18', 1)])
     held_out = np.array([p.up for p in plan('held-out', 1)])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The thermal tracker agrees with closed forms: lags, blend of sets, lost sensors, restart."""
+"""The thermal tracker agrees with closed forms: lags, regime blend, lost sensors, restart."""
 
 import math
 

@@ -99,8 +99,8 @@ def test_a_third_thermometer_reduces_the_error_to_the_noise(runs, tmp_path):
         index = np.searchsorted(runs[-1].accel_stamp_ns, corrected.accel_stamp_ns)
         error = corrected.accel - truth.specific_force
         use = truth.cycle_s[index] > 600.0
-        # Compare the scatter of means over 60 s: constants have no effect on it, and noise is
-        # small.
+        # Compare the scatter of means over 60 s: errors of the constants do not change the
+        # scatter, and noise is small.
         n = int(use.sum()) // 120 * 120
         means = error[use][:n].reshape(-1, 120, 3).mean(axis=1)
         errors[sees_lid] = float(np.sqrt(np.mean(np.var(means, axis=0)))) / MICRO_G
