@@ -31,8 +31,8 @@ from thermo_comp.unit.rate_bias import MILLIDEGREE, RateCurve
 
 OPTIONS = FitOptions(gravity=STANDARD_GRAVITY, input='m/s^2')
 START_NS = 1_767_225_600_000_000_000
-#: White noise of a mean over 60 s of the simulated gyroscope [rad/s].
 RATE_HZ, MINUTE = 1.0, 60
+#: White noise of a mean over 60 s of the simulated gyroscope [rad/s].
 FLOOR = 5.0 * MILLIDEGREE / np.sqrt(60.0)
 
 
@@ -132,7 +132,7 @@ def test_a_gyroscope_does_not_change_the_accelerometer_s_fit(unit):
         with_rate.calibration, gyroscope=None, provenance=without.calibration.provenance
     )
     assert same == without.calibration
-    # A bag with NaN rates at rest counts as a bag without rates.
+    # A bag with NaN angular rates at rest counts as a bag without angular rates.
     broken = [np.array(record.angular_rate) for record in records]
     broken[0][len(broken[0]) // 2 :] = np.nan
     sources = [

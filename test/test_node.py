@@ -10,7 +10,7 @@ import pytest
 import yaml
 from conftest import ROOT
 
-pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
 
 from builders import calibration, rich_calibration, thermal_calibration
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -54,7 +54,7 @@ def saved(tmp_path):
 
 
 def diagnosis(peer):
-    """Return a function that waits for diagnostics with a condition on status and values."""
+    """Return a function that waits for diagnostics whose status and values meet a condition."""
     heard = peer.listen(DiagnosticArray, '/diagnostics')
 
     def wait(condition):

@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import pytest
 
-pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
 
 import rclpy
 from builders import calibration

@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
 
 from builders import calibration
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -104,7 +104,7 @@ rclpy.spin(node)
 
 @contextlib.contextmanager
 def driver_process(name):
-    """Run a driver until the context ends; yield the process and its first stamp [ns]."""
+    """Run a driver until the context ends; yield the process and its first sample's stamp [ns]."""
     command, environment = [sys.executable, '-c', DRIVER, name], {**os.environ, **OVER_UDP}
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
     try:

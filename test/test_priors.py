@@ -258,7 +258,7 @@ def test_one_to_three_faces_of_an_unchanged_unit_keep_the_calibration(n_faces):
 
 @pytest.mark.parametrize('kind', ['bias', 'scale'])
 def test_three_faces_halve_the_error_of_a_change_of_bias_or_scale(kind):
-    # WHY: an update with three faces took a change of 100 ug for mounting offsets.
+    # WHY: an update with three faces took a bias change of 100 ug for mounting offsets.
     # WHAT: in each face one count, 300 ug, is added by a change of the bias or of the scale.
     K = np.array([axis.scale_factor for axis in fitted(9).calibration.axes])
     change = np.array([1.0, -1.0, 1.0]) / (K * STANDARD_GRAVITY)

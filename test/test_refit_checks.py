@@ -90,7 +90,7 @@ def test_if_the_second_fit_is_refused_the_first_is_kept(rng, monkeypatch):
 
 @pytest.mark.slow
 def test_slowly_tilting_supports_are_fitted_with_an_attitude_per_hour():
-    # WHY: tilts of 60 urad within 4 h caused force errors of 12 to 15 ug in a held-out program.
+    # WHY: supports tilting by 60 urad in 4 h caused force errors of 12 to 15 ug in held-out bags.
     _, study, _ = slow_drift(1)
     calibration = strangers.fitted(study)
     assert any('may tilt from hour to hour' in note for note in calibration.provenance.notes)

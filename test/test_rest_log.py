@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
 
 from builders import calibration
 from diagnostic_msgs.msg import DiagnosticArray
@@ -241,7 +241,7 @@ def test_a_killed_node_damages_at_most_one_line_of_its_rest_log(tmp_path, unit, 
     sent = 0
 
     def until(condition, what):
-        """Send samples of 1 s until a condition holds; samples before discovery are lost."""
+        """Send samples of 1 s until a condition holds; those before DDS discovery are lost."""
         nonlocal sent
         pause = threading.Event()
         for _ in range(len(samples) // RATE_HZ):

@@ -116,7 +116,7 @@ def test_a_saturated_effect_of_heat_flow_has_two_values():
 
 
 def test_a_switched_load_warms_its_part_by_the_steady_heat_balance():
-    """Before the load the warming is zero, at the end that of the steady heat balance."""
+    """The warming is zero before the load, and that of the heat balance in the end."""
     unit = triad('own-lags', 1)
     spell = 30_000.0
     load = SwitchedLoad('board', 0.5, (spell, 1.0001 * spell))
@@ -187,7 +187,7 @@ def test_bias_and_scale_changes_are_0_at_the_reference_temperature(name):
 
 @pytest.mark.parametrize('seed', range(8))
 def test_the_preset_bare_quartz_has_the_published_slopes(seed):
-    """Q-Flex: scale slope 68 to 87 ppm/K at 5 to 35 degC (0.31 ppm/K^2), bias 0.3 to 5 ug/K."""
+    """Q-Flex: scale slope 68 ppm/K at 5 degC, 87 ppm/K at 35 degC; bias slope 0.3 to 5 ug/K."""
     unit = unit_preset('bare-quartz', seed)
     board = np.array([4.5, 5.5, 19.5, 20.0, 20.5, 34.5, 35.5])
     bias, scale = _static(unit, board)

@@ -32,7 +32,7 @@ from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 PROGRAM = parse_cyclogram('20 10min, 40@1 25min, 5@1 25min')
 MICRO_G = STANDARD_GRAVITY * 1e-6
-#: Effect of the lid's temperature on the axes [ug/K], and warming of the lid by the load [K].
+#: Effect of the lid's temperature on the biases [ug/K], and warming of the lid by the load [K].
 LID_UG_K = (12.0, -9.0, 15.0)
 LOAD_K = 5.0
 
@@ -62,7 +62,7 @@ def record(path, run):
 
 def fitted(bags):
     sources, _ = fit_sources(bags)
-    # These groups suffice, because the effect of the lid has no lag.
+    # These groups of columns suffice, because the lid's effect has no lag.
     groups = ('curve', 'gradient', 'board')
     return fit(sources, FitOptions(gravity=STANDARD_GRAVITY, groups=groups)).calibration
 
