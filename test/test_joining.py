@@ -157,7 +157,7 @@ def test_a_split_recording_gives_the_calibration_of_the_whole_recording():
         }
         part = replace(bag, time_s=bag.time_s[inside[0]], counts=bag.counts[inside[0]])
         parts.append(replace(part, temperatures=readings, name=f'{begin_s:g} s'))
-    # A fit of these two groups takes 1/5 of the time of a choice among all groups.
+    # A fit of these two groups of columns takes 1/5 of the time of a choice among all groups.
     whole, split = (
         thermo_comp.fit(bags, gravity=9.80665, groups=('curve', 'board')) for bags in (bag, parts)
     )

@@ -95,7 +95,7 @@ def assert_same(live, offline):
     assert expected.imu is not None
     for name in ImuColumns._fields:
         assert getattr(out.imu, name).tobytes() == getattr(expected.imu, name).tobytes(), name
-    # There is one regime flag for each case reading, so equal flags mean equal times of switches.
+    # There is one regime flag for each case reading, so equal flags mean equal switching times.
     assert (len(flags), flags) == (len(expected_flags), expected_flags)
     assert False in flags
     assert True in flags

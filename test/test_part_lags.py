@@ -136,7 +136,7 @@ def test_lags_of_the_thermometers_themselves_are_fitted(sensors):
     parts = {term.part for term in calibration.response if term.kind == 'board'}
     taus, _, shares, leads = np.array(sorted(parts)).T
     if 'case' in sensors:
-        # A lag of both thermometers acts like equal shares of (case - board) in all part inputs.
+        # A lag of both thermometers acts like equal shares of (case - board) in all parts' inputs.
         assert shares == pytest.approx([np.mean(shares)] * 3, abs=0.02)
     else:
         assert taus == pytest.approx(unit.part_s, rel=0.02)
@@ -231,7 +231,7 @@ def test_the_lags_of_parts_are_found_beside_an_effect_of_the_gradient():
 def test_a_bump_of_the_bias_over_temperature_is_fitted_by_knees():
     # The bump lasts for two means over 60 s, and must not be taken for motion.
     _, study = study_of('bump', bump=np.array([450.0, -400.0, 500.0]), bump_c=17.0)
-    # A fit of all groups chooses these three groups, too, but takes three times as long.
+    # A fit of all groups of columns chooses these three, too, but takes three times as long.
     calibration = strangers.fitted(study, groups=('curve', 'part', 'bend'))
     judgement = judged(calibration, study)
     # The bump is a bell with an sd of 0.85 K; the fit has straight lines of 0.5 K.
@@ -351,7 +351,7 @@ def lags_of(calibration):
 def test_lags_of_a_unit_with_a_hidden_node_are_those_of_the_bank():
     # The bias of each axis depends on its part and on a hidden node without a thermometer.
     study = next(third_node(0))
-    # A fit of all groups chooses these six groups, too, but takes 1.5 times as long.
+    # A fit of all groups of columns chooses these six, too, but takes 1.5 times as long.
     groups = ('curve', 'part', 'board', 'gradient_lag', 'product', 'square')
     calibration = strangers.fitted(replace(study, bags=study.bags[:8]), groups=groups)
     assert lags_of(calibration) <= {*FINE_TAUS}

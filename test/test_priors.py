@@ -53,7 +53,7 @@ test_of.__test__ = False
 def fitted(number):
     """
     Fit a sibling to nine of its twelve positions. Nine positions do not determine the sd of
-    mountings, so it is stated.
+    mounting offsets, so this sd is stated.
     """
     options = replace(OPTIONS, serial=f'unit-{number}', mounting_sd=1e-6 * STANDARD_GRAVITY)
     return fit([source(record) for record in test_of(number, 0, 9)], options)
@@ -138,8 +138,8 @@ def test_chance_correlations_between_parameters_of_twelve_units_are_reduced(rng)
 
 @pytest.mark.slow
 def test_equal_curves_of_both_sets_stay_equal_in_a_population():
-    # WHY: in the prior the correlations between equal curves of both sets were reduced: the error
-    # of a fit to nine positions was 3.1 ug with this prior, and 0.7 ug without a prior.
+    # WHY: in the prior the correlations between equal curves of both regimes were reduced: the
+    # error of a fit to nine positions was 3.1 ug with this prior, and 0.7 ug without a prior.
     prior = population(siblings())
     covariance, layout = prior.posterior.covariance(), parameter_layout(prior)
     for block in (*layout.bias, *layout.scale):

@@ -223,7 +223,7 @@ def test_the_scipy_cubic_fits_a_cubic_bias_and_constants_do_not():
         strangers.error_of([by_norm([fit], order=order)(held)], [held], is_drift=False)
         for order in (3, 0)
     )
-    # The scipy cubic neglects products of small terms, such as misalignment times bias, of 5 ug.
+    # The scipy cubic neglects products of small terms, e.g. misalignment times bias, below 5 ug.
     assert cubic.vector < 5.0
     assert constants.vector > 50.0
 

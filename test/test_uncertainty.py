@@ -198,7 +198,7 @@ def test_beyond_the_range_bias_and_scale_slopes_do_not_cancel_in_the_claimed_sd(
 
 
 def curves_at(unit, celsius):
-    """Return bias and relative scale of x in both sets at n temperatures, shape (2, 2, n)."""
+    """Return bias and relative scale of x in both regimes at n temperatures, shape (2, 2, n)."""
     return Correction(unit).curves.values(np.array(celsius))[:, ::3]
 
 
@@ -223,14 +223,14 @@ def test_beyond_the_range_curves_follow_their_tangent_for_a_quarter_of_the_range
 
 
 def test_outside_its_range_a_set_follows_the_curve_of_the_other_set():
-    # The static set has a range of 5 to 35 degC, the dynamic set of 0 to 30 degC.
+    # The static set of curves is valid from 5 to 35 degC, the dynamic set from 0 to 30 degC.
     unit = calibration(
         static=regime_set(axis_set(BENT)),
         dynamic=regime_set(axis_set(WAVY, delta=2.0), temperature_range_c=(0.0, 30.0)),
     )
     celsius = [-20.0, -7.5, -3.0, 0.0, 5.0, 30.0, 35.0, 38.0, 42.5, 60.0]
     static, dynamic = curves_at(unit, celsius)[:, 0]
-    # Outside the common range, 5 to 30 degC, the sets differ by as much as at its edge.
+    # Outside the common range, 5 to 30 degC, both sets differ by as much as at its edge.
     np.testing.assert_allclose((dynamic - static)[:5], dynamic[4] - static[4], rtol=1e-12)
     np.testing.assert_allclose((dynamic - static)[5:], dynamic[5] - static[5], rtol=1e-12)
     wavy, bent = np.polynomial.Polynomial(WAVY), np.polynomial.Polynomial(BENT)
