@@ -288,7 +288,7 @@ class TestVerdict:
             assert judgement.left_out_rms == pytest.approx(expected, nan_ok=True)
 
     def test_a_calibration_without_covariance_gets_the_verdict_no_claim(self):
-        # WHY: without a covariance the claimed sd is only noise, and gave 'recalibrate'.
+        # WHY: without a covariance the claimed sd is that of noise alone: it gave 'recalibrate'.
         imported = corrected_by(SLOPE)
         windows = made(50.0, 1000.0, 2.0)
         judgement = judge(windows, imported)

@@ -60,7 +60,7 @@ class TestEveryFile:
 
 
 def parameters_set(arguments):
-    """Return the parameters that thermo_comp.launch.xml sets for these arguments."""
+    """Return the parameters that thermo_comp.launch.xml sets for the given arguments."""
     given = {arg.get('name', ''): arg.get('default', '') for arg in parse(OURS).findall('arg')}
     given |= arguments
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The correction of nonlinear axes agrees with closed formulas, in blocks and one by one."""
+"""The correction of nonlinear axes agrees with closed formulas, for blocks and single samples."""
 
 from dataclasses import replace
 

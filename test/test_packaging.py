@@ -83,7 +83,7 @@ def test_no_source_file_exceeds_the_limit_of_lines():
 
 
 def test_the_manifest_lists_only_dependencies_of_the_node():
-    # The further dependencies of the commands come from PyPI.
+    # Commands have further dependencies, which come from PyPI.
     keys = {node.text for node in MANIFEST.iter('exec_depend')}
     assert {key for key in keys if key and key.startswith('python3-')} == {
         'python3-numpy',

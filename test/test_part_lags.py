@@ -253,7 +253,7 @@ def test_two_lags_in_series_are_fitted_as_two_stages():
     for record in (*records, *tests):
         for name in ('board', 'case', 'board_stamp_ns', 'case_stamp_ns'):
             setattr(record, name, getattr(record, name)[::10])
-    # A fit with only the groups of the simulated unit takes half the time.
+    # A fit with only the groups of columns that the simulated unit needs takes half the time.
     groups = ('curve', 'board', 'part', 'product', 'square')
     result = fit_and_correct(records, tests, full_scale=FULL_SCALE['full_scale'], groups=groups)
     least, _ = second_simulator.floor_of(tests)

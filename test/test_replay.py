@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`replay` gives the bits of a compensator that processes the bag's messages one by one."""
+"""`replay` equals, bit for bit, a compensator that processes the messages one by one."""
 
 import csv
 import dataclasses

@@ -116,7 +116,7 @@ def test_a_saturated_effect_of_heat_flow_has_two_values():
 
 
 def test_a_switched_load_warms_its_part_by_the_steady_heat_balance():
-    """The warming is zero before the load, and that of the heat balance in the end."""
+    """The warming is zero while the load is off, and that of the heat balance in the end."""
     unit = triad('own-lags', 1)
     spell = 30_000.0
     load = SwitchedLoad('board', 0.5, (spell, 1.0001 * spell))
