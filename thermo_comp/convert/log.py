@@ -114,7 +114,7 @@ class ConversionReport:
     rate_hz: float
     duration_s: float
     findings: dict[str, Finding]
-    inferred_unit: str  # which unit follows from the readings at rest, and why
+    inferred_unit: str  # the unit that follows from the readings at rest, and the reason
     stillness: Stillness
 
 

@@ -78,7 +78,7 @@ def fit_fleet(
     progress: Callable[[int, int, Row | None], None] = lambda *_: None,
 ) -> FleetResult:
     """
-    Fit all units without a stored result. Raises ThermoCompError if the folder of bags has none, a
+    Fit all units without a stored result. Raises ThermoCompError if the folder has no bag, a
     package is missing or the Dask cluster cannot be used, OutputError if a file cannot be written.
 
     `progress` is called with the numbers of finished and of all tests of a round (without a prior,

@@ -39,7 +39,7 @@ _COMPRESSORS: Mapping[Compression, Callable[[Any, int], Any]] = {
     'lz4': lambda data, _: lz4.frame.compress(data),
     'zstd': zstandard.compress,
 }
-#: Transient-local topics: a late subscriber gets the last message; a namespace may be in front.
+#: Transient-local topics (a late subscriber gets the last message), without their namespace.
 _LATCHED = tuple(topic.name for topic in OUTPUTS if topic.is_latched)
 _INFINITE = {'sec': 9223372036, 'nsec': 854775807}
 # Any callable, because the type hints differ between versions of the `mcap` library.

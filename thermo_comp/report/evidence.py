@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the data of a report of a fit, of bags, or of a calibration, and of the bag that figures over
-time show; nothing is drawn here.
+Owns the data of a report on a fit, on bags, or on a calibration, and the data of the bag that the
+figures over time show; nothing is drawn here.
 """
 
 from collections.abc import Mapping, Sequence
@@ -149,7 +149,7 @@ class Evidence:
 
     @property
     def level(self) -> Literal['good', 'reserved', 'poor', 'open']:
-        """Good: valid; reserved: wide claim or reservations; poor: not valid; open: no verdict."""
+        """Good: valid; reserved: reservations or large sd; poor: not valid; open: no verdict."""
         if self.judgement is None or self.judgement.kind in (Verdict.OUTSIDE, Verdict.NO_CLAIM):
             return 'open'
         if not self.judgement.is_valid:

@@ -115,7 +115,7 @@ def draw_residuals(evidence: Evidence) -> Figure:
 
 
 def draw_gravity(evidence: Evidence) -> Figure:
-    """Draw |f| - g over time, raw and corrected, and corrected in detail (the paper's Fig. 7)."""
+    """Draw raw and corrected |f| - g over time, and the latter enlarged (the paper's Fig. 7)."""
     residuals = evidence.residuals
     corrected = [name for name in residuals if name != RAW]
     sets = [forces for forces in (list(residuals), corrected) if forces]
