@@ -61,7 +61,7 @@ class FleetResult:
 
     @property
     def is_whole(self) -> bool:
-        """Whether every unit has a valid calibration, fitted to all of its bags, all complete."""
+        """Whether every unit has a valid calibration, and no bag is incomplete or left out."""
         return all(is_valid(row) and not (row['n_left_out'] or row['n_torn']) for row in self.rows)
 
 

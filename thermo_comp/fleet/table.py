@@ -92,7 +92,7 @@ _TABLE = (
     (
         'board_lag_s',
         'number',
-        'lag of the board temperature behind that of the case in ramps; negative if it leads',
+        'lag of the board temperature behind the case in ramps; negative if the board leads',
     ),
     ('window_s', 'number', 'length of the windows at rest'),
     ('raw_ug', 'number', 'RMS of |f| - g at rest, corrected with the constants at T_ref alone'),

@@ -38,7 +38,7 @@ _MOST_JUMPS = 100
 # A thermometer is taken to use another clock than the accelerometer if `_FEWEST_READINGS` or more
 # of its readings are in the median more than `_APART_S` s before or after the samples around them.
 _FEWEST_READINGS, _APART_S = 10, 10.0
-#: Shortest time between two equal readings that `Readings.thinned` both keeps [ns].
+#: Shortest time between successive equal readings in the result of `Readings.thinned` [ns].
 _REPEAT_NS = 10_000_000_000
 #: Duration above which the mean interval between messages is limited, and its upper limit [ns].
 _SPARSE_NS, _SPARSEST_NS = 10 * 86400 * 10**9, 10 * 10**9
@@ -244,9 +244,9 @@ def joined(blocks: Sequence[Block]) -> Block:
 
 def with_stamps(block: Block, last_ns: int) -> tuple[Block, int]:
     """
-    Give a reading without a stamp the newest stamp of the samples before the reading, and not the
-    log time, which depends on the speed of a playback; `last_ns` is the newest stamp before the
-    block. Return block and newest stamp. Readings without a stamp before all samples are dropped.
+    Give each reading without a stamp the newest stamp of the samples before it, because its log
+    time depends on the speed of a playback; drop such readings before the first sample. `last_ns`:
+    newest stamp before the block. Return the block and the newest stamp up to the block's end.
     """
     samples = np.concatenate(([last_ns], block.accel_stamp_ns))
     jumps = np.flatnonzero(np.diff(samples) < -_JUMP_NS) + 1
