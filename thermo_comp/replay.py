@@ -51,7 +51,7 @@ class ReplayResult:
     output: Path
     counters: Counters
     n_flags: int
-    #: Stamp [ns] and value of the first regime flag, and of each flag that differs from the last.
+    #: Stamp [ns] and value of the first regime flag, and of each flag unlike the flag before it.
     switches: list[tuple[int, bool]]
     #: Warnings that the node would give: exchanged thermometers, temperatures outside the
     #: calibrated range.

@@ -27,7 +27,7 @@ _REST_S = 10.0
 _CELL_S, _SAMPLES_TO_BEGIN = 0.5, 30
 # Number of earlier cells that each search for rests includes, besides the new cells.
 _LOOKED_BACK = 200
-# Sd of the mean force in a position due to hysteresis, mounting and drift, at any rest length [g].
+# Sd of the mean force in a position due to hysteresis, mounting and drift, however long the rest.
 _FLOOR_SD = 2e-5
 # A position whose noise is above `_RESTLESS` times the median of all positions is 'restless'. A
 # still interval after the last rest is a rest if its noise is below `_LOUDEST` times the rests'.

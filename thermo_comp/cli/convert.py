@@ -117,7 +117,7 @@ def _print_conversion(out: Output, report: 'ConversionReport', output: Path) -> 
     if report.rate_hz < SLOW_HZ:
         out.line(
             f'{report.rate_hz:.3g} Hz is sufficient for soaks of minutes; the rate is too low for '
-            'short rests by hand, and to detect vibration or a knock between two samples'
+            'rests of seconds, and to detect vibration or a knock between two samples'
         )
     if log.hint:
         out.line(log.hint)

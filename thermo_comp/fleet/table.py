@@ -265,7 +265,7 @@ def write_tables(rows: Sequence[Row], folder: Path) -> tuple[Path, Path]:
     writer = csv.DictWriter(text, [column.name for column in COLUMNS], lineterminator='\n')
     writer.writeheader()
     for row in rows:
-        # Begin texts that a spreadsheet would evaluate as a formula with an apostrophe.
+        # Put an apostrophe before texts that a spreadsheet would evaluate as a formula.
         armed = [k for k, v in row.items() if isinstance(v, str) and v.startswith(_FORMULA)]
         writer.writerow({**row, **{name: f"'{row[name]}" for name in armed}})
     paths = folder / 'fleet.parquet', folder / 'fleet.csv'

@@ -164,12 +164,12 @@ class CellAccumulator:
     def cells(self) -> Cells:
         """Return all cells so far, including the unfinished last cell."""
         sums = np.concatenate(self._sums)
-        self._sums = [sums]  # join only once
+        self._sums = [sums]  # join earlier sums only once
         index, count = sums[:, 0].astype(np.int64), sums[:, 1]
         total, square = np.split(sums[:, 3:-6], 2, axis=1)
         n_free = np.maximum(count[:, None] - 1.0, 1.0)
         mean = total / count[:, None]
-        # Set a variance below the rounding error of the two sums to 0, as for equal samples.
+        # Set variances below their rounding error to 0, as for equal samples.
         spread = square - count[:, None] * mean**2
         spread[spread < np.finfo(np.float64).eps * count[:, None] * square] = 0.0
         variance = spread / n_free
