@@ -10,7 +10,7 @@ All three input types are a std_msgs/Header followed by float64 numbers alone. I
     12  uint32 length of frame_id with its final NUL, then its characters
     4 + align8(12 + length)   the float64 numbers
 
-The size of messages of one type depends on `frame_id` alone; equal layouts are gathered as rows
+The size of messages of one type depends on `frame_id` alone; messages of one layout become rows
 of bytes, with stamps and numbers as views. `rosbags` converts ROS 1 messages one by one.
 """
 
