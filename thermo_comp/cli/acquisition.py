@@ -4,7 +4,7 @@
 Owns the state of a test during recording: its positions, the expected accuracy, missing data.
 
 Blocks of samples are added in the order of arrival. A rest whose force direction differs from that
-of the present position begins the next position; samples before it belong to the present one.
+of the present position begins the next position, to which no earlier sample belongs.
 """
 
 import math
@@ -29,8 +29,8 @@ _CELL_S, _SAMPLES_TO_BEGIN = 0.5, 30
 _LOOKED_BACK = 200
 # Sd of the mean force in a position due to hysteresis, mounting and drift, however long the rest.
 _FLOOR_SD = 2e-5
-# A position whose noise is above `_RESTLESS` times the median of all positions is 'restless'. A
-# still interval after the last rest is a rest if its noise is below `_LOUDEST` times the rests'.
+# A position is 'restless' if its noise is above `_RESTLESS` times the median of all positions. A
+# later still interval is a rest if its noise is below `_LOUDEST` times the noise of the rests.
 _RESTLESS, _LOUDEST = 3.0, 10.0
 # Smallest backward step of the stamps that shows a restart of the driver [ns].
 _STEP_BACK_NS = 10**9

@@ -336,7 +336,7 @@ def _show_axis_changes(result: 'Update', out: Output) -> None:
 
 
 def _ageing(ageing: 'Ageing | None') -> dict[str, Any]:
-    """Return the sds of `Ageing` [m/s^2] and its ratio `lags` of two sds."""
+    """Return the sds of `Ageing` [m/s^2] and, separately, `lags`, a ratio of two sds."""
     values = vars(ageing).copy() if ageing else {}
     share = values.pop('lags', None)
     return {'ageing_m_s2': values or None, 'lags_at_start': share}

@@ -121,7 +121,7 @@ def layout(head: str, delimiter: str | None = None) -> tuple[str, int]:
     """
     Return the delimiter of a text table and the number of cells per row: the delimiter that splits
     most lines into the same number of cells (a blank is any run of white space). `head` may begin
-    with a preamble and end in a cut line: its last line is ignored, and only 50 before it count.
+    with a preamble and end in a cut line: only the 50 lines before its last line are examined.
     """
     lines = [line for line in head.splitlines() if line.strip() and not _is_comment(line)]
     lines = lines[:-1] if len(lines) > 2 else lines
