@@ -87,7 +87,8 @@ same order. A `nonlinearity` adds, for each axis, the coefficients of its terms,
 per kelvin. The last three parameters of a posterior are `M[1][0]`, `M[2][0]` and `M[2][1]`. The
 covariance of all parameters is `factor @ factor.T + diag(diagonal)`. The posterior of a `gyroscope`
 has only the parameters of the bias, in rad/s and in the order of the accelerometer's bias. The
-`gyroscope` uses the ranges, the reference temperature and the thermometers of the accelerometer. """
+`gyroscope` uses the ranges, the reference temperature and the thermometers of the accelerometer.
+"""
 
 BOUNDS = """\
 ## Bounds
@@ -117,9 +118,9 @@ parameters.
 
 With Fast DDS the node uses a profile with `nackSupressionDuration` = 20 ms for its publishers, as no ROS QoS setting has
 this parameter. With the default, 0 s, each sample for a reliable subscriber wakes a thread of the middleware about four
-times, which takes a quarter of the node's CPU time. With 20 ms a lost sample is resent up to 20 ms later. A user's profile
-(`FASTRTPS_DEFAULT_PROFILES_FILE`, or `DEFAULT_FASTRTPS_PROFILES.xml` in the working directory) replaces that of the node:
-repeat `nackSupressionDuration` there.
+times, which takes a quarter of the node's CPU time. With NACKs suppressed for 20 ms, a lost sample is resent up to 20 ms
+later. A user's profile (`FASTRTPS_DEFAULT_PROFILES_FILE`, or `DEFAULT_FASTRTPS_PROFILES.xml` in the working directory)
+replaces that of the node: repeat `nackSupressionDuration` there.
 
 `linear_acceleration_covariance` is a full 3x3 matrix: noise of the sample plus uncertainty of the calibration at the
 present thermal state. Without an angular rate or an orientation in the input, the first element of the covariance of the
