@@ -90,7 +90,7 @@ def test_each_imu_of_a_log_can_become_a_bag(flight, tmp_path, imu):
     expected_ns = (5_000_000 + np.arange(N) * STEP_US + imu) * 1000
     np.testing.assert_array_equal(bag.accel_stamp_ns, expected_ns)
     np.testing.assert_array_equal(bag.accel, truth['force'][imu])
-    # Board: temperature of the accelerometer chip at each sample. Case: that of the barometer.
+    # The board temperature is the accelerometer's at each sample, the case's the barometer's.
     np.testing.assert_array_equal(bag.temperatures['board'].celsius, truth['celsius'][imu])
     np.testing.assert_array_equal(bag.temperatures['case'].celsius, 20 + 0.5 * np.arange(12))
     assert recording.info.metadata['serial'] == f'px4-accel-{77 + imu}'
@@ -180,7 +180,7 @@ def write_combined(path, rng, later=None, **parameters):
         now = 7_000_000 + k * STEP_US
         rows = [(-200, vector)]
         if k == 3:
-            # Add a message without an accelerometer sample, and one with an old sample.
+            # Add a message without accelerometer sample, and one that repeats a sample.
             rows += [(2**31 - 1, vector), (-200 - 50, vector)]
         for j, (relative, (x, y, z)) in enumerate(rows):
             at = now + (50 if j == 2 else 0)

@@ -50,7 +50,7 @@ class RestSeries:
     `time`: days since 1970; `start`: number of the node's start, from 0; `direction`, `force`,
     `by_parameter`: v, x and H, see this module's docstring; `gravity`: stated g; `residual`: ``|f|
     - g``; `by_level`: derivatives of |f| w.r.t. the bias, and the scale times g, of each axis, (n,
-    6); `noise`: variance of |f| in a rest by noise of samples, thermometers, regime; `by_start`:
+    6); `noise`: variance of |f| due to noise of samples, thermometers, regime; `by_start`:
     derivatives of |f| w.r.t. unknown lag states at the start, scaled to unit variance; `lack`: sd
     of the lack of fit of each axis times `direction`; `claim`: claimed sd of `residual`;
     `n_windows`: number of windows averaged to a rest
@@ -167,7 +167,7 @@ def read_rests(
 
 
 def source_of(rests: Sequence[tuple[Start, Rest]], sha256: str, ahead: float = 0.0) -> Source:
-    """Return the `Source` of an update, named by the last rest's time and the days of ageing."""
+    """Return an update's `Source`; its name: time of the last rest, days of ageing claimed."""
     end = np.datetime64(max(rest.stamp_ns for _, rest in rests), 'ns').astype('datetime64[s]')
     n_samples = sum(rest.n for _, rest in rests)
     return Source(f'{_UNTIL}{end}{_AGED}{ahead:g} d', sha256, n_samples)

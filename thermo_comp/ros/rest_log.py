@@ -42,7 +42,7 @@ _JUMP_NS = 10**9
 # First bytes of a message in little-endian CDR; offsets of counts, force and angular rate from the
 # end of a message [bytes].
 _PLAIN, _COUNTS, _FORCE, _RATE = (0, 1, 0, 0), -24, -96, -192
-_SHORTEST = {False: 44, True: 316}  # shortest message [bytes]: of counts, and of an Imu (True)
+_SHORTEST = {False: 44, True: 316}  # shortest message [bytes], by whether it is an Imu
 
 
 class RestLog:
@@ -209,7 +209,7 @@ class RestKeeper:
 
 
 def samples_of(messages: Sequence[bytes], *, is_imu: bool) -> tuple[Stamps, Floats]:
-    """Read stamps [ns] and samples of the plain messages that are as long as the last message."""
+    """Read stamps [ns] and samples of little-endian messages that have the last one's length."""
     size = len(messages[-1]) if messages else 0
     # Shorter messages than those with an empty frame_id are malformed.
     if size < _SHORTEST[is_imu]:

@@ -102,6 +102,7 @@ class ThermalTracker:
     def read(self, name: str, stamp_ns: int, celsius: float) -> bool:
         """Take a reading [degC]; return False if it is old, an outlier or implausible."""
         sensor, check = self.thermometers[name], self.checks[name]
+        # Test whether sensors repeat readings of the board.
         for other in self.copies if sensor is self.board else (name,):
             self.copies[other].update(sensor is self.board, stamp_ns, celsius)
         if not self._use(name, sensor, check, stamp_ns, celsius):
