@@ -120,7 +120,7 @@ def test_twenty_clients_that_set_parameters_at_once_are_all_answered(peer, tmp_p
                 is_good = value not in (str(tmp_path / 'none'), 'x' * 300, -1.0, 'imu')
                 # The node may refuse a request because too many arrive at a time.
                 assert result.successful == is_good or 'too many' in result.reason, (key, value)
-        config = node._config
+        config = node._relay.running.config
         for key in ('calibration_file', 'frame_id', 'transition_time', 'diagnostics_period'):
             assert node.node.get_parameter(key).value == getattr(config, key)
         assert node._relay.running.loaded.path == config.calibration_file

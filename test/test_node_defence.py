@@ -87,7 +87,7 @@ def test_any_request_is_answered_and_samples_go_on(peer, unit, together):
         # If a request has a wrong value, its right values are set (or none, if set atomically).
         good = Parameter('frame_id', value='body').to_parameter_msg()
         answer = peer.call(kind, name, kind.Request(parameters=[STRANGE[1], good]))
-        config = node._config
+        config = node._relay.running.config
         assert config.frame_id == ('' if together else 'body')
         many = kind.Request(parameters=[good] * (PARAMETERS_LIMIT + 1))
         answer = peer.call(kind, name, many)

@@ -219,7 +219,7 @@ def test_a_change_that_fails_at_any_line_is_not_applied(tmp_path):
             change.name: change.value for change in changes
         }
         sample = START_NS + k * CYCLE_NS, *standing(k)
-        force = node._compensator.process(*sample)
+        force = node._relay.running.compensator.process(*sample)
         assert force[0] == pytest.approx((standing(k)[0] - 2.0) / K, abs=1e-12)
         assert node._relay.running.config.frame_id == 'body'
         assert node._loop._period_ns == 2 * SECOND_NS

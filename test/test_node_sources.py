@@ -188,7 +188,7 @@ def test_readings_of_a_second_publisher_are_not_used(peer, unit):
             samples.send(10)
 
         contested(peer, samples.reports, '/temperature/board', both)
-        board = node._compensator.thermal.tracker.board
+        board = node._relay.running.compensator.thermal.tracker.board
         assert board.temperature == pytest.approx(20.0, abs=1e-6)
         assert board.stamp_ns < START_NS + 20 * CYCLE_NS
 

@@ -66,11 +66,9 @@ def check_unit(calibration: Calibration, info: RecordingInfo, serial: str | None
     """Refuse a calibration of another unit or input; an empty `serial` accepts any unit."""
     expected = info.metadata.get('serial', '') if serial is None else serial
     if expected and expected != calibration.unit.serial:
-        stated = (
-            f'the recording {info.path} is of unit' if serial is None else 'the given serial is'
-        )
+        other = 'the given serial is' if serial else f'the recording {info.path} is of unit'
         raise CalibrationError(
-            f'this calibration is of unit {calibration.unit.serial}, {stated} {expected} '
+            f'this calibration is of unit {calibration.unit.serial}, {other} {expected} '
             "(--serial '' accepts any calibration)",
             key='unit.serial',
         )
@@ -209,10 +207,9 @@ def _messages_of(
                     writer.write_raw(topic.name, topic.type, times, packed)
             # The log time of a copied input message is its stamp, as for the output messages.
             for role, messages in block.raw.items():
-                name, kind = reader.topics[role], ''
-                if role in reader.fields:
-                    name, kind = thermometer(role), TEMPERATURE
-                copy(name, kind or reader.info.topics[name][0], messages, block.stamp_ns[role])
+                name = thermometer(role) if role in reader.fields else reader.topics[role]
+                kind = TEMPERATURE if role in reader.fields else reader.info.topics[name][0]
+                copy(name, kind, messages, block.stamp_ns[role])
             if len(block):
                 copy_others(block.log_ns['accel'][-1])
             writer.flush()

@@ -26,7 +26,7 @@ from ..thermal.state import BOARD, GRADIENT, RATE, VAR_BOARD, WEIGHT
 from ..topics import STATUS
 from ..unit.calibration import Calibration
 from ..unit.gravity import STANDARD_GRAVITY
-from .messages import qos_of, type_name
+from .messages import qos_of
 from .reader import LoadedCalibration
 from .relay import Relay
 from .waitloop import WaitLoop
@@ -67,8 +67,6 @@ _FAULTS = {
     Fault.LOOSE: 'is {:.1f} K farther from that of the case than in the fit: thermometer loose?',
 }
 
-_BEYOND_FORCE = 'above the largest |f| of the fit: the covariance grows'
-
 Finding = tuple[int, str]  # level and text
 
 
@@ -106,13 +104,13 @@ class Reporter:
             if passed_s > 0.0 and new['n_in'] and self._before['n_in']:
                 rate = new['n_in'] / passed_s
         self._before, self._before_ns = counts, status.stamp_ns
-        findings = [*self._inputs(), *self._lost_rests()]
-        findings += findings_of(loaded, status, new, rate, silence_s)
+        findings = [*self._findings(), *findings_of(loaded, status, new, rate, silence_s)]
         # If the calibration has no nonlinearity, the warning begins 1 g above 1.01 times gravity,
         # where the unknown square term has an sd of 0.1 mg, and not at each vehicle acceleration.
         least = 0.0 if loaded.calibration.nonlinearity else STANDARD_GRAVITY
         if (over := self._force_excess()) > least:
-            findings.append((_WARN, f'|f| {over:.3g} m/s^2 {_BEYOND_FORCE}'))
+            text = f'|f| {over:.3g} m/s^2 above the largest |f| of the fit: the covariance grows'
+            findings.append((_WARN, text))
         findings.sort(key=lambda finding: -finding[0])
         values = self._values(loaded, status, counts, rate)
         message = DiagnosticStatus(
@@ -156,7 +154,8 @@ class Reporter:
         if before == self._n_publishers == 1:
             self._relay.traffic.n_lost += n_lost
 
-    def _inputs(self) -> Iterator[Finding]:
+    def _findings(self) -> Iterator[Finding]:
+        """Yield the problems of the subscriptions and of the rest log."""
         for name, source in self._relay.inputs.items():
             n_publishers, topic = source.count_publishers(), source.subscription.topic_name
             if n_publishers > 1 and source.sources.is_contested:
@@ -168,8 +167,6 @@ class Reporter:
             elif not n_publishers and (mismatch := _mismatch(self._node, source.subscription)):
                 level = _ERROR if name in ('sample', 'board') else _WARN
                 yield level, f'messages of a publisher on {topic} are not received: {mismatch}'
-
-    def _lost_rests(self) -> Iterator[Finding]:
         rests = self._relay.rests
         if rests is not None and rests.log.reason:
             lost = counted(rests.log.n_lost, 'rest')
@@ -269,7 +266,8 @@ def _of_axes(key: str, values: Iterable[float]) -> dict[str, str]:
 
 def _mismatch(node: Node, subscription: Subscription) -> str:
     """Return why a publisher's messages are not received (type or QoS), or an empty text."""
-    topic, expected = subscription.topic_name, type_name(subscription.msg_type)
+    topic, message_type = subscription.topic_name, subscription.msg_type
+    expected = f'{message_type.__module__.partition(".")[0]}/msg/{message_type.__name__}'
     for publisher in node.get_publishers_info_by_topic(topic):
         if publisher.topic_type != expected:
             return f'its type is {publisher.topic_type}, not {expected}'

@@ -31,11 +31,6 @@ def message_class(kind: str) -> Any:
     return getattr(import_module(f'{package}.msg'), name)
 
 
-def type_name(message_type: Any) -> str:
-    """Return the name of a message type as ROS tools and bags write it."""
-    return f'{message_type.__module__.partition(".")[0]}/msg/{message_type.__name__}'
-
-
 def qos_of(topic: NodeTopic) -> QoSProfile:
     """Build the QoS profile of a topic of the node."""
     policy, durability = ReliabilityPolicy, DurabilityPolicy

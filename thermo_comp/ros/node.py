@@ -93,7 +93,7 @@ class CompensationNode:
 
     def counts(self) -> tuple[int, int, int]:
         """Return the numbers of samples received and published, and of flags published."""
-        counters, traffic = self._compensator.counters, self._relay.traffic
+        counters, traffic = self._relay.running.compensator.counters, self._relay.traffic
         return counters.n_in, counters.n_out - traffic.n_unpublished, traffic.n_flags
 
     def stop(self) -> None:
@@ -113,20 +113,13 @@ class CompensationNode:
         self._relay.gather()
         self._reporter.report()
 
-    @property
-    def _config(self) -> parameters.NodeConfig:
-        return self._relay.running.config
-
-    @property
-    def _compensator(self) -> Compensator:
-        return self._relay.running.compensator
-
     def _prepare(self, changes: list[Parameter]) -> tuple[LoadedCalibration, Model] | None:
         """Read, test and prepare a changed calibration, in parallel to the samples."""
         names = [change.value for change in changes if change.name == 'calibration_file']
         if not names or not isinstance(names[-1], str):
             return None
-        loaded = self._reader.read(names[-1], self._config.calibration_directory)
+        directory = self._relay.running.config.calibration_directory
+        loaded = self._reader.read(names[-1], directory)
         return loaded, Model(loaded.calibration)
 
     def _set(
@@ -161,31 +154,28 @@ class CompensationNode:
             raise
 
     def _run_with(self, running: Running) -> None:
-        period_s, self._relay.running = self._config.diagnostics_period, running
-        if running.config.diagnostics_period != period_s:
-            self._loop.call_every(running.config.diagnostics_period, self._report)
+        before, self._relay.running = self._relay.running, running
+        if (period_s := running.config.diagnostics_period) != before.config.diagnostics_period:
+            self._loop.call_every(period_s, self._report)
 
     def _check(
         self, loaded: LoadedCalibration, config: parameters.NodeConfig, inputs: tuple[str, ...]
     ) -> None:
         """Refuse a calibration whose serial, input or thermometers are not those of the node."""
-        unit, listened_sensors = loaded.calibration.unit, inputs[1:]
-        message = key = ''
+        unit, sensors = loaded.calibration.unit, loaded.calibration.sensors
         taken = {'counts': 'counts', 'imu': 'm/s^2'}[config.input]
         if config.serial and unit.serial != config.serial:
-            message = f'must be {config.serial!r} (parameter `serial`), got {unit.serial!r}'
+            rule, got = f'{config.serial!r} (parameter `serial`)', repr(unit.serial)
             key = 'unit.serial'
         elif unit.input != taken:
-            message = (
-                f'must be {taken!r} (parameter `input` is {config.input}), got {unit.input!r}'
-            )
+            rule, got = f'{taken!r} (parameter `input` is {config.input})', repr(unit.input)
             key = 'unit.input'
-        elif loaded.calibration.sensors != listened_sensors:
-            named, key = ', '.join(loaded.calibration.sensors), 'sensors'
-            message = f'must be {", ".join(listened_sensors)}, which this node listens to, '
-            message += f'got {named}: restart the node with this file'
-        if message:
-            raise CalibrationError(message, loaded.path, key)
+        elif sensors != inputs[1:]:
+            rule, key = f'{", ".join(inputs[1:])}, which this node listens to', 'sensors'
+            got = f'{", ".join(sensors)}: restart the node with this file'
+        else:
+            return
+        raise CalibrationError(f'must be {rule}, got {got}', loaded.path, key)
 
     def _print_calibration(self, serial_before: str = '') -> None:
         loaded = self._relay.running.loaded

@@ -38,12 +38,9 @@ _LONGEST_REASON = 1000  # longest reason of a refusal, which may quote the reque
 _DEFAULTS = CompensatorConfig()
 
 
-def _parameter(
-    default: Any, description: str, bounds: tuple[float, float] | None = None, **more: Any
-) -> Any:
-    others = {'choices': (), 'longest': LONGEST_SERIAL, 'is_fixed': False, **more}
-    metadata = {'description': description, 'bounds': bounds, **others}
-    return field(default=default, metadata=metadata)
+def _parameter(default: Any, description: str, bounds: tuple[float, ...] = (), **more: Any) -> Any:
+    usual = {'bounds': bounds, 'choices': (), 'longest': LONGEST_SERIAL, 'is_fixed': False}
+    return field(default=default, metadata={'description': description, **usual, **more})
 
 
 @dataclass(frozen=True, slots=True)
@@ -291,16 +288,14 @@ class ParameterRequests:
         try:
             changes, preparation = prepared.result()
             news = [change for change in changes if not self._repeats_fixed_value(change)]
-            result = (
-                self._apply(news, preparation) if news else SetParametersResult(successful=True)
-            )
+            result = SetParametersResult(successful=True)
+            result = self._apply(news, preparation) if news else result
             results.append(result if result.successful else _refusal(result.reason))
         except (ThermoCompError, ParameterNotDeclaredException) as error:
             results.append(_refusal(str(error)))
         except Exception as error:
-            results.append(
-                _refusal(f"internal error ({type(error).__name__}), see the node's log")
-            )
+            reason = f"internal error ({type(error).__name__}), see the node's log"
+            results.append(_refusal(reason))
             raise
 
     def _repeats_fixed_value(self, change: Parameter) -> bool:

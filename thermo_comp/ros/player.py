@@ -99,25 +99,20 @@ class Player:
 
     def __init__(self, node: Node, reader: RecordingReader, rate: float) -> None:
         self.node, self._reader, self._rate = node, reader, rate
-        kinds = {role: (TEMPERATURE, thermometer(role)) for role in reader.topics}
+        topics = {role: (TEMPERATURE, thermometer(role)) for role in reader.topics}
         samples = SAMPLES[reader.info.input or 'counts']
-        kinds['accel'] = samples.type, samples.name
-        self._publishers: dict[Role, Any] = {
-            role: node.create_publisher(
-                message_class(kinds[role][0]),
-                kinds[role][1],
-                QoSProfile(depth=WINDOW[role], durability=DurabilityPolicy.TRANSIENT_LOCAL),
-            )
-            for role in reader.topics
-        }
+        topics['accel'] = samples.type, samples.name
+        self._publishers: dict[Role, Any] = {}
+        for role, (kind, name) in topics.items():
+            qos = QoSProfile(depth=WINDOW[role], durability=DurabilityPolicy.TRANSIENT_LOCAL)
+            self._publishers[role] = node.create_publisher(message_class(kind), name, qos)
         self._clock = node.create_publisher(Clock, '/clock', 1)
         self._next_clock = 0.0
 
     def unheard(self) -> list[str]:
         """Return the topics without a subscriber."""
-        return [
-            out.topic_name for out in self._publishers.values() if not out.get_subscription_count()
-        ]
+        publishers = self._publishers.values()
+        return [out.topic_name for out in publishers if not out.get_subscription_count()]
 
     def run(
         self, progress: Callable[[float], None], throttle: Callable[[int], object] = lambda _: None
@@ -133,8 +128,7 @@ class Player:
             for end in self.node.get_subscriptions_info_by_topic(name)
             if end.qos_profile.reliability != ReliabilityPolicy.RELIABLE
         ]
-        started = time.monotonic()
-        start_ns: int | None = None
+        started, start_ns = time.monotonic(), None
         for block in reader.blocks(raw=True):
             for _, log_ns, role, data in _in_order(block):
                 start_ns = log_ns if start_ns is None else start_ns

@@ -57,8 +57,7 @@ class Relay:
         compensator: Compensator,
         config: NodeConfig,
     ) -> None:
-        self._loop = loop
-        self._names = named_topics(config.topics)
+        self._loop, self._names = loop, named_topics(config.topics)
         self.traffic = Traffic()
         samples = self._open_samples(config)
         self.running = Running(loaded, config, compensator, samples, self._converter(config))
@@ -121,8 +120,8 @@ class Relay:
 
     def _subscribe(self, name: str, topic: str, field: LiveField) -> None:
         self._fields[name] = field
-        raw = self._loop.subscribe(field.kind, topic, qos_of(BOARD), wakes=False)
-        self.thermometers[name] = raw
+        subscribe = self._loop.subscribe
+        self.thermometers[name] = subscribe(field.kind, topic, qos_of(BOARD), wakes=False)
 
     @property
     def samples(self) -> RawSubscription:
@@ -135,7 +134,6 @@ class Relay:
         return {'sample': self.samples, **self.thermometers}
 
     def _open_samples(self, config: NodeConfig) -> RawSubscription:
-        """Subscribe to the samples of a configuration."""
         usual = SAMPLES[config.input]
         name = self._names.get(config.input, usual.name)
         return self._loop.subscribe(message_class(usual.type), name, qos_of(usual))
@@ -192,10 +190,8 @@ class Relay:
         """Use readings while no samples arrive, so that the regime flag is still published."""
         if self._newest_reading_ns is None:
             return
-        horizon_ns = self._newest_reading_ns - IDLE_NS
-        compensator = self.running.compensator
-        last_ns = compensator.now_ns
-        if last_ns is not None:
+        horizon_ns, compensator = self._newest_reading_ns - IDLE_NS, self.running.compensator
+        if (last_ns := compensator.now_ns) is not None:
             horizon_ns = min(horizon_ns, last_ns + silence_ns)
         readings, self._readings = self._readings, []
         for received, reading in readings:

@@ -6,12 +6,9 @@ Owns the detection of departures: a temperature's rate leaves the baseline, its 
 Two Kalman filters of temperature and rate, one with a long and one with a short memory, have white
 noise as second derivative. A rate has departed if it differs from the baseline, away from 0, by
 more than swing, error of the baseline and a multiple of the sd of the noise; the multiple follows
-from the permitted rate of false alarms (Rice's formula, docs/regime.md). The swing is the
-amplitude of the rate's oscillation in a soak: the ripple of the surroundings (a setting) divided
-by the lag of the sensor, or the observed amplitude if larger.
-
-The readings of a sensor with a quantum lie in cells of one quantum. If noise cannot cross a cell,
-the filters are not used: two edges of cells crossed in the same direction give the mean rate.
+from the permitted rate of false alarms (Rice's formula [1]_, docs/regime.md). If noise cannot move
+the readings of a quantized sensor across a cell of one quantum, the filters are not used: two
+edges of cells crossed in the same direction give the mean rate.
 
 References
 ----------
@@ -50,12 +47,12 @@ class ChangeDetector:
     def __init__(
         self, sensor: ThermometerSettings, smallest_rate: float, ripple: float, false_alarms: float
     ) -> None:
+        self._settings = sensor
         self._largest_swing = 0.5 * smallest_rate
         self._largest_baseline = LARGEST_BASELINE_SHARE * smallest_rate
         self._ripple_rate = min(ripple / sensor.lag_s, self._largest_swing)
         self._baseline_s = 0.5 * sensor.lag_s
         self._swing_memory_s = SWING_MEMORY_LAGS * sensor.lag_s
-        self._rate_variance = (sensor.fastest_ramp_k_min / 60.0) ** 2
         # Memory (1 / tracking frequency) of each filter [s]: the memory that detects a second
         # derivative ``share * onset`` of the temperature [K/s^2] soonest in readings at 1 Hz. The
         # memory determines the spectral density of this derivative for any interval of readings.
@@ -68,19 +65,9 @@ class ChangeDetector:
         # False alarms per second at a threshold of h sd: acos(rho) / (2 pi dt) exp(-h^2 / 2) for
         # each filter and sign, rho the correlation of the noise of rates dt apart.
         self._log_crossings = -log(2.0 * pi * false_alarms / (2.0 * len(self._powers)))
-        self._edge_noise = sensor.noise_sd_c * sqrt(2.0)
-        self._quantum = sensor.quantum_c
-        self._has_cells = sensor.has_cells
         self._by_edges = sensor.has_wide_cells
         self._stamp_ns: int | None = None
-        self._n_restarts = -1
-        self._filters: list[tuple[float, float, float, float, float]] = []
         self._dt = 0.0
-        self._thresholds: list[float] = []
-        self._noise_share = 0.0
-        self._edge_margin = 0.0
-        self._settled_s = 0.0
-        self._age_s = 0.0
         self.rate = 0.0
         self.swing = self._ripple_rate
         self._baseline = 0.0
@@ -89,11 +76,7 @@ class ChangeDetector:
         self._trend = 0.0
         self._is_above = False
         self._turned_s = 0.0
-        self._peak = 0.0
-        self._peak_before = 0.0
-        self._edge = nan
-        self._edge_ns = 0
-        self._reading = nan
+        self._peak = self._peak_before = 0.0
 
     def settle(self, sensor: Thermometer, least_error: float = 0.0) -> None:
         """Begin a soak: the rate becomes the baseline, with at least the error `least_error`."""
@@ -138,9 +121,7 @@ class ChangeDetector:
         if self._by_edges:
             departure = self._watch_edges(stamp_ns, sensor, low, high)
         else:
-            departure = self._watch_filters(
-                dt, sensor.measured, sensor.measured_variance, low, high
-            )
+            departure = self._watch_filters(dt, sensor, low, high)
         if self._age_s < self._settled_s:
             self.settle(sensor)
             self._trend = self.rate
@@ -155,7 +136,8 @@ class ChangeDetector:
         self._stamp_ns = stamp_ns
         self._n_restarts = sensor.n_restarts
         self._age_s = 0.0
-        self._filters = [(sensor.temperature, 0.0, self._noise, 0.0, self._rate_variance)] * 2
+        rate_variance = (self._settings.fastest_ramp_k_min / 60.0) ** 2
+        self._filters = [(sensor.temperature, 0.0, self._noise, 0.0, rate_variance)] * 2
         self._edge = nan
         self._edge_ns = stamp_ns
         self._reading = sensor.reading
@@ -163,23 +145,20 @@ class ChangeDetector:
     def _tune(self, dt: float) -> None:
         """Set the squared threshold of each filter, relative to the filter's rate variance."""
         self._dt = dt
-        self._thresholds = []
-        squared = 1.0
+        self._thresholds: list[float] = []
         for power in self._powers[::-1]:
             pace = dt * math.pow(power / (self._noise * dt), 0.25)
             correlation = max(1.0 - sqrt(2.0) * pace, -1.0)
             squared = max(2.0 * (self._log_crossings + log(acos(correlation) / dt)), 1.0)
-            share = CELL_NOISE_SHARE if self._has_cells else 0.25 + 0.08 * min(pace, 1.0)
+            share = CELL_NOISE_SHARE if self._settings.has_cells else 0.25 + 0.08 * min(pace, 1.0)
             self._thresholds.insert(0, squared * share)
             self._noise_share = share
-        self._edge_margin = sqrt(squared) * self._edge_noise
+        self._edge_margin = sqrt(squared) * (self._settings.noise_sd_c * sqrt(2.0))
         self._settled_s = SETTLING_MEMORIES * math.pow(self._noise * dt / self._powers[0], 0.25)
 
-    def _watch_filters(
-        self, dt: float, measured: float, variance: float, low: float, high: float
-    ) -> int:
-        departure = 0
-        filters = self._filters
+    def _watch_filters(self, dt: float, sensor: Thermometer, low: float, high: float) -> int:
+        departure, filters = 0, self._filters
+        measured, variance = sensor.measured, sensor.measured_variance
         for k in (1, 0):
             power = self._powers[k]
             t, v, p00, p01, p11 = filters[k]
@@ -212,7 +191,7 @@ class ChangeDetector:
         if reading == before:
             # As no edge of a cell was crossed, the rate is at most a quantum divided by the time
             # since the last crossing.
-            bound = self._quantum / apart
+            bound = self._settings.quantum_c / apart
             if bound < self._baseline_error + abs(self._baseline):
                 self._baseline_error = max(min(self._baseline_error, bound), self.swing)
                 self._baseline = min(max(self._baseline, -bound), bound)
@@ -230,35 +209,21 @@ class ChangeDetector:
         return departure
 
     def _follow(self, rate: float, dt: float) -> None:
-        """
-        Move the baseline towards a rate that has lasted for `dt` [s]. The difference counts as at
-        most the sum of swing and error of the baseline.
-        """
+        """Move the baseline towards a rate that has lasted for `dt` [s]."""
         baseline, error = self._baseline, self._baseline_error
         limit = self.swing + error
         share = dt / (dt + self._baseline_s)
-        step = rate - baseline
-        if not -limit <= step <= limit:
-            step = limit if step > 0.0 else -limit
-        moved = baseline + share * step
+        moved = baseline + share * min(max(rate - baseline, -limit), limit)
         # The slow onset of a ramp must not raise the baseline to the rate of the ramp.
-        farthest = self._largest_baseline
-        if not -farthest <= moved <= farthest:
-            farthest = max(farthest, abs(baseline))
-            moved = min(max(moved, -farthest), farthest)
-        self._baseline = moved
+        farthest = max(self._largest_baseline, abs(baseline))
+        self._baseline = min(max(moved, -farthest), farthest)
         self._baseline_error = error - share * error
 
     def _learn_swing(self, dt: float) -> None:
-        """
-        Update the swing: an upper estimate of the amplitude of an oscillation of the rate about
-        its trend.
-        """
-        rate = self.rate
-        trend = self._trend
-        self._trend = trend = trend + dt / (dt + self._baseline_s) * (rate - trend)
+        """Update the swing: an upper estimate of the rate's amplitude about its trend."""
+        self._trend += dt / (dt + self._baseline_s) * (self.rate - self._trend)
         self.swing += dt / (dt + self._swing_memory_s) * (self._ripple_rate - self.swing)
-        apart = rate - trend
+        apart = self.rate - self._trend
         if (apart > 0.0) == self._is_above:
             self._peak = max(self._peak, abs(apart))
             return

@@ -4,32 +4,22 @@
 Owns the definitions of lags and play operators, and the covariance of their initial states.
 
 A lag L of an input u obeys ``dL/dt = (u - L) / tau``. The stored state is ``m = u - L``, the input
-less the lag.
-
-A part may exchange heat with another part that lags the board: the lag then has two stages in
-series, of time constants ``tau_1 > tau_2``. By partial fractions m is a weighted sum of the m of
-two first-order lags, ``m = (tau_1 m_1 - tau_2 m_2) / (tau_1 - tau_2)``.
-
-The temperature that a part lags may lead the board thermometer by a time theta, if the thermometer
-lags the board, or if the part also exchanges heat with a case that has no thermometer. With
-a lead theta the transfer function of the part is ``(1 + theta s) / (1 + tau s)``, so that
-``m = (1 - theta / tau) m_tau``, and for two stages
-``m = ((tau_1 - theta) m_1 - (tau_2 - theta) m_2) / (tau_1 - tau_2)``.
-
-If a part exchanges heat both with the board and with the place of a sensor s, it lags the
-temperature ``T + v G`` between board and sensor, with ``G = T_s - T``. Then
-``m = T - L(T + v G)``, which is ``T - L(T)`` less v times ``L(G)``.
+less the lag. For two stages in series, of time constants ``tau_1 > tau_2``, and a lead theta, m is
+a weighted sum of the m of two first-order lags,
+``m = ((tau_1 - theta) m_1 - (tau_2 - theta) m_2) / (tau_1 - tau_2)``. A part between the board and
+a sensor s lags the temperature ``T + v G``, with ``G = T_s - T``, so that ``m = T - L(T + v G)``,
+which is ``T - L(T)`` less v times ``L(G)``. docs/theory.md explains the model ("Parts").
 """
 
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 
+from ..quantities import QUANTITIES
 from ..typing import Floats
-from .quantity import Quantity
 
 #: Name of the board temperature as the input of a lag or play.
 BOARD_INPUT: Final = 'board'
@@ -41,6 +31,28 @@ START_JITTER: Final = 3e-4
 START_TAU_S: Final = 3600.0
 BOARD_START_SD: Final = 3.0
 GRADIENT_START_SD: Final = 1.0
+
+
+class Quantity:
+    """A quantity of the thermal state, from readings of `input` (a gradient: and of the board)."""
+
+    input: str
+    #: Largest magnitude of the quantity that a calibration may contain.
+    largest: ClassVar[float] = QUANTITIES['temperature span'].at_most or 0.0
+    #: Typical change of the quantity per kelvin of temperature change.
+    per_kelvin: ClassVar[float] = 1.0
+    #: Whether the quantity is computed with the lag of one part of the unit; the board's lag is 0.
+    is_of_part: ClassVar[bool] = True
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """The thermometers of the quantity; of a gradient, the sensor without the board."""
+        return (self.input,)
+
+    @property
+    def by_board(self) -> float:
+        """Derivative w.r.t. the board temperature, with lags and other thermometers constant."""
+        return float(self.input == BOARD_INPUT)
 
 
 class _Lag(NamedTuple):

@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 
 from ..typing import Floats
-from .lags import BOARD_INPUT, MemorySpec, first_order_lags
+from .lags import BOARD_INPUT, Lag, MemorySpec, first_order_lags
 
 #: Interval between readings / time constant of a lag, above which the unknown time at which the
 #: input changed between the readings adds variance.
@@ -28,15 +28,13 @@ _LEAST_WEIGHT: Final = 1e-18
 
 class LagBank:
     """
-    First-order lags of one input; `start_ns` is the first stamp since the last `forget`.
-
-    taus: time constants of the lags [s]
+    First-order lags of one input with the time constants `taus` [s]; `start_ns` is the first stamp
+    since the last `forget`.
     """
 
     def __init__(self, taus: tuple[float, ...]) -> None:
         self.taus = taus
         self._sparse_s = SPARSE_SHARE * min(self.taus, default=math.inf)
-        self._nil = [0.0] * len(self.taus)
         self.forget()
 
     def forget(self) -> None:
@@ -44,23 +42,18 @@ class LagBank:
         self.stamp_ns: int | None = None
         self.start_ns: int | None = None
         self.input = 0.0
-        self.lagging: list[float] = self._nil
-        self.extra: list[float] = self._nil
-        #: Whether the lags have a variance `extra` in addition to the variance of their initial
-        #: states.
-        self.has_extra = False
+        #: Input less each lag [K]; its variance in addition to that of the initial state [K^2].
+        self.lagging = self.extra = [0.0] * len(self.taus)
 
     def step(self, stamp_ns: int, value: float, sd: float = 0.0) -> None:
         """Use the next input value [K], of error sd `sd`; the input is linear between values."""
-        seen_ns = self.stamp_ns
-        if seen_ns is None:
+        if self.stamp_ns is None:
             self.stamp_ns = self.start_ns = stamp_ns
             self.input = value
             return
         if not self.taus:
             return
-        change = value - self.input
-        dt_ns = stamp_ns - seen_ns
+        change, dt_ns = value - self.input, stamp_ns - self.stamp_ns
         if dt_ns <= 0:
             self.lagging = [m + change for m in self.lagging]
         else:
@@ -71,7 +64,6 @@ class LagBank:
         self.input = value
 
     def _add_variances(self, decays: list[float], dt: float, change: float, sd: float) -> None:
-        self.has_extra = True
         result = []
         for variance, e, tau in zip(self.extra, decays, self.taus, strict=True):
             grown = variance
@@ -86,9 +78,7 @@ class LagBank:
 
     def note_jump(self, change: float) -> None:
         """Add to the variances the effect of a change of the input that was a sensor's error."""
-        if self.taus:
-            self.has_extra = True
-            self.extra = [variance + change * change for variance in self.extra]
+        self.extra = [variance + change * change for variance in self.extra]
 
     def at(self, stamp_ns: int, value: float) -> tuple[list[float], list[float]]:
         """Return ``u - L`` [K], u = `value`, and its variance without that of the first state."""
@@ -100,14 +90,7 @@ class LagBank:
         lagging = [
             m * e + change * gain for m, e, gain in zip(self.lagging, decays, gains, strict=True)
         ]
-        if not self.has_extra:
-            return lagging, self.extra
         return lagging, [v * e * e for v, e in zip(self.extra, decays, strict=True)]
-
-    def age_s(self, stamp_ns: int) -> float:
-        """Return the time from the first value to a stamp [s]; 0 without a value."""
-        start_ns = self.start_ns
-        return 0.0 if start_ns is None else max(stamp_ns - start_ns, 0) * 1e-9
 
 
 @lru_cache(maxsize=1024)
@@ -131,28 +114,25 @@ class ThermalMemory:
     def __init__(self, spec: MemorySpec) -> None:
         self.spec = spec
         terms = sorted(first_order_lags(spec.lags), key=lambda term: spec.inputs.index(term[0]))
+
+        def weights(lag: Lag) -> list[tuple[int, float]]:
+            """Return index in `terms` and weight of the first-order lags of a lag."""
+            return [(terms.index(term), w) for term, w in lag.first_order_weights.items()]
+
         #: The first-order lags of each input, by the input's name.
         self.banks = {
             name: LagBank(tuple(tau for of, tau in terms if of == name)) for name in spec.inputs
         }
         self.board = self.banks[BOARD_INPUT]
         self.is_empty = not spec.lags and not spec.plays
-        #: Index and weight of the first-order terms of each lag; empty if all lags have order 1.
-        self._sums = [
-            [(terms.index(term), share) for term, share in lag.first_order_weights.items()]
-            for lag in spec.lags
-        ]
-        if [lag.first_order_weights for lag in spec.lags] == [{term: 1.0} for term in terms]:
+        #: First-order lags of each lag; empty if all lags have order 1.
+        self._sums = [weights(lag) for lag in spec.lags]
+        if self._sums == [[(k, 1.0)] for k in range(len(terms))]:
             self._sums = []
         #: For each play: index of the lag of its input, -1 for the board; half-width [K].
         self._inputs = [spec.lags.index(play.lag) if play.lag else -1 for play in spec.plays]
-        #: Index and weight of the first-order terms of each play's lag; [] without a lag.
-        self._followed = [
-            [(terms.index(term), share) for term, share in play.lag.first_order_weights.items()]
-            if play.lag
-            else []
-            for play in spec.plays
-        ]
+        #: First-order lags of each play's lag; [] without a lag.
+        self._followed = [weights(play.lag) if play.lag else [] for play in spec.plays]
         self._needs_sensors = any(play.inputs != (BOARD_INPUT,) for play in spec.plays)
         self._widths = [play.width_k for play in spec.plays]
         self._held: list[float] = []
@@ -205,10 +185,8 @@ class ThermalMemory:
     ) -> list[float]:
         """
         Return each lag [K] and its variance without that of its initial state [K^2], then each
-        play less its input [K].
-
-        still: for each input the possible error of constant readings [K], and the time since their
-            last change [s]; empty without constant readings
+        play less its input [K]; `still`: for each input the possible error of constant readings
+        [K], and the time since their last change [s], or empty without constant readings.
         """
         behind, extra = self._first_order(stamp_ns, board, gradients)
         if still:
@@ -228,9 +206,7 @@ class ThermalMemory:
                 sum([abs(share) * math.sqrt(variances[k]) for k, share in lag]) ** 2
                 for lag in self._sums
             ]
-        result = [0.0] * (2 * len(behind))
-        result[0::2] = behind
-        result[1::2] = extra
+        result = [number for pair in zip(behind, extra, strict=True) for number in pair]
         if not self._held:
             return result + [0.0] * len(self._widths)
         for place, p, r in zip(self._inputs, self._held, self._widths, strict=True):
@@ -252,9 +228,12 @@ class ThermalMemory:
 
     def remaining_shares(self, stamp_ns: int) -> list[float]:
         """Return the share of each lag's initial state that remains at a stamp, 1 to 0."""
-        ages = {name: bank.age_s(stamp_ns) for name, bank in self.banks.items()}
+        ages_s = {
+            name: 0.0 if bank.start_ns is None else max(stamp_ns - bank.start_ns, 0) * 1e-9
+            for name, bank in self.banks.items()
+        }
         return [
-            lag.remaining_share(min(map(ages.__getitem__, lag.inputs))) for lag in self.spec.lags
+            lag.remaining_share(min(ages_s[of] for of in lag.inputs)) for lag in self.spec.lags
         ]
 
 
@@ -296,8 +275,7 @@ def _recursion(decay: float, driven: Floats) -> Floats:
 
 
 def _play(v: Floats, width: float) -> Floats:
-    held = float(v[0])
-    result = []
+    held, result = float(v[0]), []
     for value in v.tolist():
         if held < value - width:
             held = value - width

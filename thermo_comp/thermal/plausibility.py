@@ -90,14 +90,11 @@ class SensorCheck:
     """
 
     def __init__(self, sensor: Thermometer, other: Thermometer, lag_s: float) -> None:
-        self.sensor = sensor
-        self._other = other
-        self.lag_s = lag_s
+        self.sensor, self._other, self.lag_s = sensor, other, lag_s
         settings = sensor.settings
         self._quantum = settings.quantum_c
         self._has_cells = settings.has_cells
         self._n_still = still_readings(settings)
-        self._rate = settings.fastest_ramp_k_min / 60.0
         self._decay = 1e-9 / max(settings.lag_s, other.settings.lag_s)
         self._largest_noise = self._quantum + _NOISE_SDS * settings.noise_sd_c
         self._n_doubtful = min(DOUBTFUL_READINGS, self._n_still)
@@ -124,14 +121,9 @@ class SensorCheck:
         self._other_then = nan
 
     def has_wrong_start(self, stamp_ns: int, celsius: float) -> bool:
-        """
-        Judge the sensor's first reading by the two readings that follow; call with each reading. A
-        sensor may have a wrong reading after power-up, which no earlier reading contradicts.
-        """
+        """Judge the sensor's first reading, after power-up, by the two readings that follow it."""
         first = self._first
-        if first is None or not isfinite(celsius):
-            return False
-        if first and stamp_ns <= first[-1][0]:
+        if first is None or not isfinite(celsius) or (first and stamp_ns <= first[-1][0]):
             return False
         if len(first) < 2:
             first.append((stamp_ns, celsius))
@@ -156,11 +148,11 @@ class SensorCheck:
             self._n_same += 1
             self.fault = self._judge_still(stamp_ns)
             return self.fault != Fault.FROZEN
-        if self._n_same >= self._n_doubtful and not self._has_cells:
-            change = celsius - sensor.reading
-            if abs(change) > self._largest_noise:
-                # The equal readings before this reading were wrong, and so is the estimate.
-                self.note_jump(stamp_ns, change)
+        change = celsius - sensor.reading
+        is_doubtful = self._n_same >= self._n_doubtful and not self._has_cells
+        if is_doubtful and abs(change) > self._largest_noise:
+            # The equal readings before this reading were wrong, and so is the estimate.
+            self.note_jump(stamp_ns, change)
         self._n_same = 0
         self._other_then = nan
         age = (stamp_ns - last_ns) * 1e-9
@@ -244,12 +236,12 @@ class SensorCheck:
         [s]; zeros if the readings change or a cell explains why they do not.
         """
         changed_ns = self.sensor.changed_ns
-        if changed_ns is None or self._n_same < self._n_doubtful:
-            return 0.0, 0.0
-        if self._has_cells and self.fault != Fault.FROZEN:
+        is_explained = self._has_cells and self.fault is not Fault.FROZEN
+        if changed_ns is None or is_explained or self._n_same < self._n_doubtful:
             return 0.0, 0.0
         still_s = max(stamp_ns - changed_ns, 0) * 1e-9
-        return min(self._rate * still_s, LARGEST_ERROR), still_s
+        fastest_rate = self.sensor.settings.fastest_ramp_k_min / 60.0
+        return min(fastest_rate * still_s, LARGEST_ERROR), still_s
 
 
 def still_readings(settings: ThermometerSettings) -> int:
@@ -301,8 +293,7 @@ class LeadCheck:
 
     def __init__(self, case: Thermometer, board: Thermometer, calm_k_min: float) -> None:
         self._calm_rate = calm_k_min / 60.0
-        self._case = case
-        self._board = board
+        self._case, self._board = case, board
         self._quanta = case.settings.quantum_c + board.settings.quantum_c
         self._margin = LEAD_K + 2.0 * self._quanta
         self.is_reversed = False
@@ -317,8 +308,7 @@ class LeadCheck:
         case, board = self._case, self._board
         calm = self._calm_rate
         if is_static or (-calm < case.rate < calm and -calm < board.rate < calm):
-            self._n_alike = 0
-            self.extra_variance = 0.0
+            self._n_alike, self.extra_variance = 0, 0.0
             stamp_ns = case.stamp_ns or 0
             self._calm_ns = stamp_ns if self._calm_ns is None else self._calm_ns
             if is_static or stamp_ns - self._calm_ns >= _CALM_NS:
@@ -329,21 +319,15 @@ class LeadCheck:
             return
         by_case, by_board = case.temperature - self._calm[0], board.temperature - self._calm[1]
         direction = 1.0 if by_case + by_board > 0.0 else -1.0
-        slow, fast = direction * case.rate, direction * board.rate
-        if slow > fast:
-            slow, fast = fast, slow
+        slow, fast = sorted((direction * case.rate, direction * board.rate))
         noise = _NOISE_SDS * sqrt(case.var_temperature + board.var_temperature)
         lead = direction * (by_case - by_board)
         if lead > -noise - self._quanta:
             self.extra_variance = 0.0
         elif slow > DOUBTFUL_RATE_SHARE * fast:
             self.extra_variance = lead * lead
-        is_telling = (
-            slow > LEAD_RATE_SHARE * fast
-            and abs(lead) > self._margin + noise
-            and abs(lead) > LEAD_SHARE * max(abs(by_case), abs(by_board))
-        )
-        if not is_telling:
+        least = max(self._margin + noise, LEAD_SHARE * max(abs(by_case), abs(by_board)))
+        if slow <= LEAD_RATE_SHARE * fast or abs(lead) <= least:
             return
         is_against = lead < 0.0
         self._n_alike = self._n_alike + 1 if is_against == self._is_against else 1

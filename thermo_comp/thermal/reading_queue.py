@@ -37,18 +37,18 @@ class ReadingQueue:
 
     def push(self, name: str, stamp_ns: int, celsius: float) -> int:
         """Add a reading; return how many were dropped: queue full, or stamps of another clock."""
-        n_before = len(self._entries)
+        n_before = len(self)
         last_ns, self._last_ns[name] = self._last_ns.get(name, -NEVER_NS), stamp_ns
         if stamp_ns < last_ns - DISORDER_NS:
             latest_ns = stamp_ns + DISORDER_NS
             self.keep(lambda entry: entry[2] != name or entry[0] <= latest_ns)
-        n_refused = n_before - len(self._entries)
-        if len(self._entries) >= PENDING_LIMIT:
+        n_dropped = n_before - len(self)
+        if len(self) >= PENDING_LIMIT:
             return 1
         entry = (stamp_ns, name != BOARD_INPUT, name, self._n_pushed, celsius)
         heapq.heappush(self._entries, entry)
         self._n_pushed += 1
-        return n_refused
+        return n_dropped
 
     def keep(self, is_kept: Callable[[Entry], bool]) -> None:
         """Drop the readings for which `is_kept` is False."""
@@ -62,9 +62,7 @@ class ReadingQueue:
 
     def ahead(self, stamp_ns: int) -> float:
         """Return the time from a stamp to the latest waiting reading [s]; 0 if none waits."""
-        if not self._entries:
-            return 0.0
-        return (max(entry[0] for entry in self._entries) - stamp_ns) * 1e-9
+        return (max((entry[0] for entry in self._entries), default=stamp_ns) - stamp_ns) * 1e-9
 
     def __len__(self) -> int:
         return len(self._entries)

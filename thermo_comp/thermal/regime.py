@@ -8,7 +8,7 @@ The dynamic state *begins* when the rate of the leading sensor has left the base
 *held* while the rate of the case or of the board, at present or predicted half a lag ahead, may
 exceed the relaxed rate, and so throughout a ramp of constant rate. With `end_condition` = 'case'
 (the paper's rule) only the rate of the case is tested; the board's is tested while the case gives
-no readings. The derivation of the detector is in docs/regime.md.
+no readings (docs/regime.md).
 
 References
 ----------
@@ -51,8 +51,6 @@ class RegimeDetector:
         self.settings = settings
         self._relaxed_rate = settings.relaxed_rate_k_min / 60.0
         self._dwell_ns = round(settings.dwell_s * 1e9)
-        self._turn_ns = self._dwell_ns // 2
-        self._needs_calm_board = settings.end_condition == 'board'
         self._case = _Watch(settings, settings.case)
         self._board = _Watch(settings, settings.board)
         self.regime = Regime.UNKNOWN
@@ -63,24 +61,20 @@ class RegimeDetector:
         self._is_grown = False
 
     def update(self, stamp_ns: int, case: Thermometer | None, board: Thermometer | None) -> Regime:
-        """
-        Decide the regime after a reading of the case or, if `case` is None, of the board.
-        """
+        """Decide the regime after a reading of the case or, if `case` is None, of the board."""
         if case is not None:
             lead, change = case, self._case.change
-            if not self._needs_calm_board:
+            if self.settings.end_condition == 'case':
                 board = None
         elif board is not None:
             lead, change = board, self._board.change
         else:
             return self.regime
-        regime = self.regime
-        is_dynamic = regime is Regime.DYNAMIC
-        departure = change.update(
-            stamp_ns, lead, 1.0 if not is_dynamic else (0.0 if self._is_grown else 0.25)
-        )
+        is_static, is_dynamic = self.regime is Regime.STATIC, self.regime is Regime.DYNAMIC
+        pace = 1.0 if not is_dynamic else (0.0 if self._is_grown else 0.25)
+        departure = change.update(stamp_ns, lead, pace)
         if not lead.is_ready:
-            return regime
+            return self.regime
 
         is_calm = self._case.is_calm(stamp_ns, case, change.swing)
         is_calm = self._board.is_calm(stamp_ns, board, change.swing) and is_calm
@@ -98,14 +92,13 @@ class RegimeDetector:
             speed = OBVIOUS_SHARE * self._relaxed_rate
             # A sensor with wide cells that crosses two cells in one direction is in a ramp, even
             # if the regime is unknown.
-            is_static = regime is Regime.STATIC
             if departure and (
                 is_static or (lead.settings.has_wide_cells and departure * lead.rate > speed)
             ):
                 self._open(stamp_ns, departure, lead)
             elif not is_calm and (is_static or lead.n_in_row > FIRST_READINGS):
                 direction = _obvious(lead, speed)
-                if direction == 0 and board is not None and board.is_ready:
+                if not direction and board is not None and board.is_ready:
                     direction = _obvious(board, speed)
                 if direction:
                     self._open(stamp_ns, direction, lead)
@@ -132,7 +125,7 @@ class RegimeDetector:
         elif self._turning_ns is None:
             self._turning_ns = stamp_ns
         if self._turning_ns is not None and (
-            self.direction == 0 or stamp_ns - self._turning_ns >= self._turn_ns
+            self.direction == 0 or stamp_ns - self._turning_ns >= self._dwell_ns // 2
         ):
             self.direction = direction
             self._turning_ns = None
@@ -163,18 +156,14 @@ class _Watch:
         # An unchanged reading proves a low rate after the longer of two times: the time in which
         # the relaxed rate crosses a cell, and the time for which the temperature stays in a cell
         # while the smallest ramp reverses.
-        quantum = sensor.quantum_c
-        bend = settings.smallest_ramp_k_min / 60.0 / sensor.lag_s
-        self._still_ns = round(
-            1e9 * max(quantum / self._relaxed, 2.0 * sqrt(2.0 * quantum / bend))
-        )
+        quantum, bend = sensor.quantum_c, settings.smallest_ramp_k_min / 60.0 / sensor.lag_s
+        still_s = max(quantum / self._relaxed, 2.0 * sqrt(2.0 * quantum / bend))
+        self._still_ns = round(1e9 * still_s)
         self._stamp_ns: int | None = None
         self._mean = 0.0
 
     def is_calm(self, stamp_ns: int, sensor: Thermometer | None, lead_swing: float) -> bool:
-        """
-        Update a sensor's mean rate; return whether its rate is low, True without a fresh reading.
-        """
+        """Update a sensor's mean rate; return whether it is low; True without a fresh reading."""
         seen_ns = None if sensor is None else sensor.stamp_ns
         if sensor is None or seen_ns is None or stamp_ns - seen_ns > self._stale_ns:
             return True
@@ -185,10 +174,8 @@ class _Watch:
         # When the temperature ripples, the rate from the third-order filter of `Thermometer`
         # overshoots, and that from the detector's filters does not.
         rate = change.rate if change.is_following(stamp_ns) else sensor.rate
-        sd = sqrt(sensor.var_rate)
-        relaxed = self._relaxed
-        stamp = self._stamp_ns
-        self._stamp_ns = stamp_ns
+        sd, relaxed = sqrt(sensor.var_rate), self._relaxed
+        stamp, self._stamp_ns = self._stamp_ns, stamp_ns
         if stamp is None or sd > relaxed:
             self._mean = rate  # restart the mean rate while the rate is too uncertain
         else:
@@ -197,9 +184,7 @@ class _Watch:
         changed = sensor.changed_ns
         if self._still_ns and changed is not None and stamp_ns - changed > self._still_ns:
             return True
-        swing = change.swing
-        bound = relaxed + (swing if swing < 0.25 * relaxed else 0.25 * relaxed)
-        bound -= SURE_SIGMAS * sd
+        bound = relaxed + min(change.swing, 0.25 * relaxed) - SURE_SIGMAS * sd
         if not -bound < rate < bound:
             return False
         # Extrapolate the rate half a lag ahead, from its mean over the last quarter lag.

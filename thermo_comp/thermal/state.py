@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from ..quantities import QUANTITIES
-from .lags import BOARD_INPUT, MemorySpec
-from .quantity import Quantity
+from .lags import BOARD_INPUT, MemorySpec, Quantity
 
 #: The thermal memory counts as settled if the sd of every lag is below this [K].
 MEMORY_SETTLED_SD: Final = 0.05

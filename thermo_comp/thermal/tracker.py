@@ -45,7 +45,6 @@ class ThermalTracker:
     ) -> None:
         self.settings = detector
         self.spec = memory or MemorySpec()
-        self._configure(config or ThermalConfig(), board_lag_s, rest_gradient_range_k)
         self.board = Thermometer(detector.board)
         others = {name: Thermometer(detector.case) for name in self.spec.sensors}
         self.thermometers = {BOARD_INPUT: self.board, **others}
@@ -66,25 +65,11 @@ class ThermalTracker:
         #: Last gradient in the static regime less board lag times board rate, by sensor [K].
         self._rest_gradients: dict[str, float] = {}
         self._begin_watch()
+        self.reconfigure(config or ThermalConfig(), board_lag_s, rest_gradient_range_k, None)
 
     def _begin_watch(self) -> None:
         self.detector = RegimeDetector(self.settings)
         self.lead = LeadCheck(self.case, self.board, self.settings.relaxed_rate_k_min)
-
-    def _configure(
-        self, config: ThermalConfig, board_lag_s: float, rest_gradient_range_k: tuple[float, float]
-    ) -> None:
-        self.config = config
-        self._rest_gradient_range = rest_gradient_range_k
-        #: Lag of the board behind the case [s], for the gradient without readings of the case.
-        self._board_lag_s = board_lag_s
-        self._case_timeout_s = config.case_timeout_s
-        #: Time without a decision after which the regime is unknown [s].
-        lag_s, longest_s = (
-            self.settings.case.lag_s,
-            max(self.settings.case.lag_s, self.settings.board.lag_s),
-        )
-        self._unwatched_s = min(max(UNWATCHED_SHARE * lag_s, config.case_timeout_s), longest_s)
 
     def reconfigure(
         self,
@@ -97,7 +82,14 @@ class ThermalTracker:
         if stamp_ns is not None:
             self._weight = self.weight_at(stamp_ns)
             self._weight_ns = stamp_ns
-        self._configure(config, board_lag_s, rest_gradient_range_k)
+        self.config = config
+        self._rest_gradient_range = rest_gradient_range_k
+        #: Lag of the board behind the case [s], for the gradient without readings of the case.
+        self._board_lag_s = board_lag_s
+        lag_s = self.settings.case.lag_s
+        usual_s = max(UNWATCHED_SHARE * lag_s, config.case_timeout_s)
+        #: Time without a decision after which the regime is unknown [s].
+        self._unwatched_s = min(usual_s, max(lag_s, self.settings.board.lag_s))
         # The check of the board's readings is copied: another tracker may share the original.
         self.checks = {**self.checks, BOARD_INPUT: copy(self.checks[BOARD_INPUT])}
         self.checks[BOARD_INPUT].lag_s = board_lag_s
@@ -105,12 +97,14 @@ class ThermalTracker:
     def is_live(self, stamp_ns: int, sensor: Thermometer) -> bool:
         """Whether the last reading of a sensor is at most the case time-out before a stamp."""
         seen_ns = sensor.stamp_ns
-        return seen_ns is not None and (stamp_ns - seen_ns) * 1e-9 <= self._case_timeout_s
+        return seen_ns is not None and (stamp_ns - seen_ns) * 1e-9 <= self.config.case_timeout_s
 
     def read(self, name: str, stamp_ns: int, celsius: float) -> bool:
         """Take a reading [degC]; return False if it is old, an outlier or implausible."""
         sensor, check = self.thermometers[name], self.checks[name]
-        self._compare(name, stamp_ns, celsius)
+        # Test whether sensors repeat readings of the board.
+        for other in self.copies if sensor is self.board else (name,):
+            self.copies[other].update(sensor is self.board, stamp_ns, celsius)
         if not self._use(name, sensor, check, stamp_ns, celsius):
             return False
         if sensor is self.board:
@@ -132,12 +126,6 @@ class ThermalTracker:
                 self._decide(stamp_ns, sensor)
             self.lead.update(self.detector.regime is Regime.STATIC)
         return True
-
-    def _compare(self, name: str, stamp_ns: int, celsius: float) -> None:
-        """Test whether sensors repeat readings of the board; `name`: origin of the reading."""
-        is_board = name == BOARD_INPUT
-        for other in self.copies if is_board else (name,):
-            self.copies[other].update(is_board, stamp_ns, celsius)
 
     def _follow_board(self, stamp_ns: int) -> None:
         board, memory = self.board, self.memory
@@ -173,8 +161,8 @@ class ThermalTracker:
         if is_anew:
             # A sensor starts again if all readings within the time-out were rejected as a step.
             age_s = 0.0 if before_ns is None else (stamp_ns - before_ns) * 1e-9
-            is_board = sensor is self.board
-            patience_s = self.config.temperature_timeout_s if is_board else self._case_timeout_s
+            config, is_board = self.config, sensor is self.board
+            patience_s = config.temperature_timeout_s if is_board else config.case_timeout_s
             if check.fault != Fault.STEP or age_s <= patience_s:
                 return False
             check.reset()
@@ -183,6 +171,8 @@ class ThermalTracker:
             sensor.reset()
         if not sensor.update(stamp_ns, celsius):
             return False
+        seen_ns = self.updated_ns
+        self.updated_ns = stamp_ns if seen_ns is None else max(seen_ns, stamp_ns)
         has_restarted = sensor.n_restarts != n_restarts
         if before_ns is not None and (is_new or has_restarted):
             is_gap = has_restarted and (stamp_ns - before_ns) * 1e-9 > sensor.settings.lag_s
@@ -190,7 +180,6 @@ class ThermalTracker:
                 # The few readings before the restart were wrong: begin at the present reading.
                 self._begin_again(name, sensor)
                 sensor.update(stamp_ns, celsius)
-                self.updated_ns = max(self.updated_ns or stamp_ns, stamp_ns)
                 return True
             memory = self.memory if sensor is self.board else self.memory.banks[name]
             if memory is self.memory and (is_anew or is_gap):
@@ -199,8 +188,6 @@ class ThermalTracker:
                 change = sensor.temperature - before
                 check.note_jump(stamp_ns, change)
                 memory.note_jump(change)
-        if self.updated_ns is None or stamp_ns > self.updated_ns:
-            self.updated_ns = stamp_ns
         return True
 
     def _begin_again(self, name: str, sensor: Thermometer) -> None:
@@ -227,15 +214,11 @@ class ThermalTracker:
 
     def weight_at(self, stamp_ns: int) -> float:
         """Weight of the dynamic set at a stamp, linear in time during a transition."""
-        if self._weight == self._target:
+        duration_s = self.config.transition_time_s
+        if self._weight == self._target or not duration_s:
             return self._target
-        duration = self.config.transition_time_s
-        if duration == 0.0:
-            return self._target
-        moved = max((stamp_ns - self._weight_ns) * 1e-9, 0.0) / duration
-        if self._target > self._weight:
-            return min(self._weight + moved, self._target)
-        return max(self._weight - moved, self._target)
+        moved = max((stamp_ns - self._weight_ns) * 1e-9, 0.0) / duration_s
+        return max(min(self._weight + moved, self._target), self._weight - moved)
 
     def sample(self, stamp_ns: int) -> tuple[float, ...]:
         """
@@ -279,10 +262,9 @@ class ThermalTracker:
         Return the variance of the error of the board temperature [K^2] that an impossible gradient
         of the leading sensor indicates, as with a loose thermometer or with swapped topics.
         """
-        loose = self.loose_k(gradient)
+        loose, lead = self.loose_k(gradient), self.lead
         # If the board leads the case in a ramp, the topics of case and board may be swapped.
-        is_reversed = self.lead.is_reversed
-        return loose * loose + (gradient * gradient if is_reversed else self.lead.extra_variance)
+        return loose * loose + (gradient * gradient if lead.is_reversed else lead.extra_variance)
 
     def loose_k(self, gradient: float) -> float:
         """

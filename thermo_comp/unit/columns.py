@@ -23,8 +23,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple, TypeAli
 import numpy as np
 
 from ..quantities import QUANTITIES
-from ..thermal.lags import BOARD_INPUT, Lag, MemorySpec, Play
-from ..thermal.quantity import Quantity
+from ..thermal.lags import BOARD_INPUT, Lag, MemorySpec, Play, Quantity
 from ..thermal.state import BOARD, WEIGHT, Gradient, Rate, StateLayout
 from ..typing import Floats
 from .functions import by_element, hold

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ..thermal import lags, state
-from ..thermal.quantity import Quantity
+from ..thermal.lags import Quantity
 from ..typing import Floats
 from .functions import by_element
 
