@@ -214,9 +214,7 @@ def samples_of(messages: Sequence[bytes], *, is_imu: bool) -> tuple[Stamps, Floa
     # Shorter messages than those with an empty frame_id are malformed.
     if size < _SHORTEST[is_imu]:
         return np.zeros(0, np.int64), np.zeros((0, 3))
-    content = b''.join(messages)
-    if len(content) != size * len(messages):
-        content = b''.join([message for message in messages if len(message) == size])
+    content = b''.join([message for message in messages if len(message) == size])
     rows = np.frombuffer(content, np.uint8).reshape(-1, size)
     is_plain = (rows[:, :4] == _PLAIN).all(axis=1)
     if not is_plain.all():
