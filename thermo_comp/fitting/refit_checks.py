@@ -16,9 +16,9 @@ import numpy as np
 from ..typing import Floats
 from .data_checks import advice
 from .evidence import PositionReport
+from .left_out import settled_error
 from .reduction import ReducedBag, StillInterval
 from .selection import Fit
-from .settled_bias import settled_error
 from .unknowns import Windows
 from .windows import CURVE
 
@@ -37,7 +37,7 @@ SLOW_TILTS = advice(
 def extrapolates(fit: Fit) -> bool:
     """
     Whether the left-out drift of the chosen model exceeds noise, and its bias at settled
-    temperatures is expected to be less accurate than that of a smaller model (`settled_bias`).
+    temperatures is expected to be less accurate than that of a smaller model (`settled_error`).
     """
     settled, trials = fit.windows.data.settled, fit.selected.trials
     chosen = next(trial for trial in trials if trial.is_chosen)
