@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from thermo_comp.fitting.coverage import (
-    PRIOR_SD,
     constants_covariance,
     direction_text,
     farthest,
@@ -15,8 +14,11 @@ from thermo_comp.fitting.coverage import (
     norm_columns,
     worst_sd,
 )
+from thermo_comp.fitting.unknowns import BIAS_SD, MISALIGNMENT_SD, SCALE_SD
 from thermo_comp.simulation.campaign import positions
+from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
+PRIOR_SD = np.repeat([BIAS_SD / STANDARD_GRAVITY, SCALE_SD, MISALIGNMENT_SD], 3)
 FACES = np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)], float)
 NOTHING = np.empty((0, 3))
 SD = 2e-5

@@ -14,7 +14,6 @@ from itertools import pairwise
 import numpy as np
 
 from ..typing import Floats
-from .data_checks import advice
 from .evidence import PositionReport
 from .left_out import settled_error
 from .reduction import ReducedBag, StillInterval
@@ -27,11 +26,6 @@ _PIECE_S = 3600.0
 # Smallest number of positions whose left-out norms are scored, for a reliable standard error of
 # the gain by slow tilts.
 _FEWEST_NORMS = 6
-SLOW_TILTS = advice(
-    'tilt',
-    'left-out |f| - g is smaller if the supports may tilt from hour to hour: in the fit each hour '
-    'of a rest has a separate attitude',
-)
 
 
 def extrapolates(fit: Fit) -> bool:
