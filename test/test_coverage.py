@@ -14,11 +14,9 @@ from thermo_comp.fitting.coverage import (
     norm_columns,
     worst_sd,
 )
-from thermo_comp.fitting.unknowns import BIAS_SD, MISALIGNMENT_SD, SCALE_SD
 from thermo_comp.simulation.campaign import positions
-from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
-PRIOR_SD = np.repeat([BIAS_SD / STANDARD_GRAVITY, SCALE_SD, MISALIGNMENT_SD], 3)
+PRIOR_SD = np.repeat([1.0 / 9.80665, 0.05, 1e-3], 3)  # bias [g], scale, misalignment [rad]
 FACES = np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)], float)
 NOTHING = np.empty((0, 3))
 SD = 2e-5

@@ -48,8 +48,7 @@ def ratios_to_sd(seed, effect_sd):
     missed = fitted.state.weights[0] - truth.on_bias * regression.rms
     places = fitted.layout.weights[0][:, used]
     chosen = SimpleNamespace(posterior=fitted, informative=(), lacks_effects=True)
-    claim = claim_of(Fit(windows, regression, chosen))
-    covariances = fitted.covariance, claim.covariance
+    covariances = fitted.covariance, claim_of(Fit(windows, regression, chosen)).covariance
     return [missed[:, used] / np.sqrt(np.diag(each)[places]) for each in covariances]
 
 

@@ -64,10 +64,6 @@ def page_of(evidence, folder, **keys):
     return Page(path.read_text(encoding='utf-8'))
 
 
-def words_of(evidence):
-    return Page(render_report(evidence))
-
-
 def bare():
     """Make the evidence for a page of a calibration without bags."""
     return evidence_of_bags([], fitted().calibration)
@@ -138,11 +134,11 @@ def test_the_page_states_whether_a_bag_was_fitted(opened, page):
     calibration = fitted().calibration
     assert 'positions in bags of the fit' in page.text
     unseen = evidence_of_bags(opened, calibration)
-    assert '1 position in bags that the fit did not use' in words_of(unseen).text
+    assert '1 position in bags that the fit did not use' in Page(render_report(unseen)).text
     sources = (replace(calibration.provenance.sources[0], sha256=unseen.bags[0].source.sha256),)
     provenance = replace(calibration.provenance, sources=sources)
     seen = evidence_of_bags(opened, replace(calibration, provenance=provenance))
-    assert '1 position in bags of the fit' in words_of(seen).text
+    assert '1 position in bags of the fit' in Page(render_report(seen)).text
 
 
 def test_a_page_without_calibration_shows_temperatures_derivatives_and_regime(opened, tmp_path):
@@ -187,7 +183,7 @@ def test_texts_of_a_bag_or_a_calibration_are_escaped_in_the_page(tmp_path, monke
     judged = evidence_of_bags(open_bags([bag]), calibration)
     undrawn = 'thermo_comp.report.page.drawn_figures'
     monkeypatch.setattr(undrawn, lambda figures: [(figure, '') for figure in figures])
-    page = words_of(judged)
+    page = Page(render_report(judged))
     assert page.text.count(evil) >= 6
     assert '$\\frac{.mcap' in page.text
     assert not page.names() & {'script', 'img'}
@@ -271,6 +267,6 @@ def test_each_verdict_has_a_colour_in_the_page(opened):
     assert 'outside the calibrated ranges not judged' in judged.headline
     strict = evidence_of_bags(opened, calibration, tolerance=1e-9)
     assert (strict.level, strict.judgement.verdict) == ('poor', 'recalibrate')
-    page = words_of(strict)
+    page = Page(render_report(strict))
     assert '<section class="verdict poor"' in page.source
     assert spelt(strict.judgement.reason) in page.text
