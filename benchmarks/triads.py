@@ -27,8 +27,7 @@ from thermo_comp.simulation.unit import Stream, SwitchedLoad, UnitModel, generat
 from thermo_comp.typing import Floats
 from thermo_comp.unit.gravity import MICRO_G
 
-#: Kinds of triads. The random numbers of a kind come from the stream with the number `FIRST_KIND`
-#: plus the kind's position in this list.
+#: Kinds of triads; the index of a kind here plus `FIRST_KIND` is the number of its random stream.
 TRIAD_NAMES = (
     *('own-lags', 'between', 'products', 'hysteresis', 'even', 'convection', 'switched-load'),
     *('paper', 'slow-noise', 'plain'),

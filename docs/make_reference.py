@@ -119,8 +119,7 @@ parameters.
 
 With Fast DDS the node uses a profile with `nackSupressionDuration` = 20 ms for its publishers, because this parameter has
 no ROS QoS setting. With the default of Fast DDS, 0 s, each sample for a reliable subscriber wakes a thread of the
-middleware about four times; these wake-ups take a quarter of the node's CPU time. With 20 ms a lost sample is sent again up
-to 20 ms later than with the default. A profile of the user (`FASTRTPS_DEFAULT_PROFILES_FILE`, or
+middleware about four times; these wake-ups take a quarter of the node's CPU time. With NACKs suppressed for 20 ms a lost sample is sent again up to 20 ms later. A profile of the user (`FASTRTPS_DEFAULT_PROFILES_FILE`, or
 `DEFAULT_FASTRTPS_PROFILES.xml` in the working directory) replaces that of the node: repeat `nackSupressionDuration` there.
 
 `linear_acceleration_covariance` is a full 3x3 matrix: noise of the sample plus uncertainty of the calibration at the

@@ -326,7 +326,7 @@ def test_the_command_convert_reads_a_bag(tmp_path, rng, cli):
 @pytest.mark.parametrize(
     ('magnitude', 'unit'),
     [
-        (1.019, 'g'),  # an MPU6050 with 2 % of bias
+        (1.019, 'g'),  # an MPU6050 with a bias of 19 mg
         (0.85, 'g'),
         (9.78, 'm/s^2'),
         (10.4, 'm/s^2'),

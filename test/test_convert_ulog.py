@@ -180,7 +180,7 @@ def write_combined(path, rng, later=None, **parameters):
         now = 7_000_000 + k * STEP_US
         rows = [(-200, vector)]
         if k == 3:
-            # Add a message without an accelerometer sample, and one with an old sample.
+            # Add a message without accelerometer sample, and one that repeats a sample.
             rows += [(2**31 - 1, vector), (-200 - 50, vector)]
         for j, (relative, (x, y, z)) in enumerate(rows):
             at = now + (50 if j == 2 else 0)

@@ -273,8 +273,8 @@ def test_the_bias_sd_of_one_recording_contains_the_sd_of_a_turn_on(rng):
 
 @pytest.mark.slow
 def test_the_claimed_variance_of_a_curve_contains_that_of_turn_ons_at_each_temperature(rng):
-    # WHY: for three recordings at three temperatures the claimed variance contained the error of
-    # the mean turn-on offset only: 1.6 to 1.9 times the variance of a turn-on.
+    # WHY: the claimed variance was 1.6 to 1.9 times that of a turn-on, as turn-ons at three
+    # temperatures were taken for an error of the mean offset, not of the curve.
     turn_on, ups, dwell = 5e-3, positions(9, 3), 600
     bags = []
     for celsius in (-15.0, 20.0, 55.0):

@@ -269,7 +269,7 @@ def test_runs_of_a_centrifuge_determine_nonlinear_terms_that_a_later_fit_keeps()
     assert outside.sections['outside'].n == most.n
     rows = results(evidence_of_fit(result), CertificateInfo(), ())
     assert {'K2 x', 'K3 z'} < {row.quantity for row in rows}
-    # A fit to six positions at 1 g with this calibration as prior keeps the nonlinear terms.
+    # Six positions at 1 g, with the centrifuge's calibration as prior, keep the nonlinear terms.
     still = [Position(program, position) for position in positions(6, 2)]
     later = arrays(unit, still, 9, rate_hz=2.0)
     tumble = [source(run, None, f'still{k}') for k, run in enumerate(later)]

@@ -197,7 +197,7 @@ def other(content):
 
 
 def one_by_one(data):
-    """Scan in a loop; return (place, size, channel, log time) of messages, other records, end."""
+    """List (place, size, channel, log time) of messages, other records, end of the last record."""
     at, messages, others = 0, [], []
     while at + 9 <= len(data):
         opcode, length = struct.unpack_from('<BQ', data, at)

@@ -131,9 +131,9 @@ def test_the_claimed_sd_covers_thermometer_errors_for_parts_that_lag_the_board(f
     assert ratio.max() > 0.1
 
 
-def test_the_lack_of_fit_is_divided_between_bias_and_scale():
-    # WHY: the certificate stated an sd of 11 ppm for a scale factor at temperatures at which no
-    # position had gravity along the axis, and added the whole unknown error to the bias.
+def test_the_lack_of_fit_is_included_in_the_sd_of_bias_and_of_scale():
+    # WHY: where no position had gravity along the axis, the certificate stated the scale factor to
+    # 11 ppm, because the lack of fit increased the sd of the bias only.
     lacks = LackOfFit(0.0, (0.0, 3e-3, 4e-3)), LackOfFit(20.0, (0.0, 0.0, 0.0))
     plain = calibration()
     lacking = replace(plain, static=replace(plain.static, lack_of_fit=lacks))

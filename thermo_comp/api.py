@@ -103,7 +103,7 @@ def correct(
     **sensors: Temperature,
 ) -> Corrected:
     """
-    Correct arrays of samples; for equal stamps the node and ``replay`` give the same bits.
+    Correct arrays of samples, to the same bits as the node and ``replay`` at equal stamps.
 
     Parameters
     ----------

@@ -50,7 +50,7 @@ _HEADING = re.compile(r'\s*(#|Misalignment Matrix|Scale Matrix|Bias Vector)')
 
 @dataclass(frozen=True)
 class Content:
-    """The content of a file: ``a = matrix (N - bias)``, the bias is a cubic of temperature."""
+    """A tool's file: ``a = matrix (N - bias)``, N: readings, bias: cubic of temperature."""
 
     matrix: Floats  # shape (3, 3); the identity in an autopilot's file
     bias: Floats  # coefficients of the cubic of each axis, in units of N, shape (3, 4)
@@ -111,7 +111,7 @@ def _within(number: int | None, lowest: int) -> int:
 
 
 def _read_px4(text: str, number: int | None) -> Content | None:
-    """Read PX4 parameters (QGroundControl's format or ``NAME=VALUE``); None for another tool."""
+    """Read PX4 TC_A parameters (QGroundControl's format or ``NAME=VALUE``); None without any."""
     values = _Parameters(text)
     numbers = {int(name[4]) for name in values if re.match(r'TC_A\d_X1_', name)}
     if not numbers:

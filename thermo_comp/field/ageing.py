@@ -299,8 +299,8 @@ def learn(
 
 def _best(candidates: Iterable[Change], is_gravity_certain: bool) -> Change | None:
     """
-    Return the most probable change, or None if no log Bayes factor reaches `_LEAST_GAIN`. That of
-    a jump of gravity must also exceed those of all other changes by `_LEAST_LEAD`.
+    Return the most probable change, or None if no log Bayes factor reaches `_LEAST_GAIN`. The
+    log Bayes factor of a gravity jump must also exceed those of other kinds by `_LEAST_LEAD`.
     """
     every = list(candidates)
     of_gravity = [change for change in every if change.kind == 'gravity']

@@ -158,8 +158,8 @@ def counted_rests(content: bytes) -> int:
 
 def thinned(content: bytes) -> bytes:
     """
-    Drop every second rest of a file, and lines that are neither starts nor rests; checksums are
-    not verified. The first rest of each start is kept.
+    Drop every second rest of a log, and lines of neither rests nor node starts; checksums are not
+    verified. The first rest of each start is kept.
     """
     kept: list[bytes] = []
     n = 0

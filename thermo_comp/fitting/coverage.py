@@ -158,7 +158,8 @@ def best_rests(candidates: list[Floats]) -> int:
 
     The sd of the constants follows from the directions of the rests of a set and from the
     residuals of |f|. The best set is the first whose sd is within 2 % of the smallest sd: the
-    first sets have the longest, quietest rests. If no set has six attitudes, take the first set.
+    first sets have the longest, quietest rests. If no set of rests has six attitudes,
+    the first is taken.
     """
     counts = [n_directions(means) for means in candidates]
     costs = np.array([

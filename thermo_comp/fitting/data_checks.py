@@ -267,9 +267,9 @@ def determines_misalignment(up: Floats) -> bool:
     """
     Whether the number and the spread of positions are sufficient to estimate the misalignment M.
 
-    The largest sd of a constant, divided by the noise of one position, must be at most 6. This
-    ratio is 1 for 18 well spread positions, 3 for nine well spread positions, and 4.5 to 8 for the
-    six faces held three times each by hand.
+    The largest sd of a constant, divided by the noise of one position, must be at most 6. The
+    sd of a constant over the noise of a position is 1 for 18 well spread positions, 3 for nine,
+    and 4.5 to 8 for the six faces held three times each by hand.
     """
     distinct = distinct_directions(up)
     is_enough = len(distinct) >= POSITIONS_FOR_MISALIGNMENT

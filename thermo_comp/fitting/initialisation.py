@@ -360,7 +360,7 @@ def sizes_of(windows: ThermalWindows, options: FitOptions) -> Floats:
 
 
 def initial_triad(windows: ThermalWindows, options: FitOptions) -> ConstantCalibration:
-    """Fit the constants without temperature; with few attitudes only the scale, 1 for m/s^2."""
+    """Fit constant bias, scale and M; few attitudes give the scale only (1 for m/s^2 input)."""
     means, gravity = position_means(windows.data), sizes_of(windows, options)
     norms = np.linalg.norm(means, axis=1)
     if not norms.all() or (len(means) > 1 and not means.any(axis=0).all()):

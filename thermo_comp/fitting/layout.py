@@ -108,7 +108,7 @@ class Layout:
 
     @cached_property
     def used(self) -> Bools:
-        """Active columns of bias and scale, shape (2, m)."""
+        """Whether bias and scale have a weight of each of the m columns, shape (2, m)."""
         return np.asarray(self.weights[:, 0] >= 0)
 
     def by_weights(self, columns: Floats, force: Floats) -> Iterator[tuple[Floats, Ints]]:

@@ -217,7 +217,7 @@ def describe(jump: Jump, per_mg: float, since_s: float = 0.0) -> str:
 
 
 def judge_missing(bags: Sequence[ReducedBag], windows: ThermalWindows) -> Iterator[Finding]:
-    """Report which share of the time at rest is left out without a temperature, and why."""
+    """Report the share of the time at rest left out for lack of a temperature, and why."""
     if not windows.has_temperature:
         return
     counts = [_missing(bag, track) for bag, track in zip(bags, windows.tracks, strict=True)]

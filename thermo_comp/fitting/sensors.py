@@ -27,7 +27,7 @@ _BIN_S, _BINS_PER_SIDE = 10.0, 6
 
 @dataclass(frozen=True)
 class RateHistory:
-    """Rate of a thermometer in a bag every ten seconds, and sd of the rate's noise [K/s]."""
+    """Temperature rate of a thermometer, every 10 s of a bag, and sd of its noise [K/s]."""
 
     rate: Floats
     rate_sd: float

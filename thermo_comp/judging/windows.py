@@ -179,7 +179,7 @@ def columns_of(windows: JudgedWindows, bags: Sequence[str]) -> dict[str, npt.NDA
 
 # A structured array of partial sums of samples, or of windows.
 _Table: TypeAlias = npt.NDArray[Any]
-# Integer fields: `count` is the sum, the other fields are of the first partial sum of a window.
+# Integer fields of a window: `count` is summed over its partial sums, the others: of its first.
 # Then fields that are averages over the partial sums; only `excess` is a maximum.
 _ONCE = ('bag', 'position', 'start_ns', 'count')
 _AVERAGED = ('time', 'board', 'rate', 'weight', 'variance', 'swapped', 'size', 'size_sd')

@@ -140,7 +140,7 @@ def _panels(
     unit, name = style.time_unit(shown.duration_s)
     figure = style.new_figure(more + sum(heights))
     panels = figure.subplots(len(heights), sharex=True, height_ratios=heights, squeeze=False)[:, 0]
-    # Join successive heating and cooling, so that no bright line is between them.
+    # Shade adjoining heating and cooling as one span, without a bright line.
     for regime, run in groupby(shown.stretches, key=attrgetter('regime')):
         start, *_, stop = (edge / unit for stretch in run for edge in stretch[:2])
         if regime == Regime.DYNAMIC:

@@ -209,7 +209,7 @@ class RestKeeper:
 
 
 def samples_of(messages: Sequence[bytes], *, is_imu: bool) -> tuple[Stamps, Floats]:
-    """Read stamps [ns] and samples of the plain messages that are as long as the last message."""
+    """Read stamps [ns] and samples of little-endian messages that have the last one's length."""
     size = len(messages[-1]) if messages else 0
     # Shorter messages than those with an empty frame_id are malformed.
     if size < _SHORTEST[is_imu]:

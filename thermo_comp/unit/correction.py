@@ -144,7 +144,7 @@ class Correction:
         return in_order(np.concatenate((start[:, np.newaxis], self._W * columns), axis=1), 1)
 
     def gentle_transition(self, given_s: float) -> float:
-        """Lengthen a transition [s], at most 10 times, to let the force change at GENTLE_RATE."""
+        """Lengthen a regime transition [s] up to tenfold to limit d(force)/dt to GENTLE_RATE."""
         board = np.linspace(*self._span, _GAP_TEMPERATURES)
         gap = np.diff(self.curves.values(board), axis=0)[0]
         scale = np.abs(gap[3:]).max(axis=0)
