@@ -66,8 +66,8 @@ GOALS = {
     'slow-noise': Goal(1.15, 1.15, is_relative=True),
     'plain': Goal(1.05, 1.05, is_relative=True, plan='chamber-9'),
 }
-# Limits for three plans of a thermal test: of a fit without a prior, and of a fit with the prior
-# from siblings.
+# Limits of the errors for three plans of a thermal test: without a prior, and with a prior from
+# siblings; None: no limit.
 PLAN_GOALS = {
     'chamber-9': (None, None),
     'tumble-3': (Goal(1.5, 2.5), Goal(1.2, 2.1)),
@@ -204,7 +204,7 @@ def floor(tests: Sequence[SimulatedRun]) -> Errors:
 
 
 def judged(result: Errors, goal: Goal | None, least: Errors) -> str:
-    """Return RMS of |f| - g and of the error vector [ug] as a cell, with (!) above the goal."""
+    """Return RMS of |f| - g and of the error vector [ug] as a table cell, (!) above a limit."""
     cell = f'{result.norm:.2f} / {result.vector:.2f}'
     if goal is None:
         return cell

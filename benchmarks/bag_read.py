@@ -6,7 +6,7 @@ Owns the measured speed of reading a bag, by thermo_comp, rosbags and mcap in on
 All bags hold counts at 400 Hz and two temperatures at 10 Hz; rosbags and mcap get shorter bags
 (`--peer-samples`). `rosbags` reads and deserializes each message; `mcap` only reads each message.
 A rate is the number of counts messages read per second of wall time, in the fastest of the
-repeats. From machine to machine the ratios of the rates change less than the rates.
+repeats. The ratios of the rates vary less between machines than the rates.
 
     python benchmarks/bag_read.py --samples 1000000
 """
@@ -132,7 +132,7 @@ def measure(
 
 def main() -> None:
     """Measure all readers and print the table."""
-    parser = argparse.ArgumentParser(description='Times reading by thermo_comp, rosbags, mcap.')
+    parser = argparse.ArgumentParser(description='Measures how fast bags are read.')
     parser.add_argument(
         '--samples', type=int, default=2_000_000, help='messages that thermo_comp reads'
     )

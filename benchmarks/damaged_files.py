@@ -56,7 +56,7 @@ def delete_rows(file: Path) -> None:
 
 
 def flip_message(file: Path) -> None:
-    """In each message of topic 1 add 64 to the topic number; no topic has this number."""
+    """Change the topic number of all messages of topic 1 to 65, a number that no topic has."""
     with sqlite3.connect(file) as database:
         database.execute('update messages set topic_id = topic_id + 64 where topic_id = 1')
 

@@ -4,8 +4,8 @@
 Owns the table of every command on every degenerate input: exit code, seconds, peak memory.
 
 For any recording or table a command must end within 60 s, use at most 300 MB, and print no
-traceback. Exit code 0 is allowed only if all data of the input can be read. A run that breaks one
-of these rules is marked ``!``, and the exit code of the benchmark is then 1.
+traceback. Exit code 0 is allowed only if all data of the input can be read. A run that breaks a
+rule is marked ``!``, and the exit code of the benchmark is then 1.
 
     python benchmarks/degenerate.py --only jump --json degenerate.json
 """

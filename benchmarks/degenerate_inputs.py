@@ -120,7 +120,7 @@ def _without_gravity(force: np.ndarray) -> np.ndarray:
 
 
 def _worn(sd: float, longest_s: float) -> Callable[[np.ndarray], np.ndarray]:
-    """Add noise of `sd` [m/s^2], as on an arm or in a car, except in pauses of `longest_s` [s]."""
+    """Add noise of `sd` [m/s^2], as on an arm or in a car, except for `longest_s` in each 20 s."""
 
     def change(force: np.ndarray) -> np.ndarray:
         rng = np.random.default_rng(9)

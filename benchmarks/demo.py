@@ -33,8 +33,8 @@ from thermo_comp.topics import IMU_OUT, REGIME
 from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
-# Sd of the sample unit's bias from turn-on to turn-on [m/s^2]. The norms of nine positions do not
-# determine this sd, so the fit gets this value as an option.
+# Sd of the sample unit's bias from turn-on to turn-on [m/s^2]. Norms in nine positions do not
+# determine the sd of turn-ons, so the fit gets it as an option.
 MOUNTING_SD = 1e-6 * STANDARD_GRAVITY
 
 # Groups of columns of each fit, by the name in the table: a curve for both regimes; a curve per
@@ -43,7 +43,7 @@ MODELS = {'one set': ('curve',), 'two sets': ('curve', 'set'), 'node': None}
 
 
 def demo(folder: Path, output: Path) -> bool:
-    """Run all steps; return whether the node lost no message and its output equals the replay."""
+    """Run all steps; return whether the node lost no message and its output is the replay's."""
     out = Output()
     output.mkdir(parents=True, exist_ok=True)
     held_out, recorded, unit = folder / 'held_out.mcap', output / 'out.mcap', output / 'unit.yaml'

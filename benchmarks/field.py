@@ -8,10 +8,10 @@ Compares updates in the field with an optimal filter, for units that age (`field
 Half of the units are in vehicles, level within 10 deg, half are carried in any attitude. Units age
 for 60 days: random walks of the bias (15 ug per root day) and scale (10 ppm per root day), bias
 offsets at turn-on (sd 20 ug) and one shock (sd 300 ug). On six days the calibration is updated
-with all earlier rests, as in `thermo_comp update`, and judged on the rests of the next day. After
-the last day the errors of the updated calibration are compared with those of a Kalman filter that
-is given these sd and the time of the shock. With --recordings FOLDER, the real recordings in
-FOLDER are cut into parts, and an update with all earlier parts is judged on the next part.
+with all earlier rests, as in `thermo_comp update`, and judged on the next rests. After the last
+day the errors of the updated calibration are compared with those of a Kalman filter that is given
+the true sd and the time of the shock. With --recordings FOLDER, the real recordings in FOLDER are
+cut into parts, and an update with all earlier parts is judged on the next part.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def root_mean(values: Floats) -> float:
 def worse(after: list, new: Calibration, kalman: Floats) -> tuple[bool, bool]:
     """
     Return whether the updated calibration, and whether the Kalman filter, has a larger RMS of
-    |f| - g on the rests of a day than the calibration before the update.
+    |f| - g on the rests of a day than the laboratory's calibration.
 
     A difference counts if it exceeds the standard error of an RMS over n turn-ons, which is the
     claimed sd / sqrt(2 n).
@@ -178,7 +178,7 @@ def unit(kind: str, seed: int, days: int) -> tuple[dict[str, Floats], list, floa
 
 
 def simulated(kind: str, n_units: int, days: int) -> None:
-    """Print the errors on a kind of platform before and after updates, and of the filter."""
+    """Print errors of units on a kind of platform before and after updates, and of the filter."""
     results = [unit(kind, seed, days) for seed in range(n_units)]
     joined = {name: np.array([result[0][name] for result in results]) for name in results[0][0]}
     print(f'\n{kind}: {n_units} units, {days} days, one shock each')
@@ -199,8 +199,8 @@ def simulated(kind: str, n_units: int, days: int) -> None:
     print(f'  error / claimed sd of |f| {ratio:.2f} (goal 0.7 .. 1.4)')
     days_after = np.array([pair for result in results for pair in result[1]])
     print(
-        f'  day after an update: {len(days_after)} days, error larger than without the update by '
-        f'the standard error {days_after[:, 0].sum()} (filter: {days_after[:, 1].sum()})'
+        f'  {len(days_after)} days after an update; error larger by a standard error than without '
+        f'the update on {days_after[:, 0].sum()} days (filter: {days_after[:, 1].sum()})'
     )
     print(f'  time of an update: {max(result[2] for result in results):.1f} s at most')
 

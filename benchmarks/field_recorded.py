@@ -84,14 +84,14 @@ def rests_of(of: Columns, calibration: Calibration, start_ns: int) -> list[tuple
 
 def cases(folder: Path, work: Path) -> Iterator[tuple[str, Path, list[float], float]]:
     """Yield name, bag, edges of the parts [s] and length of a window [s] of each recording."""
-    # Use the time from the last jump (docs/real_data.md) until the sensor leaves the freezer.
+    # Use the time from the last jump of the readings until the sensor leaves the freezer.
     yield 'freezer', freezer_bag(folder, work), [518.5, *np.arange(900.0, 1941.0, 104.0)], 10.0
     for unit in range(3):
         yield f'handheld {unit}', handheld_bag(folder, work, unit), [0.0, *range(80, 157, 11)], 2.0
 
 
 def judge_recordings(folder: Path) -> None:
-    """Print for each recording the RMS of |f| - g, before and after updates by earlier parts."""
+    """Print for each recording the RMS of |f| - g without and with updates by earlier parts."""
     print('\nreal recordings: an update with all earlier parts, judged on the next part')
     with tempfile.TemporaryDirectory() as work:
         for name, bag, edges, window in cases(folder, Path(work)):
@@ -116,6 +116,6 @@ def judge_recordings(folder: Path) -> None:
             mg = [1e3 * np.sqrt(np.mean(np.square(rms))) / GRAVITY for rms in (old, new)]
             n_worse = sum(b > 1.001 * a for a, b in zip(old, new, strict=True))
             print(
-                f'  {name:11} {len(old)} updates, {n_written} written: |f| - g of the part after '
+                f'  {name:11} {len(old)} updates, {n_written} written: |f| - g of the next part '
                 f'{mg[0]:.2f} mg RMS before, {mg[1]:.2f} after; worse on {n_worse} parts'
             )

@@ -98,7 +98,7 @@ def verdicts(kind: str, n_units: int, days: int) -> None:
         for low, high in pairwise(CLASSES):
             at = chosen & (ratio >= low) & (ratio < high)
             print(
-                f'  true RMS {low} .. {high} limits: {int(is_out[at].sum())} of {at.sum()} outside'
+                f'  true RMS / limit {low}..{high}: {int(is_out[at].sum())} of {at.sum()} outside'
             )
 
 
@@ -113,8 +113,8 @@ def main() -> None:
             shares, true, _, printed, _ = rows.T
             factor = np.log(np.maximum(printed, 0.3) / np.maximum(true, 0.3))
             print(
-                f'{kind:12} {name}: {len(rows)} units, {100 * shares.mean():.0f} % of the futures '
-                f'in 10 .. 90 %; median {np.median(printed):.0f} days, true '
+                f'{kind:12} {name}: {len(rows)} units, {100 * shares.mean():.0f} % of true days '
+                f'in 10 .. 90 %; median stated {np.median(printed):.0f} days, true '
                 f'{np.median(true):.0f}, ratio {np.exp(np.median(factor)):.2f} (scatter over the '
                 f'units: factor {np.exp(np.std(factor)):.1f})'
             )

@@ -10,12 +10,12 @@ temperatures at 10 Hz, and a sink process receives the Imu messages. Between sou
 either the node, with all functions, or the naive relay: an rclpy node that copies Vector3Stamped
 to Imu in a callback. The CPU time is that of all threads of the relay process, from the first
 sample to the last. The latency is the time from the source's publish call to the arrival in the
-sink's middleware, before any Python code of the sink runs. From machine to machine the ratios of
-node to naive relay change less than the times. The node uses its profile for Fast DDS; source,
-sink and naive relay use the default profile. At the last rate the node is measured once more while
-the parameter `calibration_file` is set twice a second. `--core` binds each relay to a core.
-`--floor` also measures a third relay, which copies the bytes of each message to Imu in a loop over
-a wait set, with the node's profile, and computes nothing.
+sink's middleware, before any Python code of the sink runs. Ratios of node to naive relay vary less
+between machines than CPU times and latencies. The node uses its profile for Fast DDS; source, sink
+and naive relay use the default profile. At the last rate the node is measured once more while the
+parameter `calibration_file` is set twice a second. `--core` binds each relay to a core. `--floor`
+also measures a third relay, which copies the bytes of each message to Imu in a loop over a wait
+set, with the node's profile, and computes nothing.
 
 The source keeps `--depth` samples to send lost samples again. With a reliable relay Fast DDS
 removes samples from the source's store 859 at a time; with 2000 kept samples the removal delays
@@ -27,11 +27,11 @@ for a third of a second, because Fast DDS waits for a reader. The measurement be
 processes have discovered each other.
 
 An idle core sleeps and needs time to wake up, and the host may use an idle virtual core for other
-machines. If the system allows this (Linux, as root), all cores are kept awake for all relays, by a
-request for a wake-up time of 0 us in /dev/cpu_dma_latency, as in cyclictest; with `--sleep` the
-cores may sleep. The host may stop a virtual machine with all its processes. "stolen" at the end of
-each row is the percentage of time for which the machine was stopped; if it is above some percent,
-the latencies are not those of node and relay.
+machines. On Linux, as root, all cores are kept awake for all relays, by a request for a wake-up
+time of 0 us in /dev/cpu_dma_latency, as in cyclictest; with `--sleep` the cores may sleep. The
+host may stop a virtual machine with all its processes. "stolen" at the end of each row is the
+percentage of time for which the machine was stopped; if it is above some percent, the latencies
+are not those of node and relay.
 """
 
 from __future__ import annotations
@@ -106,14 +106,14 @@ def main() -> None:
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
     parser.add_argument('--quick', action='store_true', help='three rates, one run of 3 s each')
-    parser.add_argument('--seconds', type=float, help='length of a run (default 10)')
+    parser.add_argument('--seconds', type=float, help='length of a run [s] (default 10)')
     parser.add_argument('--repeats', type=int, help='runs of each case (default 3)')
     parser.add_argument('--rates', type=int, nargs='+', help=f'default {RATES}')
     parser.add_argument(
         '--floor', action='store_true', help='also measure a relay that only copies bytes'
     )
     parser.add_argument('--core', type=int, default=-1, help='core of the relays (default any)')
-    parser.add_argument('--depth', type=int, default=100, help='queue of the source (default 100)')
+    parser.add_argument('--depth', type=int, default=100, help='samples kept to resend (100)')
     parser.add_argument('--sleep', action='store_true', help='let idle cores sleep')
     parser.add_argument('--json', help='file for the figures')
     arguments = parser.parse_args()

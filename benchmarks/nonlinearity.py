@@ -206,7 +206,7 @@ def figures(seed: int, k2: float, k3: float) -> dict[str, Floats]:
         result[f'{term.kind} ratio'] = (np.array(term.coefficient) - true) / of_terms[:, 0, k]
         slope = np.array(term.per_kelvin) - unit.share * true
         result[f'{term.kind} slope ratio'] = slope / of_terms[:, 1, k]
-    # The held-out mounting is nearly along an axis, where the nonlinear terms are largest.
+    # The held-out force is nearly along an axis, where the nonlinear terms are largest.
     direction = np.eye(3)[seed % 3] * rng.choice((-1.0, 1.0)) + 0.1 * rng.standard_normal(3)
     new = run(unit, direction / np.linalg.norm(direction), rng, (5.0,))
     result['after'] = np.array([residual_ug(calibration, new, 5.0)])

@@ -5,7 +5,7 @@ Owns the figures of docs/regime.md: the regime detector in simulated ramps and s
 
 A ramp of a chamber, with control ripple and a drift by self-heating, changes the temperatures of a
 case (first-order lag of the chamber) and of a board (first-order lag of the case). Sensors of
-several noises, quanta and rates read these temperatures. The detector's settings are the defaults
+several noises, quanta and rates read case and board. The detector's settings are the defaults
 except for noise, quantum, lags and ripple, which are those of the scene. All runs are seeded, so
 the command always prints the same figures, except for CPU times.
 
@@ -145,7 +145,7 @@ def run_matrix(
 
 
 def rate_table(matrix: Matrix) -> Rows:
-    """Count ramps, missed ramps, and ramps in which the flag returns to static, by rate."""
+    """Count ramps, missed ramps, and ramps whose flag returns to static early, by rate."""
     rows = [['readings', 'ramps', 'missed', 'missed, >= 0.2 K/min', 'static before the end']]
     for rate in dict.fromkeys(scene.rate_hz for scene, _ in matrix):
         mine = [(scene, result) for scene, result in matrix if scene.rate_hz == rate]
@@ -162,7 +162,7 @@ def rate_table(matrix: Matrix) -> Rows:
 
 
 def scene_table(matrix: Matrix, lag: float) -> Rows:
-    """Return median delay and dynamic fraction of the ramp, for all scenes with a case lag."""
+    """Return median delay and dynamic fraction of ramps, for scenes with a given case lag."""
     rows = [['sensor', 'Hz', 'K/min', 'median, s', 'share flagged']]
     for scene, result in matrix:
         if scene.lag_s == lag:
@@ -228,7 +228,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument('parts', nargs='*', help=f'all by default: {", ".join(PARTS)}')
-    parser.add_argument('--quick', action='store_true', help='small runs, for some seconds')
+    parser.add_argument('--quick', action='store_true', help='fewer runs, done in seconds')
     parser.add_argument('--seed', type=int, default=1)
     parser.add_argument('--workers', type=int, default=1, help='number of processes')
     parser.add_argument('--soak-hours', type=float, default=1100.0)

@@ -34,7 +34,7 @@ SINK_REST_S = 2e-3
 
 COUNTS = struct.Struct('<4siII7s5x3d')
 ENCAPSULATION = b'\0\1\0\0'
-#: frame_id of uncounted and of counted samples; every relay copies it to the Imu message.
+#: frame_id of uncounted and of counted samples; each relay copies the frame_id to the Imu.
 WARM_UP, SAMPLE = b'warmup\0', b'sensor\0'
 
 

@@ -229,9 +229,9 @@ def main() -> None:
     """Measure reading, compensating and writing, and print the tables."""
     parser = argparse.ArgumentParser(description='Times `replay` and a script with rosbags.')
     parser.add_argument('--samples', type=int, default=1_000_000, help='samples of the bags')
-    parser.add_argument('--hours', type=float, default=2.0, help='length of the bag to read')
+    parser.add_argument('--hours', type=float, default=2.0, help='length of the bag to read [h]')
     parser.add_argument('--compression', default='zstd', choices=('none', 'lz4', 'zstd'))
-    parser.add_argument('--gigabytes', type=float, default=0.0, help='size of the large bag')
+    parser.add_argument('--gigabytes', type=float, default=0.0, help='size of the large bag [GB]')
     parser.add_argument('--repeats', type=int, default=2)
     options = parser.parse_args()
     print(

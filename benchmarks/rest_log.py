@@ -9,8 +9,8 @@ log.
 The node runs in this process, source and sink of samples in two other processes; the rest log is
 on in even seconds of the clock and off in odd seconds. Neighbouring seconds are compared, because
 the speed of a shared machine changes. The latency is the time from the source's publish call to
-the arrival in the sink's middleware. The rest log sums samples in blocks; the printed time of the
-sum over a block is the longest delay of the next sample.
+the arrival in the sink's middleware. The rest log sums samples in blocks; the sum over a block,
+whose time is printed, delays the next sample.
 """
 
 from __future__ import annotations

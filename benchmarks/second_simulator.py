@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns a second simulator, which shares no code with that of thermo_comp, of units whose physics the
+Owns a second simulator, without code of the simulator of thermo_comp, of units whose physics the
 fit does not model exactly.
 
 Run ``python benchmarks/second_simulator.py`` for the table of docs/accuracy.md, or a part of it:

@@ -5,8 +5,8 @@ Runs the node for hours with reloads and regime changes, and checks that no samp
 
     python benchmarks/soak.py [--minutes 60] [--rate 2000] [--json FILE]
 
-The node runs in a separate process, with settings under which no message is lost. The temperatures
-ramp up, rest, ramp down and rest every three minutes, so the regime changes; `calibration_file` is
+The node runs in a separate process, with settings under which no message is lost. Every three
+minutes the temperatures rise, stay, fall and stay, so the regime changes; `calibration_file` is
 set every two seconds. The resident memory of the node is read every second, the latency of the
 samples (from before the publish call to after the take) every ten seconds. The slopes of memory
 and latency over time are fitted to means over a minute, without the first tenth of the run. The
@@ -41,8 +41,8 @@ STAMP = struct.Struct('<iI')
 SECOND_NS = 1_000_000_000
 READINGS_HZ = 10
 RELOAD_S, LATENCY_S, REPORT_S = 2.0, 10.0, 0.25
-#: Lengths of ramps and rests [s], which alternate, rate of a ramp [K/s], and lags of case and
-#: board [s], which are so short that the regime becomes static in each rest.
+#: Lengths of ramps and soaks [s], which alternate, rate of a ramp [K/s], and lags of case and
+#: board [s], which are so short that the regime becomes static in each soak.
 RAMP_S, REST_S, RAMP_K_S, CASE_LAG_S, BOARD_LAG_S = 30.0, 60.0, 0.1, 5.0, 10.0
 TIMEOUT_S = 30.0
 

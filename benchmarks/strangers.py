@@ -50,8 +50,8 @@ PACKAGE: dict[str, dict[str, Any]] = {
     'sets': {'groups': ('curve', 'set')},
 }
 BASELINES = ('constants', 'cubic', 'golovach', 'sets')
-#: A fit fails below this share of minutes in which all samples are corrected; below 1, because
-#: samples before the first reading of a thermometer are not corrected.
+#: Smallest share of minutes with all samples corrected for a fit to pass; below 1, because samples
+#: before the first reading of a thermometer are not corrected.
 LEAST_PUBLISHED = 0.98
 #: Cases of recorded bags, each with a single unit.
 RECORDED = ('sample-bags', 'no-case', 'board-twice', 'cats')
@@ -205,8 +205,8 @@ def bias_score(calibration: thermo_comp.Calibration, study: Study) -> Score:
     bag = Bag('zero', time_s, zero, temperatures)
     out = corrected(calibration, bag, config)
     error = out.force[len(out.force) // 2 :].mean(axis=0)
-    # The Cramer-Rao bound is that of the parameters alone: subtract the claimed variance of a
-    # calibration without a posterior, which is that of thermometer noise and of a turn-on.
+    # The Cramer-Rao bound does not include thermometer noise and turn-ons: subtract their claimed
+    # variance, which is that of the calibration without a posterior.
     exact = corrected(replace(calibration, posterior=None), bag, config)
     sd = np.sqrt(np.maximum(np.diag(out.claim[-1] - exact.claim[-1]), 0.0))
     return Score(
@@ -325,7 +325,7 @@ def run_case(
     path: Path | None,
     earlier: Mapping[tuple[str, int], Mapping[str, Score]],
 ) -> list[Result]:
-    """Run all studies of a case or, with a label, this study and that of its prior."""
+    """Run all studies of a case or, with a label, one study and the study of its prior."""
     results = []
     for unit in range(1, (1 if case in RECORDED else units or CASES[case][1]) + 1):
         done: dict[str, thermo_comp.Calibration] = {}

@@ -3,9 +3,9 @@
 """
 Owns the baselines that scipy fits to means over a minute, for the benchmark `strangers.py`.
 
-The baseline 'constants' has nine numbers: bias, scale and misalignment. The baseline 'cubic' has
-these nine and, for each axis, a cubic of the bias and a line of the scale over board temperature.
-Both are fitted by least squares on ``|f| - g`` or, in a single pose, on the samples of each axis.
+The baseline 'constants' has nine numbers: bias, scale and misalignment. The baseline 'cubic' adds
+for each axis a cubic of the bias and a line of the scale over board temperature. Both baselines
+are fitted by least squares on ``|f| - g`` or, in a single pose, on the samples of each axis.
 """
 
 from __future__ import annotations

@@ -129,7 +129,7 @@ def plain(number: int) -> Iterator[Study]:
 
 
 def one_pose(number: int) -> Iterator[Study]:
-    """Record a single pose for 9.5 h; the parts lag the board by 500 to 1500 s."""
+    """Record a single pose for 9.1 h; the parts lag the board by 500 to 1500 s."""
     rng = rng_of('one-pose', number)
     unit = navigation(rng)
     up = spread(1, rng)
@@ -208,7 +208,7 @@ def mems(number: int) -> Iterator[Study]:
 def sessions(number: int) -> Iterator[Study]:
     """
     Turn a MEMS unit by hand every 8 min in two recordings, each with a random bias offset of
-    0.3 mg. Fit the first, both recordings, and the second with the fit of the first as prior.
+    0.3 mg. Fit the first recording, both, and the second with the first fit as prior.
     """
     rng, hold_s, rate_hz = rng_of('sessions', number), 480.0, 10.0
     unit, up = consumer_grade(rng), spread(12, rng)
@@ -385,7 +385,7 @@ def flicker(number: int) -> Iterator[Study]:
 
 
 def third_node(number: int) -> Iterator[Study]:
-    """Let the bias depend on a node without a thermometer; chamber bags and a still-air bag."""
+    """Let the bias depend on a thermal node without thermometer, in a chamber and in still air."""
     rng = rng_of('third-node', number)
     unit = navigation(rng, hidden_bias=signed(rng, 20, 60), hidden_s=rng.uniform(900, 2500))
     fit = positions(unit, HALF, spread(12, rng), rng)

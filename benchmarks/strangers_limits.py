@@ -89,7 +89,7 @@ class Limit:
     claim : float
         Largest claimed sd / error.
     than, times : str, float
-        End of the title of another row of the case, and largest error / error of that row.
+        End of the title of a second row of the case, and largest error / error of this second row.
     bound_ratio : float
         Largest error of the bias / its Cramer-Rao bound.
 
@@ -110,7 +110,7 @@ class Limit:
 _ONE_THERMOMETER = Limit(norm=25.0, low=0.7, high=1.4)
 _REAL_UNIT = Limit(norm=560.0, low=0.7, high=1.4)
 _TURN_ON = Limit(low=0.7, high=1.4, unit=2.0)
-#: Limits by the beginning of a row's title; the longest key that fits applies.
+#: Limits by the beginning of a row's title; of several matching keys the longest applies.
 LIMITS = {
     'sample-bags': Limit(norm=1.3, vector=2.0, low=0.7, high=1.4),
     'no-case': _ONE_THERMOMETER,
@@ -121,8 +121,8 @@ LIMITS = {
     'plain': Limit(norm=1.3, vector=2.0, low=0.7, high=1.4),
     'one-pose: own bag': Limit(vector=2.0, low=0.7, high=1.4),
     'one-pose: other program': Limit(vector=5.0, low=0.7, high=1.4),
-    # In 'returned', `score` subtracts the smallest claimed variance over temperature, which
-    # contains the variance of a slope: error / claimed sd is not meaningful and has no limit.
+    # For 'returned', `score` subtracts the smallest claimed variance over temperature, which
+    # contains a slope's variance: error / claimed sd has no meaning and no limit.
     'returned': Limit(high=np.inf),
     'soaks': Limit(low=0.5, high=1.5, claim=3.0),
     'turn-on': _TURN_ON,

@@ -43,12 +43,11 @@ A calibration file describes one unit in YAML, and is written by `thermo_comp fi
 Schema; this page is generated from the schema.
 
 A file is refused if it has unknown or missing keys, text in place of a number, NaN or infinity,
-ranges that do not rise, functions that are not normalised at the reference temperature, a relative scale
-that could leave 0.1 to 10, a posterior of the wrong size, another `format_version` than 2, YAML
-aliases or tags, or more than 8 MiB. The error names the file, the key, the value and the expected
-value. Numbers are written with all digits and the posterior in single precision, so that no number
-changes if a file is read and written. The last line of a written file is `...`: a written file that is cut, for
-example by a copy that has not ended, is refused.
+ranges that do not rise, functions that are not normalised at the reference temperature, a relative scale that could leave
+the range 0.1 to 10, a posterior of the wrong size, another `format_version` than 2, YAML aliases or tags, or a size above 8
+MiB. The error names the file, the key, the value and the expected value. Numbers are written with all digits and the
+posterior in single precision, so that no number changes if a file is read and written. The last line of a written file is
+`...`: if such a file is cut, for example by a copy that has not ended, it is refused.
 
 The main keys:
 
@@ -88,17 +87,17 @@ same order. A `nonlinearity` adds, for each axis, the coefficients of its terms,
 per kelvin. The last three parameters of a posterior are `M[1][0]`, `M[2][0]` and `M[2][1]`. The
 covariance of all parameters is `factor @ factor.T + diag(diagonal)`. The posterior of a `gyroscope`
 has only the parameters of the bias, in rad/s and in the order of the accelerometer's bias. The
-`gyroscope` uses the ranges, the reference temperature and the thermometers of the unit.
+`gyroscope` uses the ranges, the reference temperature and the thermometers of the accelerometer.
 """
 
 BOUNDS = """\
 ## Bounds
 
 Each number in a calibration is one of the quantities in the table. The bounds are wider than any instrument needs; a
-calibration within these bounds gives finite results and a positive definite covariance. Further bounds depend on the full
-scale of the unit. The bias at the reference temperature, and its change, must each be within twice the full scale. The
-largest contribution of a column, and of one standard deviation of a parameter, must stay within a million times twice the
-full scale. The relative scale including the largest contributions of all columns must stay between 0.1 and 10.
+calibration within them gives finite results and a positive definite covariance. Further bounds depend on the full scale of
+the unit. The bias at the reference temperature, and its change over temperature, must each be within twice the full scale.
+The largest effects of a column on the bias, and of a parameter's sd on bias or scale, must be within a million times the
+limit of bias or scale. The relative scale including the largest contributions of all columns must stay between 0.1 and 10.
 """
 
 INTERFACE = """\
@@ -117,10 +116,11 @@ node needs no `use_sim_time`.
 Each QoS policy can be overridden at start with the usual `qos_overrides./topic.subscription.reliability`
 parameters.
 
-With Fast DDS the node uses a profile with `nackSupressionDuration` = 20 ms for its publishers, because this parameter has
-no ROS QoS setting. With the default of Fast DDS, 0 s, each sample for a reliable subscriber wakes a thread of the
-middleware about four times; these wake-ups take a quarter of the node's CPU time. With NACKs suppressed for 20 ms a lost sample is sent again up to 20 ms later. A profile of the user (`FASTRTPS_DEFAULT_PROFILES_FILE`, or
-`DEFAULT_FASTRTPS_PROFILES.xml` in the working directory) replaces that of the node: repeat `nackSupressionDuration` there.
+With Fast DDS the node uses a profile with `nackSupressionDuration` = 20 ms for its publishers, as no ROS QoS setting has
+this parameter. With the default, 0 s, each sample for a reliable subscriber wakes a thread of the middleware about four
+times, which takes a quarter of the node's CPU time. With NACKs suppressed for 20 ms, a lost sample is resent up to 20 ms
+later. A user's profile (`FASTRTPS_DEFAULT_PROFILES_FILE`, or `DEFAULT_FASTRTPS_PROFILES.xml` in the working directory)
+replaces that of the node: repeat `nackSupressionDuration` there.
 
 `linear_acceleration_covariance` is a full 3x3 matrix: noise of the sample plus uncertainty of the calibration at the
 present thermal state. Without an angular rate or an orientation in the input, the first element of the covariance of the
@@ -132,9 +132,9 @@ from `angular_velocity`, and `angular_velocity_covariance` is the noise of a mes
 The parameter `topics` names the driver's topics, like the option `--topic` of the offline commands:
 `topics:=imu=/imu/data,board=/fmu/out/sensor_accel:temperature`, or a file of such lines, as in
 [config/drivers](drivers.md). `TOPIC:FIELD` is a number inside a message, written as for `ros2 topic echo --field`. The node
-takes the message type from the publisher; only the messages of the driver's package must be installed. A reading without a
-header gets the stamp of the newest sample before it. `output=TOPIC` names the output, for a driver that publishes
-`imu/data_raw` itself; the node refuses an output that is its input.
+takes the message type from the publisher; the driver's message package must be installed. A reading without a header gets
+the stamp of the newest sample before it. `output=TOPIC` names the output, for a driver that publishes `imu/data_raw` itself;
+the node refuses an output that is its input.
 
 ## Recording a test
 
@@ -149,8 +149,8 @@ to every further `temperature/<name>`, once the topic has a publisher; the subsc
 A `set_parameters_atomically` request is checked as a whole before any of its parameters is applied. A separate process
 reads and checks a calibration while samples flow; the node then exchanges the calibration between two samples. An
 invalid `calibration_file` is refused in the response, with the reason, and the running calibration stays. The
-coefficients of a calibration are not parameters: parameters arrive one at a time, and a polynomial with old and new
-coefficients together gives a wrong correction.
+coefficients of a calibration are not parameters: parameters arrive one at a time, and a polynomial that mixes old and new
+coefficients gives a wrong correction.
 
 ```console
 $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml

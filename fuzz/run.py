@@ -23,10 +23,10 @@ NAMES = ('calibration', 'mcap', 'cdr', 'parameters', 'db3', 'zstd', 'csv', 'parq
 
 
 def main() -> int:
-    """Run one target here, or all of them one after the other."""
+    """Run one target in this process, or all targets one after the other."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
     parser.add_argument('target', choices=(*NAMES, 'all'), nargs='?', default='all')
-    parser.add_argument('--seconds', type=int, default=60, help='time per target (default 60)')
+    parser.add_argument('--seconds', type=int, default=60, help='time per target [s] (default 60)')
     parser.add_argument('--inputs', type=int, default=-1, help='inputs per target (-1: no limit)')
     arguments = parser.parse_args()
     if arguments.target == 'all':

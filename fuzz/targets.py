@@ -4,7 +4,7 @@
 Owns the fuzz targets: the readers of bytes from outside, and the properties that must hold.
 
 Each target takes any bytes and raises if a property is violated; its seeds are small and complete,
-so that the fuzzer starts behind the first checks.
+so that the fuzzer passes the first checks of the readers from the start.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def check_calibration(data: bytes) -> None:
         return
     assert parse_calibration(dump_calibration(value).encode()) == value
     row = Compensator(value).process(START_NS, 1.0, 2.0, 3.0)
-    # No thermometer has a reading, so only a calibration that needs no temperature gives a row.
+    # Without a reading only a calibration that needs no temperature corrects a sample.
     assert row is None or not value.needs_temperature
 
 
@@ -166,8 +166,7 @@ def check_parameters(data: bytes) -> None:
     try:
         messages = deserialize_message(data, SetParameters.Request).parameters
     except (RuntimeError, ValueError):
-        # Bytes that are no request become a value: the first byte is the type, the others the
-        # text.
+        # Bytes that are not a request become a parameter value: first its type, then its text.
         text = data[1:].decode(errors='replace').replace('\0', '')
         value = ParameterValue(type=data[0] if data else 0, string_value=text)
         messages = [Parameter(name=name, value=value) for name in ('frame_id', 'calibration_file')]

@@ -25,7 +25,7 @@ from thermo_comp.unit.rate_bias import Gyroscope, RateCurve, RateSet, RateTerm
 
 GRAVITY = 9.80665
 SECOND_NS = 1_000_000_000
-#: Places of the six different elements in the nine of a covariance.
+#: Indices of the six distinct elements among the nine of a 3 x 3 covariance.
 UNIQUE = [0, 1, 2, 4, 5, 8]
 #: Settings without checks for stuck samples and for a wrong |f|.
 UNCHECKED = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
@@ -194,7 +194,7 @@ def batch(compensator, events):
 
 def assert_equal_bits(unit, config, events, chunk):
     """
-    Check that one block of all events, and blocks of `chunk` events, give the bits of single
+    Check that one block of all events, and blocks of `chunk` events, give the same bits as single
     samples; return the rows of the single samples, the whole block and the three compensators.
     """
     streamed, whole, cut = (Compensator(unit, config) for _ in range(3))

@@ -29,7 +29,7 @@ ROOT = Path(__file__).resolve().parent.parent
 # variable OPENBLAS_NUM_THREADS when numpy is imported.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
-# Each worker of each test run uses a separate DDS domain, limited to this machine. Its number
+# Each worker of each test run uses a separate DDS domain, limited to this machine. The domain
 # follows from the id of the run and the number of the worker. Domain 0 is for users, domains from
 # 81 are for the benchmarks.
 _RUN = os.environ.get('PYTEST_XDIST_TESTRUNUID', str(os.getpid()))

@@ -43,7 +43,7 @@ class Truth:
     #: Slow noise of the bias (white noise: `sigma`).
     noise: Noise = field(default_factory=Noise)
     offset_sd: float = 0.0
-    #: Sd of support tilts [rad], for a column of temperature with an RMS of 1.
+    #: Sd of support tilts [rad] by a column of temperature with an RMS of 1.
     tilt_sd: float = 0.0
 
     @property

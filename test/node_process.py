@@ -53,7 +53,7 @@ class NodeProcess:
         return os.pread(self._log.fileno(), 1 << 20, 0).decode(errors='replace').strip()
 
     def stop(self, number=signal.SIGTERM):
-        # This sends no signal to a process that has already ended.
+        # `send_signal` sends no signal to a process that has already ended.
         self.process.send_signal(number)
         try:
             return self.process.wait(timeout=_STOPPING_S)

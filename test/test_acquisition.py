@@ -63,7 +63,7 @@ def test_positions_do_not_depend_on_the_length_of_blocks(stream, seconds):
         stream.turn()
     test = Acquisition(6, 50.0)
     starts = [begin for block in stream.blocks(seconds) for begin in test.add(block)]
-    # A position begins within two cells (0.5 s each) after the end of a turn.
+    # A position begins within 1.1 s after the end of a turn.
     assert np.array(starts) * 1e-9 - START_NS * 1e-9 == pytest.approx(
         np.array(begins[1:]) + 0.5, abs=0.6
     )

@@ -122,7 +122,7 @@ def in_whole_degrees(rest):
     ],
 )
 def test_bags_without_usable_numbers_are_refused_with_a_message(rng, spoil, text):
-    # WHY: for such bags the fit ended with a traceback.
+    # WHY: the fit to bags without usable numbers ended with a traceback.
     with pytest.raises(FitError, match=text):
         fit(spoilt(rng, spoil), FORCE)
 
@@ -152,7 +152,7 @@ def test_likely_mistakes_are_refused_with_the_name_of_the_refusal(rng, spoil, na
 
 
 def test_the_advice_for_rests_without_noise_names_the_parameter_of_the_node(rng):
-    # WHY: the node rejects equal samples as those of a stuck converter, and dropped 60 %.
+    # WHY: the node rejects equal samples as a stuck converter's, and dropped 60 % of the samples.
     rests = [Rest(rng, level=tuple(GRAVITY * up), sd=0.3 * MG) for up in positions(7, 3)]
     for rest in rests[:2]:
         # The samples have no noise; a drift of 40 mg changes them by steps of 4 mg.

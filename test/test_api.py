@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The Python interface: arrays are corrected to the bits of the compensator's output."""
+"""The Python interface corrects arrays to the same bits as the compensator."""
 
 import shutil
 from dataclasses import replace

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Wrong clocks, many clients, hostile data: no wrong output; the SROS 2 policy fits the node."""
+"""Wrong clocks, many clients or hostile data give no wrong output; the SROS 2 policy is right."""
 
 import itertools
 import random

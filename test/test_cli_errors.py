@@ -160,7 +160,7 @@ class TestFits:
 
 class TestEvaluations:
     def test_a_calibration_that_is_not_valid_gives_exit_code_1(self, cli, tmp_path):
-        # The unit reads exactly g; the calibration subtracts 50 mg by a wrong level of both sets.
+        # The unit reads exactly g; the calibration subtracts a wrong bias of 50 mg.
         wrong = axis_set((0.0, 1.0), (1.0,), delta=150.0)
         sets = regime_set(wrong, wrong, wrong)
         save_calibration(calibration(static=sets, dynamic=sets), tmp_path / 'wrong.yaml')
@@ -174,7 +174,7 @@ class TestEvaluations:
             writer.write_counts(TOPICS.counts, stamps, level)
         finished = cli('evaluate', path, '-c', tmp_path / 'wrong.yaml', code=1)
         assert 'no better than raw: 48 mg RMS of |f| - g, ' in finished.stdout
-        # The second calibration is right: its level of +10 mg cancels biases of -10 mg.
+        # The second calibration is right: its bias level of +10 mg cancels its bias of -10 mg.
         right = axis_set(delta=30.0)
         sets = regime_set(right, right, right)
         axes = equal_axes(300.0, -30.0)

@@ -51,7 +51,7 @@ def test_the_bank_of_columns_has_the_expected_number_per_group():
         'gradient_even': 42, 'play': 20,
     }  # fmt: skip
     assert len(set(bank(('case', 'tip')))) == len(bank(('case', 'tip')))
-    # Knees are within the temperature span of the bags, for the board and for parts that lag it.
+    # Knees are within the temperature span of the bags, also those for parts lagging the board.
     assert 'bend' not in by_group(bank(span_k=(-0.4, 0.4)))
     bends = [column for column in bank(span_k=(-10.0, 2.0)) if column.group == 'bend']
     assert len(bends) == 12 * len({column.tau_s for column in bends}) == 96
@@ -65,7 +65,7 @@ def test_gradient_even_about_rest_is_an_even_function_of_gradient_less_rest():
     assert {(column.sensor, column.rest_k) for column in change} == {('case', -0.5)}
     table = ColumnTable(change, MemorySpec(('case', 'tip')), 20.0)
     states = np.zeros((StateLayout(MemorySpec(('case', 'tip'))).width, 3))
-    # Gradients of three states: -0.5 K, the gradient at rest, and 1.5 K above and below it.
+    # Gradients of three states: -0.5 K, as in a soak, and 1.5 K above and below -0.5 K.
     states[GRADIENT] = -0.5, 1.0, -2.0
     values = table.raw(states)
     assert np.all(values[:, 0] == 0.0)
@@ -121,7 +121,7 @@ def test_the_value_of_each_kind_of_column_agrees_with_hand_numbers():
         0.25, 0.49 * 3.0, 0.7, 0.5 * 3.0, 1.0, 0.5, 0.0,
     ]  # fmt: skip
     assert values == pytest.approx(expected)
-    # In a product with t, t is limited to calibrated temperatures; the column `board` has no t.
+    # In products t is limited to calibrated temperatures; the column `board` has no factor t.
     at_edge = ColumnTable(columns, spec, 20.0, (-10.0, 22.0)).values(state)[:, 0]
     assert at_edge[4] == pytest.approx(-0.6)
     assert at_edge[2] == 0.5

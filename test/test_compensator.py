@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The compensator agrees with hand calculations; a switch of sets or calibration is smooth."""
+"""The compensator agrees with hand calculations; a change of regime or calibration is smooth."""
 
 import math
 import random
@@ -111,8 +111,8 @@ def at_seconds(*events):
     ]
 
 
-# In the explicit examples the compensator must find that stored readings have stamps of another
-# clock: by a reading that it has applied, or by a reading one day later.
+# In the explicit examples a reading that was applied before, or a reading one day later, shows
+# that stored readings have stamps of another clock.
 @given(event_lists, st.integers(3, 30), st.sampled_from([0.0, 5.0]))
 @example(at_seconds('A', 3, 'A', 0, 'B', 2, 'B', 86_400, 'C', 0, 'A', 0), 5, 0.0)
 @example(at_seconds('B', 26, 'B', 21, 'A', 23, 'B', 16.5), 1, 0.0)
@@ -219,7 +219,7 @@ def test_all_readings_of_two_minutes_without_samples_are_applied(n_before, ahead
         for k in range(4, 20 * 120)
         for name in ('board', 'case')
     ]
-    # If `ahead_s` is 2, readings of 2 s have later stamps than the first sample after them.
+    # If `ahead_s` is 2, the last 2 s of readings have later stamps than the sample after them.
     after_ns = (120 - ahead_s) * SECOND_NS
     last = [('accel', after_ns + k * SECOND_NS // 100, (1.0, 2.0 + k, 2930.0)) for k in range(5)]
     block, live = (Compensator(replace(rich_calibration(), gyroscope=None)) for _ in range(2))

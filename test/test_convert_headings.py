@@ -192,7 +192,7 @@ def slow_table(path, heading, times, first=20.0, last=45.0):
           for since in (0, 1_774_747_800) for step in (1, 5)),
         # WHY: a table in which every seventh row occurs twice was refused: times did not rise.
         ('s', [k / 10 for k in range(900) for _ in range(2 if k % 7 == 0 else 1)], 45.0),
-        # Without motion and temperature change the unit follows from the size of the stamps.
+        # Without motion and temperature change the size of the stamps shows their unit.
         *((unit, [START_NS // size + step * k for k in range(900)], 20.0)
           for unit, size, step in (('s', 10**9, 2), ('ms', 10**6, 5000), ('us', 10**9, 10_000))),
     ],
@@ -334,7 +334,7 @@ def test_equal_guessed_column_maps_are_printed_once(tmp_path, rng, cli):
 def test_words_of_24_and_32_bits_are_not_saturated(rng, one_g, bits):
     rest = Rest(rng, level=(0.0, 0.0, one_g), sd=0.002 * one_g)
     rest.accel[:] = np.rint(rest.accel)
-    rest.accel[100] = 2.0**bits - 1.0  # largest valid word
+    rest.accel[100] = 2.0**bits - 1.0  # largest value of the converter
     bag = reduce_source(rest.source(), full_scale=32767.0)
     assert (bag.n_saturated, len(bag.intervals)) == (1, 1)
 

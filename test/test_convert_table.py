@@ -179,7 +179,7 @@ class TestParquet:
 @pytest.mark.parametrize('suffix', ['csv', 'parquet'])
 @pytest.mark.parametrize('unit', ['s', 'ns'])
 def test_stamps_that_ros_cannot_hold_are_left_out(tmp_path, suffix, unit):
-    """A row with a stamp outside 0 to 2^31 s is left out and counted, also 2e10 s."""
+    """A row with a stamp outside 0 to 2^31 s is left out and counted."""
     scale = 10**9 if unit == 's' else 1
     good = [10**9 + k for k in range(40)] if unit == 's' else [10**18 + k for k in range(40)]
     bad = [-1, 2**31, 2 * 10**10, 2**62, 2**63] if unit == 's' else [-1, 2**31 * 10**9, 2**63]
@@ -273,7 +273,7 @@ def present(imu, temperature=(), pressure=()):
         ((), (), None, None),
         (('/t',), (), '/t', None),
         (('/imu/t', '/air'), (), '/imu/t', '/air'),
-        # A thermometer in the namespace of a barometer is the case's, also as the only
+        # A thermometer in a barometer's namespace is the case's, even if it is the only
         # thermometer.
         (('/baro/t',), ('/baro/p',), None, '/baro/t'),
         (('/imu/t', '/baro/t', ), ('/baro/p',), '/imu/t', '/baro/t'),
@@ -347,10 +347,10 @@ def test_the_unit_follows_from_the_norm_at_rest(magnitude, unit):
 def test_a_stated_unit_that_may_be_true_is_not_contradicted():
     assert contradiction('g', 1.15, None) is None
     assert contradiction('m/s^2', 9.6, None) is None
-    # Any |a| at rest above 50 may be in counts, because converters differ in their bits.
+    # Any |a| at rest above 50 may be in counts, because converters differ in resolution.
     assert contradiction('counts', 2941.7, None) is None
     assert contradiction('counts', 2060.0, 2048.0) is None
-    # Without a rest |a| is unknown, and no unit is refused.
+    # Without a rest |a| at rest is unknown, and no unit is refused.
     assert contradiction('g', float('nan'), None) is None
 
 

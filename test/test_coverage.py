@@ -54,13 +54,13 @@ def test_the_columns_equal_the_derivatives_of_the_measured_force(rng):
 def test_without_positions_the_covariance_is_that_of_the_prior():
     covariance = constants_covariance(NOTHING, np.empty(0))
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), PRIOR_SD)
-    # With an axis along gravity the variance of |f| is the sum of those of its bias and scale.
+    # Along an axis the variance of |f| is the sum of the variances of its bias and scale.
     assert worst_sd(covariance) == pytest.approx(np.hypot(PRIOR_SD[0], PRIOR_SD[3]), rel=1e-3)
 
 
 def test_two_opposite_faces_determine_bias_and_scale_of_their_axis():
     sd = np.sqrt(np.diag(constants_covariance(FACES[:2], np.full(2, SD))))
-    # Bias and scale error are half the difference and half the sum of the errors of two readings.
+    # Bias and scale errors are half the difference and half the sum of the two errors of |f|.
     assert sd[[0, 3]] == pytest.approx(SD / np.sqrt(2.0), rel=1e-6)
     np.testing.assert_allclose(sd[[1, 2, 4, 5, 6, 7, 8]], PRIOR_SD[[1, 2, 4, 5, 6, 7, 8]])
 

@@ -85,7 +85,7 @@ def test_every_page_is_in_the_site_s_menu():
 
 
 def test_rows_of_tables_have_as_many_cells_as_the_header():
-    # WHY: the bars of |f| in a cell were taken for the borders of cells.
+    # WHY: the bars of |f| in a table were taken for borders of cells.
     for page in PAGES:
         text = re.sub(FENCE, '', page.read_text(encoding='utf-8'))
         for table in re.findall(r'^\|.*\n(?:\|.*\n)+', text, re.MULTILINE):

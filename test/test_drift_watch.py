@@ -57,8 +57,8 @@ def test_forecasts_agree_with_the_simulated_future_of_units():
         for rows in field_watch.forecasts(kind, 3, 20).values():
             shares += rows[:, 0].tolist()
             ratios.append(float(np.median(rows[:, 3] / rows[:, 1])))
-    # The true day must lie in the printed interval with a probability of 80 %, which is estimated
-    # from 24 rows with an error of 6 %.
+    # The printed interval must contain 80 % of the simulated days; the mean of this share over 24
+    # rows has an error of 6 %.
     assert np.mean(shares) == pytest.approx(0.8, abs=0.12)
     # A unit's median time until it leaves the tolerance is uncertain by a factor of 1.5, the mean
     # of eight such times by 1.3.

@@ -319,7 +319,7 @@ def test_the_formula_of_imu_tk_gives_the_correction_of_the_calibration(tumbled):
     assert np.all(np.tril(T, -1) == 0.0)
     assert np.count_nonzero(K - np.diag(np.diag(K))) == 0
     theirs = (RAW - numbers[18:]) @ (T @ K).T
-    # The notes have angles with six digits: an error of 1e-6 rad times 90 m/s^2.
+    # The notes round angles to 1e-6 rad, an error of 1e-6 times 90 m/s^2.
     np.testing.assert_allclose(theirs, ours(tumbled, RAW) @ turn(file.notes).T, atol=1e-4)
     np.testing.assert_allclose(
         np.linalg.norm(theirs, axis=1), np.linalg.norm(ours(tumbled, RAW), axis=1), rtol=1e-12

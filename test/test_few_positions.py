@@ -115,7 +115,7 @@ def test_one_position_gives_bias_over_temperature_on_three_axes(one_position):
     at = np.array([-3.0, 12.0])
     for axis, slope in zip(one_position.calibration.static.axes(), SLOPE, strict=True):
         fitted = np.diff(axis.bias_function.value(at))[0] / 15.0 / MG
-        # 15000 samples (noise 3 mg) over 16 K determine a slope to some hundredths of a mg/K.
+        # 15000 samples (noise 3 mg) over 19 K determine a slope to 0.01 mg/K.
         assert fitted == pytest.approx(slope, abs=0.2)
 
 
@@ -175,7 +175,7 @@ def test_rests_at_three_temperatures_give_the_bias_slope_despite_a_warm_up_of_th
 @pytest.mark.slow
 def test_the_drift_error_of_a_sensor_that_follows_half_of_a_warm_up_is_within_three_claimed_sd():
     # WHY: a curve fitted to the drifts within rests was wrong by 7 claimed sd over the range of
-    # temperatures. Seed 2 gives an error above the sd that follows from these drifts.
+    # temperatures. Seed 2 gives an error above the sd of the curve fitted to drifts.
     rng, slopes, bags = np.random.default_rng(2), 0.1 * MG * SLOPE, []
     for celsius in (5.0, 20.0, 35.0):
         for up in positions(6, 3):
@@ -234,7 +234,7 @@ def test_positions_without_a_thermometer_give_constants_and_wide_temperature_slo
 
 
 def test_a_fit_that_cannot_determine_the_repeatability_of_mountings_reports_its_assumption(rng):
-    # The nine constants of a triad fit nine norms exactly, so nine norms do not show offsets.
+    # The nine constants of a triad fit nine norms exactly, so nine norms show no mounting offset.
     assert 'mountings' in names_of(tumbled(9))
     stated = fit([turned(rng, positions(9, 3))], replace(OPTIONS, mounting_sd=1e-3))
     assert 'mountings' not in names_of(stated)
@@ -288,8 +288,8 @@ def test_the_claimed_variance_of_a_curve_contains_that_of_turn_ons_at_each_tempe
     for bag in (bags[0], bags[2]):
         out = unit.correct(bag.time_s, bag.counts, board=bag.temperatures['board'])
         # At the ends of the range a curve through three equidistant points has 5/6 (line) to 1
-        # (parabola) of the variance of a turn-on; the next turn-on adds 1. If `mounting_sd` is the
-        # sd of nine independent mountings, bias and scale add 1/3 each.
+        # (parabola) times the variance of a turn-on, which the next turn-on adds once more. If
+        # `mounting_sd` is the sd of nine independent mountings, bias and scale add 1/3 each.
         variance = np.diagonal(out.covariance[-dwell:].mean(axis=0)) - 1e-3**2
         assert ((1.0 + 5.0 / 6.0) * turn_on**2 < variance).all()
         assert (variance < (1.0 + 1.0 + 2.0 / 3.0) * turn_on**2).all()
@@ -413,7 +413,7 @@ def test_the_claimed_sd_from_six_faces_contains_the_cross_axis_sensitivity_of_a_
     out = calibration.correct(np.arange(1.0, len(reading) + 1.0), reading)
     sd = np.sqrt(np.diagonal(out.covariance, axis1=1, axis2=2))
     ratio = (out.specific_force - corners)[:, 1:] / sd[:, 1:]
-    # The RMS of three random numbers is within a factor of 2 of their sd in 95 % of the draws.
+    # The RMS of three normal numbers is within a factor of 2 of their sd in 85 % of the draws.
     assert 0.5 < np.sqrt(np.mean(ratio**2)) < 2.0
 
 

@@ -186,7 +186,7 @@ def test_the_sd_of_an_old_calibration_aged_to_the_last_rest_includes_the_random_
     # and y between half and all of the variance of the random walk.
     for axis in (x, y):
         assert 0.5 < axis.present_sd / (329.0 * MICRO_G) < 1.5
-    # The present sd of z must be the size of its change, within two turn-on offsets (sd 20 ug).
+    # The present sd of z must be the size of the change of z to 40 ug, two sd of a turn-on offset.
     assert z.present_sd == pytest.approx(abs(walk[-1, 2]), abs=40.0 * MICRO_G)
 
 
@@ -295,8 +295,8 @@ def test_a_turn_on_that_contradicts_all_other_turn_ons_is_left_out():
 
 
 def test_a_wrong_clock_at_the_start_of_the_node_does_not_change_the_update(tmp_path, rng):
-    # A computer without a battery clock starts with the date of its disk image, while the stamps
-    # of the samples are right. Start times are wrong at no start, all starts, the last start.
+    # A computer without a battery clock starts with the date of its disk image; sample stamps are
+    # right. Start times of no start, of all starts, or of the last start are wrong.
     unit = known()
     logged = rests(unit, upright, jump_of(300.0, 10.0))
     image = {start.start_ns: int(1.6e18 + 5e8 * rng.standard_normal()) for start, _ in logged}
@@ -436,7 +436,7 @@ def test_derivatives_of_a_rest_by_initial_lag_states_agree_with_finite_differenc
 
 def test_an_unknown_regime_after_a_turn_on_does_not_increase_the_noise_of_a_rest():
     # The residual sd of a calibration is the scatter of turn-ons. The ageing model estimates this
-    # scatter, so the noise of a rest must not contain the residual sd.
+    # scatter of turn-ons, so the noise of a rest must not contain the residual sd.
     unit = field_units.calibration()
     logged = field_units.live('level', 1, 3, field_units.Process()).rests
     unknown = [(s, replace(r, state=(*r.state[:4], 1.0, *r.state[5:]))) for s, r in logged]

@@ -112,7 +112,7 @@ def test_the_paper_s_model_fits_a_unit_of_the_paper_s_physics(golovach):
     assert calibration.response == ()
     assert calibration.provenance.model == 'golovach'
     for row in golovach.residuals[1:]:
-        # The paper's model has a curve per regime, so it has no residual of a single curve.
+        # The paper's model has a curve per regime; residuals of a single curve are not computed.
         assert not row.one_set.n
         assert row.two_sets.rms < row.raw.rms, row.section
     # The paper's model has a linear static set and a quadratic dynamic set.

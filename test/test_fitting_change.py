@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""If a board heats itself, even effects of T_case - T_board count from its value at rest."""
+"""With self-heating, even effects of T_case - T_board are even about its value in a soak."""
 
 from itertools import pairwise
 
@@ -26,7 +26,7 @@ def lagged(values, tau):
 
 
 def recorded(rng, up, name, targets):
-    """Simulate a unit whose bias is an even function of T_case - T_board less its rest value."""
+    """Simulate a unit whose bias is even in T_case - T_board less its value in a soak."""
     corners = [(0.0, targets[0]), (900.0, targets[0])]
     for before, after in pairwise(targets):
         corners += [(corners[-1][0] + 60.0 * abs(after - before), after)]

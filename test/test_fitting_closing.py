@@ -132,7 +132,7 @@ def test_variance_ratio_and_correlation_time_are_estimated(rng, noise):
 
 
 def test_white_noise_is_not_taken_for_gauss_markov_noise(rng):
-    # A fit finds Gauss-Markov noise in 1 % of white series; it must find none in these ten.
+    # The fit finds Gauss-Markov noise in 1 % of series of white noise, but not in these ten.
     assert [
         whitener.estimate(series, weight)
         for whitener, weight, series in (drawn(rng, 5, 100, Noise()) for _ in range(10))
@@ -179,11 +179,11 @@ def test_a_larger_model_must_not_explain_the_errors_of_a_coarse_thermometer():
     curve, parts, bends = (score(drift, (), by_thermometer) for drift in (120.0, 46.0, 20.0))
     assert is_better(curve, parts)
     assert not is_better(parts, bends)
-    # Errors of |f| that are larger than the error of the thermometer decide for the curve.
+    # Errors of |f| above those by the thermometer (49 ug) select the curve that reduces them.
     flat, curved = (score(46.0, size * np.ones(9), by_thermometer) for size in (3000.0, 60.0))
     assert is_better(flat, curved)
     assert not is_better(curved, score(20.0, 30.0 * np.ones(9), by_thermometer))
-    # With a thermometer error of 5 ug a reduction of the left-out drift from 46 to 20 ug counts.
+    # If the thermometer causes 5 ug, a fall of the left-out drift from 46 to 20 ug is significant.
     assert is_better(score(46.0, (), 5.0), score(20.0, (), 5.0))
 
 

@@ -216,7 +216,7 @@ def test_a_constant_rotation_counts_as_a_rest_and_a_changing_rotation_does_not(r
     summed = accumulator.cells()
     still = still_intervals(without_rotation(summed), 3.0)
     edges = [(summed.time[a], summed.time[b - 1]) for a, b in still]
-    # The median rate shows a change after 5 s, and cells next to a motion do not count as rest.
+    # The median rate shows a change after 5 s; samples next to a motion do not count as rest.
     assert len(edges) == 3
     for (a, b), (begun, ended) in zip(edges, ((0, 80), (100, 180), (190, 240)), strict=True):
         assert begun <= a < begun + 8.0
@@ -281,7 +281,7 @@ def test_runs_of_a_centrifuge_determine_nonlinear_terms_that_a_later_fit_keeps()
         replace(again, unit=replace(again.unit, serial=f'{k}'), gyroscope=None) for k in range(3)
     ]
     assert population(siblings).nonlinearity is None
-    # A fit to positions at 1 g only keeps the stated sd of K2, and a finding says so.
+    # A fit to positions at 1 g alone keeps the stated sd of K2, which is reported.
     alone = fit(tumble, FitOptions(gravity=G, model='golovach', k2_sd=5e-5))
     assert [finding.name for finding in alone.findings].count('nonlinearity') == 1
     (square, *_) = nonlinear_coefficients(alone.calibration)

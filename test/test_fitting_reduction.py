@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Samples are reduced to cells, rests and windows; thermometer settings are estimated."""
+"""Samples are averaged over windows in rests; thermometer settings are estimated."""
 
 from dataclasses import replace
 
@@ -89,7 +89,7 @@ def test_short_rests_of_slow_samples_are_found(rng, rest_s):
 
 @pytest.mark.parametrize('cycle_s', [0.01, 0.02, 0.04, 0.05, 0.1, 0.3, 1.0])
 def test_the_estimated_interval_between_samples_is_right_to_0_1_percent(rng, cycle_s):
-    # WHY: at 10 Hz a cell has 33 or 34 samples, and the rate was computed as 9.9 Hz.
+    # WHY: at 10 Hz averages have 33 or 34 samples; the rate was computed as 9.9 Hz.
     n = round(1800.0 / cycle_s)
     kept = rng.random(n) > 2.0 / n  # a few samples are lost
     samples = 9.8 + 0.01 * rng.standard_normal((n, 3))
@@ -102,7 +102,7 @@ def test_windows_are_means_of_their_samples(rng):
     (interval,) = reduced([block(samples)]).intervals
     assert interval.count.sum() == len(samples)
     assert len(interval.time) == 6
-    # A window of 10 s consists of 20 cells of 0.5 s with 50 samples each.
+    # A window of 10 s has 20 averages over 0.5 s (50 samples).
     np.testing.assert_allclose(interval.mean[2], samples[2000:3000].mean(axis=0), atol=1e-10)
     assert interval.time[2] == pytest.approx(24.995, abs=1e-9)
     np.testing.assert_allclose(interval.sample_sd, 0.3, rtol=0.1)
@@ -117,7 +117,7 @@ def test_positions_in_one_bag_are_separated(rng):
     first, second = reduced([block(accel)]).intervals
     np.testing.assert_allclose(first.mean[0], (0.0, 0.0, 3000.0), atol=0.1)
     np.testing.assert_allclose(second.mean[-1], (3000.0, 0.0, 0.0), atol=0.1)
-    # Up to two cells (1 s) before and after the motion are left out of the rests.
+    # Up to 1 s (two means) before and after the motion is left out of the rests.
     assert (first.end_ns - first.start_ns) * 1e-9 == pytest.approx(40.0, abs=1.6)
     assert (second.end_ns - second.start_ns) * 1e-9 == pytest.approx(30.0, abs=1.6)
 
@@ -184,8 +184,8 @@ def test_glitches_are_counted_and_end_no_rest(rng):
 
 
 def test_a_rest_is_found_in_samples_that_arrive_in_bursts(rng):
-    # WHY: the length of a cell followed from the median step of stamps, 0.3 ms, so cells between
-    # bursts were empty, and a unit at rest for 22 min was reported as worn or driven.
+    # WHY: the averaging time followed from the median step of stamps, 0.3 ms, so no samples were
+    # averaged between bursts, and a unit at rest for 22 min was reported as worn or driven.
     whole = block(still(rng, 600.0, (0.0, 0.0, 3000.0)))
     number = np.arange(len(whole.accel))
     for size in (20, 100, 200):
@@ -234,7 +234,7 @@ def test_the_reduction_does_not_depend_on_the_origin_of_time(rng):
 
 @pytest.mark.parametrize(
     ('rate_hz', 'cell_s', 'window_s'),
-    # At 100 Hz 20 cells of 0.5 s make a window of 10 s; at 4 Hz and 1 Hz a window is one cell.
+    # At 100 Hz 20 means over 0.5 s make a window of 10 s; at 4 and 1 Hz a window is one mean.
     [(100.0, 0.5, 10.0), (20.0, 10.0 / 6.0, 10.0), (4.0, 10.0, 10.0), (1.0, 30.0, 30.0)],
 )
 def test_windows_of_a_fit_have_the_stated_length(rate_hz, cell_s, window_s, rng):
@@ -314,8 +314,8 @@ def soak_ramp_soak(quantum, noise, rng):
 def test_thermometer_settings_are_estimated_from_readings(quantum, noise, rng):
     learned = learn_thermometer([soak_ramp_soak(quantum, noise, rng)], ThermometerSettings())
     assert learned.quantum_c == pytest.approx(quantum, rel=1e-6)
-    # If readings have steps, only edges that are passed slowly, at the end of the ramp, show
-    # noise.
+    # Rounded readings show noise only at the rounding edges that they pass slowly, at the end of
+    # the ramp.
     assert learned.noise_sd_c == pytest.approx(noise, rel=0.4 if quantum else 0.1)
     # Means over 60 s determine the lag of the thermometer, 300 s, to a third.
     assert learned.lag_s == pytest.approx(300.0, rel=0.35)
@@ -325,7 +325,7 @@ def test_thermometer_settings_are_estimated_from_readings(quantum, noise, rng):
 @pytest.mark.parametrize('noise', [0.02, 0.05, 0.09])
 def test_readings_that_alternate_at_edges_of_1_k_steps_show_their_noise(noise, rng):
     learned = learn_thermometer([soak_ramp_soak(1.0, noise, rng)], ThermometerSettings())
-    # The readings pass each of 30 edges once; only the two slowest passes show the noise.
+    # The readings pass each of 30 rounding edges once; only the two slowest passes show noise.
     assert learned.noise_sd_c == pytest.approx(noise, rel=0.3)
 
 
@@ -391,8 +391,8 @@ def test_a_drift_averages_the_error_of_rounding(rng):
 
 @pytest.mark.parametrize('step', [1.0, 0.04])
 def test_steps_of_a_converter_after_a_constant_soak_do_not_divide_a_rest(rng, step):
-    # WHY: the step of the converter was searched in the first 20000 samples. These were constant,
-    # and each later step of the converter began a new rest.
+    # WHY: the step of the converter was searched in the first 20000 samples only. If these samples
+    # were constant, each later step of the converter began a new rest.
     rest = Rest(rng, duration_s=3600.0, sd=0.0)
     ramp = np.maximum(rest.time - 1800.0, 0.0) / 1800.0
     rest.accel = np.rint(rest.accel / 0.04 + 6.0 * np.outer(ramp, (1.0, -1.3, 0.7))) * step
@@ -401,7 +401,7 @@ def test_steps_of_a_converter_after_a_constant_soak_do_not_divide_a_rest(rng, st
 
 
 def test_a_turn_between_constant_samples_is_not_taken_for_a_step_of_the_converter(rng):
-    # WHY: the samples change at a turn only, and this change was taken for the converter's step.
+    # WHY: if samples change only at a turn, this change was taken for the converter's step.
     rest = Rest(rng, sd=0.0)
     rest.accel[rest.time > 300.0] = (GRAVITY, 0.0, 0.0)
     bag = reduce_source(rest.source(), full_scale=None)

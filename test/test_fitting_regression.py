@@ -151,7 +151,7 @@ def solved(request):
     windows = replace(windows, weight=weight, bag=bag, pose=pose)
     regression, state = begin(windows, up)
     # The derivatives of the regression omit products of parameter changes. In one or two poses
-    # bias, scale and misalignment are undetermined; narrow priors keep these products small.
+    # bias, scale and misalignment are undetermined; narrow priors keep the products small.
     narrow = {'scale_sd': 1e-5, 'misalignment_sd': 1e-5, 'bias_sd': np.full(3, 1e-4)}
     narrow['column_sd'] = column_sd(('curve', 'board'), 1e-2, 1e-5)
     narrow = narrow if pose_of else {}
@@ -205,7 +205,7 @@ def test_the_regression_of_windows_without_noise_gives_the_true_parameters(rng):
     regression, state = begin(windows, up)
     prior = replace(prior_of(truth), sigma=np.full(3, MICRO))
     mode = mode_of(regression, state, prior).state
-    # The priors shift the result by 1e-6 of its sd, which is about 1 ug.
+    # The priors shift the result by 1e-6 of its sd (about 1 ug).
     np.testing.assert_allclose(mode.kappa, truth.kappa, atol=1e-9)
     np.testing.assert_allclose(mode.bias, truth.bias, atol=1e-8)
     np.testing.assert_allclose(mode.misalignment, truth.misalignment, atol=1e-8)

@@ -94,7 +94,7 @@ def test_each_tried_model_has_a_left_out_error(calm):
     assert rms[()] > 2.0 * rms['curve',] > 10.0 * rms['curve', 'board']
     (chosen,) = (trial for trial in selected.trials if trial.is_chosen)
     assert chosen.score is selected.score
-    # The left-out error is white noise plus the error of the fit, at most 15 % in total.
+    # By errors of the fit the left-out error is above the white noise, by 15 % at most.
     assert 1.0 < selected.score.rms / truth.sigma[0] < 1.15
     assert all(is_better(trial.score, selected.score) for trial in selected.trials[:2])
 
@@ -137,7 +137,7 @@ def test_estimated_noise_parameters_agree_with_the_truth(noisy):
     _, chosen, truth = noisy
     prior = chosen.posterior.prior
     assert {'curve', 'board'} <= chosen_groups(chosen)
-    # 1080 windows per axis determine the sd of white noise to 3 %, with slow noise less well.
+    # 1080 windows per axis determine the sd of white noise to 2 %, with slow noise less well.
     np.testing.assert_allclose(prior.sigma, truth.sigma, rtol=0.15)
     # A position lasts six correlation times of the noise, and the curves fit part of the noise.
     assert 0.5 < prior.noise.ratio / truth.noise.ratio < 2.0
@@ -189,7 +189,7 @@ def test_the_estimated_prior_sd_of_a_column_is_the_rms_of_its_true_weights(calm)
 
 
 def test_the_prior_sd_of_a_slope_stays_below_the_steepest_plausible_slope():
-    # The slope of the unit is ten times the limit of the prior sd.
+    # The unit's bias slope is ten times the largest allowed prior sd of a bias slope.
     truth = Truth(on_bias=10.0 * STEEPEST[0] * np.outer([1.0, -1.0, 1.0], np.arange(6) == 0))
     windows, up = table_of(truth, 12, np.random.default_rng(2), n_windows=20)
     regression, state = begin(windows, up)
@@ -204,7 +204,7 @@ def test_the_prior_sd_of_a_slope_stays_below_the_steepest_plausible_slope():
 def test_errors_of_fitted_parameters_in_claimed_sd_have_an_rms_near_1(noisy):
     regression, chosen, truth = noisy
     errors = truth.errors(regression, chosen.posterior)
-    # Weights that the fit pruned have no sd and no entry here.
+    # Weights that the fit pruned have no sd and are not in `errors`.
     every = np.concatenate([*errors.values()])
     # The RMS of 30 values of error / sd is uncertain by 13 %; estimated prior sd lower the RMS.
     assert len(every) > 20
@@ -384,7 +384,7 @@ def test_thermal_tilts_of_supports_are_separated_from_the_drift_of_the_unit():
 
 
 def test_the_estimated_tilt_of_a_stiff_support_is_below_the_noise(calm):
-    # A mean over 60 windows with a noise of 2 ug each does not show a smaller tilt.
+    # A tilt below the noise of a mean over 60 windows (2 ug / sqrt(60)) cannot be measured.
     _, chosen, truth = calm
     hidden = truth.sigma[0] / np.sqrt(60.0)
     tilt = GRAVITY * chosen.posterior.state.tilt

@@ -70,7 +70,7 @@ class TestOutliers:
     @pytest.mark.parametrize('n', [10, pytest.param(40, marks=pytest.mark.slow)])
     def test_fewer_than_a_fifth_of_fleets_without_outliers_give_a_false_alarm(self, n, rng):
         n_alarms = sum(bool(summarise(fleet_of(n, rng)).outliers) for _ in range(60))
-        # With a rate of 5 %, 60 fleets give 3 false alarms on average, and 12 with p < 1e-4.
+        # At a rate of 5 %, 60 fleets give 3 false alarms on average, and 12 or more with p < 1e-4.
         assert n_alarms < 12
 
     def test_no_outlier_is_reported_in_a_fleet_of_six(self, rng):

@@ -162,7 +162,7 @@ def test_the_predicted_sd_agrees_with_hand_numbers():
     assert bias[:, 0] == pytest.approx(np.hypot(expected, 3e-5), rel=1e-6)
     assert bias[:, 1] == pytest.approx([3e-5, 3e-5])
     assert scale[:, 0] == pytest.approx([1e-6, 1e-6], rel=1e-6)
-    # In an endless ramp of 0.6 K/min a lag of 600 s is 6 K.
+    # In an endless ramp of 0.6 K/min a part with a lag of 600 s is 6 K behind the board.
     bias, scale = sd_of_states(unit, ramp_states(unit, np.array([25.0]), 0.01, np.inf))
     assert bias[0, 0] == pytest.approx(np.sqrt(9e-4 + 36e-6) / 300.0, rel=1e-6)
     assert scale[0, 0] == pytest.approx(2e-6, rel=1e-6)
@@ -176,7 +176,7 @@ def test_parameters_without_variance_give_no_sd():
 
 
 def test_the_bias_in_a_soak_includes_the_gradient_by_self_heating():
-    # WHY: the bias in the certificate lacked the gradient in a soak: 50 ug for 3 K and 16 ug/K.
+    # WHY: the certified bias lacked the effect of a soak's gradient: 50 ug for 3 K and 16 ug/K.
     unit = calibration(
         response=(
             term('gradient', (30.0, 0.0, 0.0), scale=(0.0, 2e-5, 0.0)),
@@ -200,7 +200,7 @@ def test_the_bias_in_a_soak_includes_the_gradient_by_self_heating():
 
 @pytest.mark.parametrize('rate', [0.01, -0.02])
 def test_ramp_states_equal_those_of_the_memory_of_the_fit(rate):
-    # Expected: state of the memory of the fit after readings of a soak and a ramp.
+    # Expected: the fit's states of lags and plays after readings of a soak and a ramp.
     unit = replace(rich_calibration(), board_lag_s=100.0)
     spec = Correction(unit).memory
     first = StateLayout(spec).width - 2 * len(spec.lags) - len(spec.plays)
@@ -217,7 +217,7 @@ def test_ramp_states_equal_those_of_the_memory_of_the_fit(rate):
             # The gradient rises within 1 s in the memory, and in a step in `ramp_states`.
             assert state[place] == pytest.approx(lived[place - first], rel=2e-3), quantity
         elif isinstance(quantity, Play) and not quantity.tau_s:
-            # Plays on lags are left out: a lag needs half an hour to change by their half-width.
+            # Skip plays of lags: a lag takes half an hour to change by the half-width of a play.
             assert state[place] == pytest.approx(-quantity.width_k * np.sign(rate))
             assert state[place] == pytest.approx(lived[place - first])
 

@@ -31,8 +31,8 @@ from thermo_comp.unit.rate_bias import MILLIDEGREE, RateCurve
 
 OPTIONS = FitOptions(gravity=STANDARD_GRAVITY, input='m/s^2')
 START_NS = 1_767_225_600_000_000_000
-#: White noise of a mean over 60 s of the simulated gyroscope [rad/s].
 RATE_HZ, MINUTE = 1.0, 60
+#: White noise of a mean over 60 s of the simulated gyroscope [rad/s].
 FLOOR = 5.0 * MILLIDEGREE / np.sqrt(60.0)
 
 
@@ -67,9 +67,9 @@ def unit():
 
 @pytest.fixture(scope='module')
 def fitted(unit):
-    """Fit a MEMS unit in nine positions; several columns together make its gyroscope's drift."""
+    """Fit a MEMS unit in nine positions; its gyroscope's drift is the sum of several effects."""
     records = arrays(unit, plan('chamber-9', 2), 2, rate_hz=RATE_HZ)
-    # These groups have half of all columns, so the fit takes half the time.
+    # These groups of columns are half of the model, which halves the time of the fit.
     options = replace(OPTIONS, groups=('curve', 'gradient', 'board', 'gradient_lag', 'product'))
     return fit([source_of(record, unit.scale_factor) for record in records], options)
 
@@ -98,12 +98,12 @@ def test_the_corrected_rate_of_a_mems_gyroscope_has_only_noise(unit, fitted, hel
     assert rms(raw - raw.mean(axis=0)) > 100.0 * FLOOR
     assert rms(changes) < 1.15 * FLOOR
     assert (np.sqrt(np.mean(changes**2, axis=0)) < 1.3 * FLOOR).all()
-    # The variance of a mean rate is the claimed variance plus 1/3 of the Earth's rate squared.
+    # Expected variance: the claimed one without sample noise, plus (Earth's rate)^2 / 3 per axis.
     message = gyroscope.noise_density_rad_s_sqrt_hz[0] ** 2 / calibration.unit.cycle_time_s
     claimed = np.sqrt(out.angular_rate_variance.mean(axis=0) - message + EARTH_RATE**2 / 3.0)
     assert (np.abs(means.mean(axis=0)) < 3.0 * claimed).all()
     np.testing.assert_allclose(gyroscope.noise_density_rad_s_sqrt_hz, 5.0 * MILLIDEGREE, rtol=0.05)
-    # The residual sd is the sd of turn-ons, 2 mdeg/s, estimated from nine positions.
+    # From nine positions the residual sd estimates the sd of turn-on offsets, 2 mdeg/s.
     assert np.mean(gyroscope.residual_sd_rad_s) == pytest.approx(2.0 * MILLIDEGREE, rel=0.4)
 
 
@@ -132,7 +132,7 @@ def test_a_gyroscope_does_not_change_the_accelerometer_s_fit(unit):
         with_rate.calibration, gyroscope=None, provenance=without.calibration.provenance
     )
     assert same == without.calibration
-    # A bag with NaN rates at rest counts as a bag without rates.
+    # A bag with NaN angular rates at rest counts as a bag without angular rates.
     broken = [np.array(record.angular_rate) for record in records]
     broken[0][len(broken[0]) // 2 :] = np.nan
     sources = [
@@ -166,13 +166,13 @@ def test_a_gyroscope_is_read_back_from_a_file_bit_for_bit():
     triad = rate_triad(whole)
     assert gyroscope_of(triad) == whole.gyroscope
     assert triad.gyroscope is None
-    # The scale of a gyroscope is 1, without uncertainty.
+    # The scale factor of a gyroscope is taken as 1, without uncertainty.
     states = ramp_states(triad, np.array([10.0, 20.0, 30.0]))
     bias, scale = bias_and_scale(triad, states)
     np.testing.assert_array_equal(scale, 1.0)
     sd_bias, sd_scale = sd_of_states(triad, states[1:2])
     np.testing.assert_array_equal(sd_scale, 0.0)
-    # At the reference temperature the bias is the level, with the variance of level and turn-on.
+    # At 20 degC the bias is its level; its variance is the sum of those of level and turn-on.
     np.testing.assert_allclose(bias[1], (0.02 + 1e-5, -0.03, 0.01 + 1e-5))
     np.testing.assert_allclose(
         sd_bias[0], np.hypot((1e-5, 2e-5, 1e-5), np.sqrt(1.01e-10)), rtol=1e-5
@@ -208,7 +208,7 @@ def test_the_message_on_a_wrong_gyroscope_names_the_key():
 
 
 def test_the_rate_at_the_reference_temperature_is_corrected_by_its_bias():
-    # At the reference temperature only the constant bias of the rate is corrected, not the force.
+    # The gyroscope's calibration subtracts a constant bias of the rate and does not change forces.
     triad = replace(rich_calibration().gyroscope, response=(), posterior=None)
     for gyroscope in (triad, None):
         compensator = Compensator(replace(calibration(), gyroscope=gyroscope))
@@ -221,11 +221,11 @@ def test_the_rate_at_the_reference_temperature_is_corrected_by_its_bias():
     assert compensator.process(0, 300.0, 600.0, 2900.0) is not None
     x, y, z, *variances = compensator.correct_rate(0, 1.0, 1.0, 1.0)
     assert (x, y, z) == pytest.approx((0.98 - 1e-5, 1.03, 0.99 - 1e-5), abs=1e-12)
-    # In an unknown regime the variance is the sum of noise, residual and difference of the sets.
+    # In an unknown regime noise, residual and the regimes' bias difference add to the variance.
     least = np.square((1e-4, 2e-4, 1e-4)) / 0.01 + np.square((1e-5, 2e-5, 1e-5))
     assert (np.array(variances) >= least).all()
     assert variances == pytest.approx(least, rel=0.05)
-    # The bias sd for an INS does not contain the noise of a message.
+    # The bias sd for an INS does not contain the noise of a single sample.
     sd = compensator.status().rate_bias_sd
     noise = np.square((1e-4, 2e-4, 1e-4)) / 0.01
     np.testing.assert_allclose(np.square(sd), variances - noise, rtol=1e-6)

@@ -104,7 +104,7 @@ def test_a_move_between_two_parts_of_a_recording_gives_two_rests(rng):
 
 def test_recordings_that_are_not_parts_of_one_are_not_joined(rng):
     whole = recorded(rng, 400.0)
-    # In a pause of 50 s the unit may have been turned; in a longer pause, switched off and on.
+    # After a pause of up to 60 s parts are joined; in a longer one the unit may have restarted.
     for pause_s, n in ((1.0, 1), (50.0, 1), (61.0, 2)):
         assert len(joined(reduced(cut(whole, (200.0,), pause_s=pause_s)))) == n
     known = KnownForce('part', parse_sections('0 400 2.0'))
@@ -156,7 +156,7 @@ def test_a_split_recording_gives_the_calibration_of_the_whole_recording():
         }
         part = replace(bag, time_s=bag.time_s[inside[0]], counts=bag.counts[inside[0]])
         parts.append(replace(part, temperatures=readings, name=f'{begin_s:g} s'))
-    # A fit of these two groups takes 1/5 of the time of a choice among all groups.
+    # A fit of these two groups of columns takes 1/5 of the time of a choice among all groups.
     whole, split = (
         thermo_comp.fit(bags, gravity=9.80665, groups=('curve', 'board')) for bags in (bag, parts)
     )

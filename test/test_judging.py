@@ -56,7 +56,7 @@ def resting(
     counts[:, 2] = K * GRAVITY + SLOPE * (celsius - 20.0) + error
     counts += noise * rng.standard_normal((n, 3))
     counts[:, ['xyz'.index(axis) for axis in dead]] = 0.0
-    # Samples with long repetitions of one value are rejected as those of a broken sensor.
+    # Alternate x by 1e-9 counts, because an axis that repeats one value counts as broken.
     counts[::2, 0] += 1e-9
     if shaken_s:
         shaken = (seconds >= shaken_s[0]) & (seconds < shaken_s[1])
@@ -73,7 +73,7 @@ def resting(
 
 
 def corrected_by(slope, claim=0.0, **changes):
-    """Make a calibration with a bias slope of z [counts/K] and a claimed sd [m/s^2]."""
+    """Make a calibration with a temperature slope of z [counts/K] and a claimed sd [m/s^2]."""
     parts = {name: axis_set(residual_sd_m_s2=claim) for name in 'xy'}
     part = regime_set(**parts, z=axis_set((0.0, slope), residual_sd_m_s2=claim))
     return dataclasses.replace(calibration(static=part, dynamic=part), **changes)
@@ -105,7 +105,7 @@ CLAIMING = corrected_by(SLOPE, 1e-5)
 class TestWindows:
     @pytest.mark.parametrize('reading_s', [30, 50])
     def test_readings_every_30_or_50_s_remove_no_window(self, tmp_path, reading_s):
-        # WHY: at 2 Hz windows were lost, because the time between readings was taken for a jump.
+        # WHY: at 2 Hz windows were lost: the time between temperature readings counted as a jump.
         bag = resting(tmp_path / 'bag', 30.0, minutes=30.0, rate_hz=2.0, reading_s=reading_s)
         windows = judged(bag, corrected_by(SLOPE)).windows
         assert len(windows) >= 28
@@ -143,7 +143,7 @@ class TestWindows:
     @pytest.mark.parametrize('rate_hz', [0.5, 1.0, 3.0, 4.0, 50.0])
     @pytest.mark.parametrize('window_s', [60.0, 120.0])
     def test_windows_at_rest_have_the_stated_length(self, tmp_path, rate_hz, window_s):
-        # WHY: at 4 Hz a cell of 32 samples lasts 8 s, so windows of 10 s became 16 s long.
+        # WHY: at 4 Hz windows consisted of cells of 32 samples, 8 s, so those of 10 s became 16 s.
         bag = resting(tmp_path / 'bag', 20.0, minutes=20.5, rate_hz=rate_hz, noise=0.3)
         windows = judged(bag, calibration(), window_s=window_s).windows
         assert windows.window_s == window_s
@@ -231,7 +231,7 @@ class TestVerdict:
             (121.0, 1000.0, 60.0, 'recalibrate'),
             (1100.0, 9000.0, 1500.0, 'valid, but it only claims 1.5 mg'),
             (50.0, 100.0, 60.0, 'valid, but it only claims 60 ug'),
-            # A residual not below the raw one is never valid, even with a large claimed sd.
+            # If the residual is not below the raw one, even a large claimed sd gives no 'valid'.
             (1100.0, 1000.0, 1500.0, 'no better than raw'),
             (1000.0, 1000.0, 1500.0, 'no better than raw'),
         ],
@@ -248,8 +248,8 @@ class TestVerdict:
     @pytest.mark.parametrize(
         ('residual', 'raw', 'claimed', 'verdict'),
         [
-            (90.0, 1000.0, 10.0, 'valid'),  # above the claimed sd, below the tolerance of 100 ug
-            (110.0, 1000.0, 200.0, 'recalibrate'),  # below the claimed sd, above the tolerance
+            (90.0, 1000.0, 10.0, 'valid'),  # residual > claimed sd, < tolerance of 100 ug
+            (110.0, 1000.0, 200.0, 'recalibrate'),  # residual < claimed sd, > tolerance
             (90.0, 1000.0, 200.0, 'valid, but it only claims 200 ug'),
             (90.0, 80.0, 60.0, 'no better than raw'),
         ],
@@ -260,7 +260,7 @@ class TestVerdict:
         assert 'limit 100 ug' in judgement.reason
 
     def test_the_verdict_on_bags_of_the_fit_states_the_left_out_error_first(self):
-        # WHY: the verdict stated |f| - g in fitted attitudes, 61 ug, not 1091 ug in new attitudes.
+        # WHY: the verdict stated the error in fitted attitudes, 61 ug; in new ones it is 1091 ug.
         fitted = ResidualSummary('all', 40, 1e-3, 5e-4, 1e-3, left_out_rms_m_s2=300.0 * MICRO_G)
         unit = dataclasses.replace(CLAIMING, provenance=Provenance(residuals=(fitted,)))
         windows = made(50.0, 1000.0, 60.0)
@@ -288,7 +288,7 @@ class TestVerdict:
             assert judgement.left_out_rms == pytest.approx(expected, nan_ok=True)
 
     def test_a_calibration_without_covariance_gets_the_verdict_no_claim(self):
-        # WHY: without a covariance only noise was claimed, so the verdict was 'recalibrate'.
+        # WHY: without a covariance the claimed sd is that of noise alone: it gave 'recalibrate'.
         imported = corrected_by(SLOPE)
         windows = made(50.0, 1000.0, 2.0)
         judgement = judge(windows, imported)

@@ -15,7 +15,7 @@ FILES = sorted((ROOT / 'launch').glob('*.launch.xml'))
 OURS = ROOT / 'launch' / 'thermo_comp.launch.xml'
 BESIDE = ROOT / 'launch' / 'beside_ins.launch.xml'
 
-# Parameters of nodes of other packages in ROS Jazzy. A misspelt parameter would have no effect.
+# Parameters of nodes of other packages in ROS Jazzy; ROS ignores misspelt parameters silently.
 OTHERS = {
     ('tf2_ros', 'static_transform_publisher'): set(),
     ('imu_filter_madgwick', 'imu_filter_madgwick_node'): {
@@ -60,7 +60,7 @@ class TestEveryFile:
 
 
 def parameters_set(arguments):
-    """Return the parameters that thermo_comp.launch.xml sets for these arguments."""
+    """Return the parameters that thermo_comp.launch.xml sets for the given arguments."""
     given = {arg.get('name', ''): arg.get('default', '') for arg in parse(OURS).findall('arg')}
     given |= arguments
 
@@ -83,7 +83,7 @@ def test_each_driver_of_the_launch_file_has_a_topics_file():
 
 def test_a_parameter_is_set_only_where_its_argument_was_given(tmp_path):
     # WHY: defaults of launch arguments replaced values in the user's parameter file.
-    pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+    pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
     import rclpy
     import yaml
     from builders import calibration
@@ -121,7 +121,7 @@ def test_a_parameter_is_set_only_where_its_argument_was_given(tmp_path):
 
 
 def test_executable_parameters_and_topics_of_a_launch_file_exist():
-    pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+    pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
     from dataclasses import fields
 
     from thermo_comp.ros.parameters import NodeConfig
@@ -142,7 +142,7 @@ def test_executable_parameters_and_topics_of_a_launch_file_exist():
     defaults = {arg.get('name'): arg.get('default') for arg in parse(OURS).findall('arg')}
     for remap in node.findall('remap'):
         topic = remap.get('from')
-        # The topic of a thermometer is temperature/ and its name.
+        # The topic of a thermometer is temperature/NAME.
         assert topic in topics or topic.startswith('temperature/'), topic
         argument = re.fullmatch(r'\$\(var (\w+)\)', remap.get('to', ''))
         assert defaults[argument[1]] == topic

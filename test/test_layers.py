@@ -61,7 +61,7 @@ HOMES = {
 PURE = {'thermal', 'unit', 'online', 'simulation', 'fitting', 'field'}
 CLOCKS = {'time', 'datetime', 'sched', 'threading', 'asyncio'}
 CLOCK_EXCEPTIONS = {
-    'fitting/assembly.py'  # dates a fit in the provenance of the calibration
+    'fitting/assembly.py'  # writes the date of a fit into the provenance
 }
 
 SOURCES = sorted(PACKAGE.rglob('*.py'))

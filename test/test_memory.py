@@ -39,7 +39,7 @@ def test_a_value_with_the_last_stamp_replaces_the_last_value():
 def test_the_variance_of_a_lag_after_a_gap_agrees_with_the_formula():
     bank = LagBank((100.0, 1000.0))
     bank.step(0, 0.0)
-    # A gap of 50 s adds variance to the lag of 100 s, as it exceeds 1/10 of the time constant.
+    # A gap of 50 s adds variance to a lag if it exceeds tau / 10: for tau = 100 s, not for 1000 s.
     bank.step(50 * SECOND_NS, 2.0)
     lost = 2.0 * (1.0 - math.exp(-0.5))
     assert bank.extra == pytest.approx([lost**2, 0.0])
@@ -60,7 +60,7 @@ TWO_STAGES = Lag('board', 900.0, 150.0)
 
 
 def after_two_stages(times, board):
-    """Integrate two lags in series after the board, from rest; return the second temperature."""
+    """Integrate two lags in series, from rest, with the board as input; return the output."""
 
     def slope(t, parts):
         u = np.interp(t, times, board)
@@ -117,7 +117,7 @@ def test_the_lag_of_a_part_coupled_to_board_and_case_agrees_with_a_solver(rng):
     # The case's lag contributes to the part's lag with a negative sign.
     P = start_covariance(spec.lags)
     assert P[0, 1] < 0.0 < P[0, 0] + 2.0 * P[0, 1] + P[1, 1]
-    # A lag with two inputs begins with the first value of the second input.
+    # The age of a lag with two inputs counts from the first value of the later input.
     late = ThermalMemory(spec)
     late.board_step(0, 20.0)
     late.banks['case'].step(600 * SECOND_NS, 1.0)
@@ -166,7 +166,7 @@ def test_the_prior_of_the_initial_state_of_two_stages_is_that_of_a_random_walk(r
         parts[:, 0] *= math.exp(-step / tau[0])
         parts[:, 1] += (parts[:, 0] - parts[:, 1]) * -math.expm1(-step / tau[1])
     P = start_covariance([TWO_STAGES])
-    # The variance of n draws is uncertain by sqrt(2 / n) = 2.2 %; steps are 4 % of 150 s.
+    # The variance of n draws is uncertain by sqrt(2 / n) = 2.2 %; the step is 4 % of tau, 150 s.
     assert np.mean(parts[:, 1] ** 2) == pytest.approx(P[0, 0], rel=0.11)
     for age in (150.0, 900.0, 2700.0):
         first = parts[:, 0] * math.exp(-age / tau[0])
@@ -221,7 +221,7 @@ def test_the_prior_covariance_of_initial_lag_states_agrees_with_the_formula():
 
 
 def test_the_prior_of_initial_lag_states_is_their_covariance_after_a_random_walk(rng):
-    # After a long random walk of the board temperature the lags have this covariance.
+    # `start_covariance` is the covariance of lags after a long random walk of the board.
     D = 0.005
     tau = np.array([60.0, 240.0, 960.0])
     n, step = 4000, 6.0
@@ -231,7 +231,7 @@ def test_the_prior_of_initial_lag_states_is_their_covariance_after_a_random_walk
         e = np.exp(-step / tau)
         m = m * e + walk * (tau / step) * (1.0 - e)
     P = start_covariance([('board', t) for t in tau])
-    # The variance of n draws is uncertain by sqrt(2 / n) = 2.2 %; steps are 10 % of 60 s.
+    # The variance of n draws is uncertain by sqrt(2 / n) = 2.2 %; the step is 10 % of tau, 60 s.
     np.testing.assert_allclose(m.T @ m / n, P, rtol=0.11)
 
 

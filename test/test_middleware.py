@@ -14,7 +14,7 @@ from subprocess import PIPE
 
 import pytest
 
-pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
 
 from builders import calibration
 from live_node import lossless
@@ -149,7 +149,7 @@ def test_samples_lost_by_dds_are_repeated(peer, node_arguments, monkeypatch):
         print((last - 1) * CYCLE_NS, file=receiver.stdin, flush=True)
         assert receiver.stdout.readline() == 'ready\n'
         reliable, best_effort = json.loads(receiver.stdout.readline())
-    # The reliable subscription received all samples in order; the other subscription lost some.
+    # The reliable subscription received all samples in order; the best-effort one lost some.
     assert reliable[-1000:] == [k * CYCLE_NS for k in range(first, last)]
     assert len(set(best_effort) & set(reliable[-1000:])) < 1000
 

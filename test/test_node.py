@@ -10,7 +10,7 @@ import pytest
 import yaml
 from conftest import ROOT
 
-pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
 
 from builders import calibration, rich_calibration, thermal_calibration
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -54,7 +54,7 @@ def saved(tmp_path):
 
 
 def diagnosis(peer):
-    """Return a function that waits for diagnostics with a condition on status and values."""
+    """Return a function that waits for diagnostics whose status and values meet a condition."""
     heard = peer.listen(DiagnosticArray, '/diagnostics')
 
     def wait(condition):
@@ -216,7 +216,7 @@ def test_diagnostics_contain_noise_density_and_bias_sd(peer, saved):
             assert sd >= 0.99 * math.sqrt(covariance[level, level])
             of_rate = float(values[f'noise density of rate {axis} [rad/s/sqrt(Hz)]'])
             assert of_rate == unit.gyroscope.noise_density_rad_s_sqrt_hz['xyz'.index(axis)]
-            # In an unknown regime the bias sd contains the difference of both sets, 30 urad/s.
+            # In an unknown regime the bias sd contains the regimes' bias difference, 30 urad/s.
             assert 1e-5 < float(values[f'bias sd of rate {axis} [rad/s]']) < 1e-3
 
 
@@ -274,7 +274,7 @@ def test_a_node_with_constants_needs_no_thermometer(peer, saved):
         _, status, values = wait(lambda _, values: values['samples out'] == '20')
         # The report may arrive before the last samples, which are on a different topic.
         peer.wait_for(lambda: len(heard) == 20)
-    # The samples are sent without pauses, so the report may contain a warning of their rate.
+    # The samples are sent without pauses, so the report may warn of a wrong sample rate.
     assert 'not corrected for temperature' in status.message or 'samples/s' in status.message
     assert status.level != DiagnosticStatus.ERROR
     assert (values['board age [s]'], values['board temperature sd [K]']) == ('inf', '10.0000')
@@ -315,7 +315,7 @@ def test_the_node_uses_the_namespace_and_remapped_topics(peer, saved):
         assert '/accel/counts' not in topics
         names = {name for name, _ in node.node.get_service_names_and_types()}
         assert '/imu0/thermo_comp/set_parameters' in names
-        # Two nodes give two diagnostic entries in the group of the aggregator's configuration.
+        # One group in the aggregator's configuration has entries of all nodes, such as /imu0's.
         _, status, _ = diagnosis(peer)(lambda *_: True)
         assert status.name == '/imu0/thermo_comp: compensation'
         config = ROOT / 'config' / 'diagnostic_aggregator.yaml'

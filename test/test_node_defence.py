@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Requests and messages of unknown peers: the node answers and publishes all samples."""
+"""The node answers any request, and publishes all samples, whatever unknown peers send."""
 
 import os
 import re
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
 
 from builders import calibration
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -84,7 +84,7 @@ def test_any_request_is_answered_and_samples_go_on(peer, unit, together):
             assert result.reason == one_line(result.reason)
             assert len(result.reason) < 10_000, message.name[:60]
         samples.go_on()
-        # With a wrong value in a request, the right values are set (or none, if set atomically).
+        # If a request has a wrong value, its right values are set (or none, if set atomically).
         good = Parameter('frame_id', value='body').to_parameter_msg()
         answer = peer.call(kind, name, kind.Request(parameters=[STRANGE[1], good]))
         config = node._config

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
 
 from builders import rich_calibration
 from live_node import through_the_node
@@ -95,7 +95,7 @@ def assert_same(live, offline):
     assert expected.imu is not None
     for name in ImuColumns._fields:
         assert getattr(out.imu, name).tobytes() == getattr(expected.imu, name).tobytes(), name
-    # There is one regime flag for each case reading, so equal flags mean equal times of switches.
+    # There is one regime flag for each case reading, so equal flags mean equal switching times.
     assert (len(flags), flags) == (len(expected_flags), expected_flags)
     assert False in flags
     assert True in flags

@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import pytest
 
-pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
 
 import rclpy
 from builders import calibration
@@ -149,7 +149,7 @@ def test_a_reload_while_samples_flow_loses_no_sample(peer, tmp_path):
 
 
 class _Stop(BaseException):
-    """The exception of `raising_at`."""
+    """The exception that `raising_at` raises."""
 
 
 def raising_at(number, call):
@@ -213,7 +213,7 @@ def test_a_change_that_fails_at_any_line_is_not_applied(tmp_path):
                 sample = START_NS + k * CYCLE_NS, *standing(k)
                 assert running.compensator.process(*sample) == undisturbed.process(*sample)
                 k += 1
-        # A change executes over 150 lines; the loop has raised an exception at each of them.
+        # Setting the parameters executes over 150 lines; each of them has raised an exception.
         assert number > 150
         assert {name: node.node.get_parameter(name).value for name in values} == {
             change.name: change.value for change in changes
@@ -249,7 +249,7 @@ def test_a_calibration_that_cannot_be_applied_changes_nothing(peer, tmp_path):
 
 
 def test_a_calibration_of_another_unit_is_named(peer, tmp_path, capfd):
-    # WHY: a calibration of another unit was used without a warning; errors were 890 claimed sd.
+    # WHY: a calibration of another unit was used unwarned; errors were 890 times the claimed sd.
     first, second = tmp_path / 'first.yaml', tmp_path / 'second.yaml'
     save_calibration(of_bias(1.0), first)
     unit = of_bias(1.0).unit

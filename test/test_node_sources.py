@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
 
 from builders import calibration
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -71,7 +71,7 @@ def test_samples_of_a_second_publisher_are_never_published(peer, unit):
         assert all(stamp_of(imu) % CYCLE_NS == 0 for imu in samples.heard)
 
 
-#: A driver process: it sends at 100 Hz as soon as it has a subscriber; frame_id is its name.
+#: A driver process: it sends at 100 Hz once it has a subscriber, with its name as frame_id.
 DRIVER = """
 import sys, time, rclpy
 from geometry_msgs.msg import Vector3Stamped
@@ -104,7 +104,7 @@ rclpy.spin(node)
 
 @contextlib.contextmanager
 def driver_process(name):
-    """Run a driver until the context ends; yield the process and its first stamp [ns]."""
+    """Run a driver until the context ends; yield the process and its first sample's stamp [ns]."""
     command, environment = [sys.executable, '-c', DRIVER, name], {**os.environ, **OVER_UDP}
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
     try:
@@ -208,11 +208,11 @@ def test_a_driver_with_incompatible_qos_or_type_is_named(peer, unit):
 
 
 def test_reports_more_frequent_than_samples_report_no_missing_samples(peer, tmp_path):
-    # WHY: with a diagnostics_period below the sample interval, reports without samples were ERROR.
+    # WHY: with a diagnostics_period below the sample interval, reports between samples were ERROR.
     from thermo_comp.unit.calibration import Unit
 
     slow = tmp_path / 'slow.yaml'
-    # Missing samples are an error after 5 cycles, 1.5 s: no busy machine delays a sample as long.
+    # An error is reported after 5 cycles without a sample, 1.5 s, which no busy machine causes.
     save_calibration(calibration(unit=Unit('T-1', 'counts', 32767.0, 0.3)), slow)
     with node_in_thread(*node_arguments(slow, 'diagnostics_period:=0.01')) as node:
         heard = peer.listen(DiagnosticArray, '/diagnostics')

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from conftest import ran
 
-pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
 
 from builders import calibration
 from node_process import NodeProcess

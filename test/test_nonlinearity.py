@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The correction of nonlinear axes agrees with closed formulas, in blocks and one by one."""
+"""The correction of nonlinear axes agrees with closed formulas, for blocks and single samples."""
 
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ def term(kind, x, y, z, slope=0.0):
 
 
 def test_a_nonlinear_term_that_depends_on_temperature_needs_a_thermometer():
-    # WHY: with constant bias and scale, such terms were applied without a board temperature.
+    # WHY: if bias and scale were constant, terms with a slope needed no board temperature.
     for slope in (0.0, 1e-7):
         square = NonlinearTerm('square', (1e-5,) * 3, (0.0, 0.0, slope), 1e-4)
         value = calibration(nonlinearity=Nonlinearity((0.0, 20.0), 1e-5, (square,)))
@@ -50,7 +50,7 @@ def with_covariance(unit, rng, size=1e-5):
     return replace(unit, posterior=posterior_of(root @ root.T + size**2 * np.eye(n)))
 
 
-# The error of one Halley step at 10 g is 1e-14 g for 100 ug/g^2, 1e-9 g for 1 mg/g^2.
+# The error of one Halley step at 10 g is 1e-14 g for a K2 of 100 ug/g^2, 1e-9 g for 1 mg/g^2.
 @pytest.mark.parametrize(('k2', 'tolerance'), [(1e-5, 1e-12), (-1e-4, 1e-12), (1e-3, 3e-9)])
 def test_the_inverse_of_a_square_is_the_root_of_a_quadratic(k2, tolerance):
     x = np.linspace(-10.0, 10.0, 41)
@@ -166,5 +166,5 @@ def test_rests_in_the_field_depend_on_every_nonlinear_coefficient():
             unit, scale, values + step * (np.arange(len(values)) == k), covariance
         )
         slope = (series.residual - series_of(logged, moved).residual) / step
-        # The derivatives neglect the slope of the nonlinear terms, relative 2 * K2 * 1 g.
+        # The derivatives neglect the slope of nonlinear terms, a relative error of 2 * K2 * 1 g.
         assert np.allclose(slope, series.by_parameter[:, k], atol=1e-3 * abs(slope).max() + 1e-7)

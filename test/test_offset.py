@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fits to unsigned and to signed words differ by the offset in the bias only."""
+"""Fits to unsigned and to signed integer samples differ only in the bias, by the offset."""
 
 from dataclasses import replace
 
@@ -70,7 +70,7 @@ def test_constants_of_unsigned_words_equal_those_of_signed_words(words, plain, o
 
 
 def test_a_bag_per_position_needs_no_other_bag_for_the_offset(rng):
-    # Only readings above 32767 show that 16-bit words are unsigned, and not all bags have some.
+    # Only readings above 32767 show that 16-bit words are unsigned, and some bags have none.
     ups = positions(10, 3)
     ups[0] = -np.full(3, 3.0**-0.5)
     bags = [source(words_of([up], rng) + 32768.0, f'bag{k}') for k, up in enumerate(ups)]

@@ -83,7 +83,7 @@ def test_no_source_file_exceeds_the_limit_of_lines():
 
 
 def test_the_manifest_lists_only_dependencies_of_the_node():
-    # The further dependencies of the commands come from PyPI.
+    # Commands have further dependencies, which come from PyPI.
     keys = {node.text for node in MANIFEST.iter('exec_depend')}
     assert {key for key in keys if key and key.startswith('python3-')} == {
         'python3-numpy',
@@ -121,7 +121,7 @@ def test_the_installed_share_folder_contains_the_files_that_ros_needs(tmp_path):
 
 
 SOURCES = [str(ROOT / name) for name in ('thermo_comp', 'test', 'setup.py')]
-#: As in setup.cfg: the summary of a docstring is on its second line and may have two lines.
+#: Rules not checked, as in setup.cfg: a summary is on the second line and may have two lines.
 STYLE = ['D200', 'D205', 'D400', 'D403']
 
 

@@ -54,7 +54,7 @@ def test_a_part_contains_exactly_the_messages_inside(bag, begin, end, n_messages
     got = np.concatenate([b.temperatures['board'].celsius for b in blocks])
     np.testing.assert_array_equal(got, board.celsius[own])
     assert since == (begin or 0.0)
-    # Each reading in the part applies from the same sample on as in the whole bag.
+    # Each temperature in the part applies from the same sample on as in the whole bag.
     after = [np.sum(inside[:n]) for n in board.after[own]]
     begins = np.cumsum([0, *map(len, blocks)])
     places = [b.temperatures['board'].after + n for b, n in zip(blocks, begins, strict=False)]

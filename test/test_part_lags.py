@@ -48,7 +48,7 @@ SOAKS = tuple(program(celsius, 25.0) for celsius in (8.0, 19.0, 34.0))
 
 
 def study_of(*name, up=9, corners=HALF, held=HELD, grade=navigation, **given):
-    """Record bags of a fit in `up` (directions, or their number), and held-out bags, of a unit."""
+    """Simulate bags of a unit: for a fit, in directions `up` (or their number), and held-out."""
     rng = rng_of(*name)
     unit = grade(rng, **given)
     is_mems = grade is not navigation
@@ -79,7 +79,7 @@ def parts(tmp_path_factory, cli, equal_fits_once):
 
 @cache
 def soaked(grade):
-    """Fit a unit to soaks in 18 positions; return its errors in held-out ramps, too."""
+    """Fit a unit to soaks in 18 positions; return unit, bags and errors in held-out ramps."""
     unit, study = study_of('rests', 0, up=18, corners=SOAKS, grade=grade)
     return unit, study, judged(strangers.fitted(study), study)
 
@@ -102,7 +102,7 @@ def judged(calibration, study):
 
 def test_the_fitted_lag_of_each_axis_is_that_of_its_part(parts):
     unit, study, calibration, _ = parts
-    # A part with 10 ug/K lags by 10 K in a ramp: 1 % of its time constant is a bias of 1 ug.
+    # A part of 10 ug/K lags a ramp by 10 K, so an error of 1 % of its time constant is 1 ug.
     assert np.array(taus_of(calibration)) == pytest.approx(unit.part_s[:, None], rel=0.01)
     # The noise of |f| in a mean over 60 s is 0.65 ug.
     assert judged(calibration, study).norm < 2.0
@@ -136,7 +136,7 @@ def test_lags_of_the_thermometers_themselves_are_fitted(sensors):
     parts = {term.part for term in calibration.response if term.kind == 'board'}
     taus, _, shares, leads = np.array(sorted(parts)).T
     if 'case' in sensors:
-        # A lag of both thermometers acts like equal shares of (case - board) in all part inputs.
+        # A lag of both thermometers acts like equal shares of (case - board) in all parts' inputs.
         assert shares == pytest.approx([np.mean(shares)] * 3, abs=0.02)
     else:
         assert taus == pytest.approx(unit.part_s, rel=0.02)
@@ -152,7 +152,7 @@ def test_with_a_coarse_or_noisy_thermometer_the_fit_is_as_good_as_a_cubic_by_sci
     bags = [minutes(bag) for bag in study.tests['']]
     correct = strangers.scipy_baselines(study)['cubic']
     by_cubic = strangers.error_of([correct(bag) for bag in bags], bags, is_drift=False)
-    # For a single unit the ratio of the two errors scatters by some 20 %.
+    # For a single unit the ratio of fit error to cubic's error scatters by some 20 %.
     assert ours.vector < 1.2 * by_cubic.vector
     assert ours.ratio < 1.5
 
@@ -231,10 +231,10 @@ def test_the_lags_of_parts_are_found_beside_an_effect_of_the_gradient():
 def test_a_bump_of_the_bias_over_temperature_is_fitted_by_knees():
     # The bump lasts for two means over 60 s, and must not be taken for motion.
     _, study = study_of('bump', bump=np.array([450.0, -400.0, 500.0]), bump_c=17.0)
-    # A fit of all groups chooses these three groups, too, but takes three times as long.
+    # A fit of all groups of columns chooses these three, too, but takes three times as long.
     calibration = strangers.fitted(study, groups=('curve', 'part', 'bend'))
     judgement = judged(calibration, study)
-    # The bump is a bell with an sd of 0.85 K; the fit has straight lines between knees of 0.5 K.
+    # The bump is a bell with an sd of 0.85 K; the fit has straight lines of 0.5 K.
     assert judgement.norm < 60.0
     assert judgement.norm_ratio < 1.5
 
@@ -253,7 +253,7 @@ def test_two_lags_in_series_are_fitted_as_two_stages():
     for record in (*records, *tests):
         for name in ('board', 'case', 'board_stamp_ns', 'case_stamp_ns'):
             setattr(record, name, getattr(record, name)[::10])
-    # A fit with only the groups of the simulated unit takes half the time.
+    # A fit with only the groups of columns that the simulated unit needs takes half the time.
     groups = ('curve', 'board', 'part', 'product', 'square')
     result = fit_and_correct(records, tests, full_scale=FULL_SCALE['full_scale'], groups=groups)
     least, _ = second_simulator.floor_of(tests)
@@ -272,19 +272,19 @@ def test_two_lags_in_series_are_fitted_as_two_stages():
 @pytest.mark.slow
 @pytest.mark.parametrize('grade', [consumer_grade, navigation])
 def test_norms_of_soaks_determine_the_curve_over_temperature(grade):
-    # Within a soak the board drifts by 0.01 K; from soak to soak, over 26 K, |f| changes by mg.
+    # Within a soak the board drifts by 0.01 K; over the soaks' 26 K |f| changes by some mg.
     _, study, score = soaked(grade)
     means = [minutes(bag) for bag in study.tests['']]
     forces = [strangers.scipy_baselines(study)['constants'](mean) for mean in means]
-    # Soaks do not determine lags, so in held-out ramps errors by the lags remain.
+    # Soaks do not determine lags, so the effect of the lags in held-out ramps remains.
     assert score.norm < 0.5 * strangers.error_of(forces, means, is_drift=False).norm
     assert score.ratio < 1.5
 
 
 @pytest.mark.slow
 def test_six_faces_in_three_soaks_determine_the_curve_at_other_temperatures():
-    # WHY: misalignments of 0.3 rad fitted the norms of six faces: the force error was 40 mg for
-    # drifts of 10 mg, and the fit divided by zero if `mounting_sd` was stated.
+    # WHY: the fit to norms of six faces had misalignments of 0.3 rad (true: 0): the force error
+    # was 40 mg for drifts of 10 mg, and the fit divided by zero if `mounting_sd` was stated.
     _, study = study_of(
         'faces in soaks', 1, up=FACES.repeat(3, axis=0), corners=SOAKS, held=program(19.0, 90.0),
         grade=lambda rng: replace(consumer_grade(rng), misalignment=np.zeros(3)),
@@ -297,8 +297,8 @@ def test_six_faces_in_three_soaks_determine_the_curve_at_other_temperatures():
 
 @pytest.mark.slow
 def test_the_claimed_sd_between_two_soaks_includes_the_undetermined_curve():
-    # WHY: two soaks do not determine powers of t. The covariance lacked these powers, and the
-    # claimed sd was 1/8 of the error.
+    # WHY: two soaks do not determine the powers of temperature. The covariance lacked these
+    # powers, and the claimed sd was 1/8 of the error.
     given = {'held': program(19.0, 90.0), 'grade': consumer_grade}
     _, study = study_of('two soaks', up=18, corners=SOAKS[::2], **given)
     assert judged(strangers.fitted(study), study).ratio < 2.0
@@ -306,7 +306,7 @@ def test_the_claimed_sd_between_two_soaks_includes_the_undetermined_curve():
 
 @pytest.mark.slow
 def test_the_claimed_sd_includes_a_curve_that_soaks_do_not_determine():
-    # WHY: each axis is vertical at one temperature only; force errors were 15 claimed sd.
+    # WHY: each axis is vertical at one temperature only; errors were 15 times the claimed sd.
     _, study = study_of('confounded soaks', up=np.vstack((FACES, np.eye(3))), corners=SOAKS)
     assert judged(strangers.fitted(study), study).ratio < 1.5
 
@@ -339,7 +339,7 @@ def test_a_bias_decay_after_power_on_is_not_fitted_by_a_lag():
         for way, n in ((WARM, 12), (WARM_HELD, 4))
     )
     study = Study('', fit, one_test(held), {'full_scale': 32767.0})
-    # The decay has an RMS of 0.32 mg over a bag. Its mean, an error of the constants, is smaller.
+    # The decay has an RMS of 0.32 mg over a bag. Its mean, which the constants absorb, is smaller.
     assert judged(strangers.fitted(study), study).vector < np.sqrt(2.0) * 320.0
 
 
@@ -351,7 +351,7 @@ def lags_of(calibration):
 def test_lags_of_a_unit_with_a_hidden_node_are_those_of_the_bank():
     # The bias of each axis depends on its part and on a hidden node without a thermometer.
     study = next(third_node(0))
-    # A fit of all groups chooses these six groups, too, but takes 1.5 times as long.
+    # A fit of all groups of columns chooses these six, too, but takes 1.5 times as long.
     groups = ('curve', 'part', 'board', 'gradient_lag', 'product', 'square')
     calibration = strangers.fitted(replace(study, bags=study.bags[:8]), groups=groups)
     assert lags_of(calibration) <= {*FINE_TAUS}
@@ -359,8 +359,8 @@ def test_lags_of_a_unit_with_a_hidden_node_are_those_of_the_bank():
 
 @pytest.mark.slow
 def test_a_fit_to_soaks_has_no_fitted_lag_and_no_range_of_the_gradient():
-    # Soaks do not show case less board temperature in ramps, so a later ramp with a large
-    # difference must not be reported as a loose thermometer.
+    # Soaks do not show how far case and board differ in ramps, so a large difference in a later
+    # ramp must not be reported as a loose thermometer.
     study = next(soaks(1))
     calibration = strangers.fitted(replace(study, bags=study.bags[:9]))
     assert lags_of(calibration) <= {*FINE_TAUS}

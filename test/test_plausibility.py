@@ -77,7 +77,7 @@ def test_a_wrong_first_reading_does_not_change_later_thermal_states(sensor, wron
 def test_a_fast_change_at_the_start_is_not_taken_for_a_wrong_reading(lag_s):
     tracker = tracker_of(memory=LAG)
     for second in range(0, 60, 5):
-        # A ramp of 12 K/min, or a step of the air by 40 K after a lag of 300 s.
+        # A ramp of 12 K/min, or a step of the air by 40 K that the board follows with tau = 300 s.
         changed = 40.0 * (1.0 - math.exp(-second / lag_s)) if lag_s else 0.2 * second
         tracker.read('board', second * SECOND_NS, 20.0 + changed)
     assert tracker.memory.board.start_ns == 0
@@ -227,10 +227,10 @@ def test_one_topic_given_for_both_thermometers_is_named_and_claimed(order):
     tracker = tracker_of()
     state = in_ramp(tracker, lambda board, *_: board, order)
     assert tracker.copies['case'].is_copy
-    # In a ramp of 1 K/min the case of a unit with a board lag of 900 s is 15 K before the board.
+    # In a ramp of 1 K/min the case of a unit with a board lag of 900 s is 15 K above the board.
     assert abs(state[GRADIENT]) < 0.1
     assert state[VAR_GRADIENT] ** 0.5 == pytest.approx(15.0, rel=0.2)
-    # Readings that differ from the board's end the fault.
+    # Case readings that differ from the board's end the fault.
     tracker.read('board', 300 * SECOND_NS, 25.0)
     tracker.read('case', 300 * SECOND_NS, 25.1)
     assert not tracker.copies['case'].is_copy

@@ -97,7 +97,7 @@ def test_the_order_of_parameters_equals_one_found_by_hand():
         response=(term('gradient'), term('board', tau_s=60.0)),
     )
     layout = parameter_layout(value)
-    # Bias parameters of x: static level, t, t^2; dynamic level, three knots; two weights.
+    # Bias parameters of x: static level, t, t^2; dynamic level, three knots; two response weights.
     assert layout.bias[0] == Block(0, 3, 7, 9)
     assert layout.scale[0] == Block(9, 10, 11, 13)
     assert layout.bias[1] == Block(13, 14, 15, 17)
@@ -150,7 +150,7 @@ def test_six_faces_determine_attitudes_at_the_corners_of_a_cube_least(rng):
     result = fitted(rng, FACES)
     least = result.least_known
     assert least_known(replace(result.calibration, posterior=None), FACES) is None
-    # Near a corner of the cube the variance changes little: the result may be a point next to it.
+    # Near a corner of the cube the variance changes little: the result may lie beside the corner.
     np.testing.assert_allclose(np.abs(least.up), 3.0**-0.5, atol=0.05)
     assert least.away_deg == pytest.approx(np.degrees(np.arccos(3.0**-0.5)), abs=4.0)
     # Each of three misalignment angles (prior sd of a MEMS: 0.01 rad) changes |f| by g times the

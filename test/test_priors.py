@@ -27,7 +27,7 @@ from thermo_comp.unit.prediction import in_a_soak
 
 PROGRAM = parse_cyclogram('20 5min, 33@1 15min, 8@1 15min')
 KIND = triad('products', 1)
-#: The groups of the simulated unit are a third of all columns, and take half the time to fit.
+#: The groups that the simulated unit needs are a third of all columns, and halve the fit's time.
 OPTIONS = FitOptions(STANDARD_GRAVITY, groups=('curve', 'board', 'product'))
 
 
@@ -53,7 +53,7 @@ test_of.__test__ = False
 def fitted(number):
     """
     Fit a sibling to nine of its twelve positions. Nine positions do not determine the sd of
-    mountings, so it is stated.
+    mounting offsets, so this sd is stated.
     """
     options = replace(OPTIONS, serial=f'unit-{number}', mounting_sd=1e-6 * STANDARD_GRAVITY)
     return fit([source(record) for record in test_of(number, 0, 9)], options)
@@ -118,7 +118,7 @@ def test_chance_correlations_between_parameters_of_twelve_units_are_reduced(rng)
     n = layout.n_parameters
 
     def share_left(units, k):
-        """Return the variance of parameter k given all other parameters / its variance."""
+        """Return the variance of parameter k given all others, divided by its variance."""
         deviations = (units - units.mean(axis=0)) / np.sqrt(len(units) - 1.0)
         scatter = _scatter(deviations, layout, np.ones(3))
         return 1.0 / (np.linalg.inv(scatter)[k, k] * scatter[k, k])
@@ -138,8 +138,8 @@ def test_chance_correlations_between_parameters_of_twelve_units_are_reduced(rng)
 
 @pytest.mark.slow
 def test_equal_curves_of_both_sets_stay_equal_in_a_population():
-    # WHY: in the prior the correlations between equal curves of both sets were reduced: the error
-    # of a fit to nine positions was 3.1 ug with this prior, and 0.7 ug without a prior.
+    # WHY: in the prior the correlations between equal curves of both regimes were reduced: the
+    # error of a fit to nine positions was 3.1 ug with this prior, and 0.7 ug without a prior.
     prior = population(siblings())
     covariance, layout = prior.posterior.covariance(), parameter_layout(prior)
     for block in (*layout.bias, *layout.scale):
@@ -250,7 +250,7 @@ def after(change, ups):
 def test_one_to_three_faces_of_an_unchanged_unit_keep_the_calibration(n_faces):
     # WHY: one unchanged face had increased the claimed sd of bias and scale from 0.2 to 424 ug.
     bias, bias_sd, scale, scale_sd = after(lambda counts, _: counts, np.eye(3)[:n_faces])
-    # The limit is a tenth of the usual repeatability of turn-ons, 300 ug.
+    # The limit, 30 ug, is a tenth of the usual repeatability of turn-ons, 300 ug.
     assert max(bias_sd.max(), scale_sd.max() * STANDARD_GRAVITY) < 30e-6 * STANDARD_GRAVITY
     assert np.abs(bias).max() < 2.0 * bias_sd.max()
     assert np.abs(scale).max() < 2.0 * scale_sd.max()
@@ -258,7 +258,7 @@ def test_one_to_three_faces_of_an_unchanged_unit_keep_the_calibration(n_faces):
 
 @pytest.mark.parametrize('kind', ['bias', 'scale'])
 def test_three_faces_halve_the_error_of_a_change_of_bias_or_scale(kind):
-    # WHY: an update with three faces took a change of 100 ug for mounting offsets.
+    # WHY: an update with three faces took a bias change of 100 ug for mounting offsets.
     # WHAT: in each face one count, 300 ug, is added by a change of the bias or of the scale.
     K = np.array([axis.scale_factor for axis in fitted(9).calibration.axes])
     change = np.array([1.0, -1.0, 1.0]) / (K * STANDARD_GRAVITY)

@@ -182,7 +182,7 @@ def whole_range(of):
 @example(changed(1, ('axes', 'z', 'scale_factor'), 1.0))
 @example(changed(0, ('response', 3, 'sensor_share'), 1e-12))
 def test_whatever_file_is_accepted_gives_finite_numbers_over_its_whole_range(tree):
-    # WHY: deltas of 1e300, lags of 1e-300 s or weights of 1e160 gave output that is not finite.
+    # WHY: a `delta` of 1e300, a lag of 1e-300 s or a weight of 1e160 gave infinite or NaN output.
     content = yaml.dump(dict(tree), Dumper=yaml.CSafeDumper, allow_unicode=True).encode()
     try:
         of = parse_calibration(content, 'unit.yaml')
@@ -207,7 +207,7 @@ def test_whatever_file_is_accepted_gives_finite_numbers_over_its_whole_range(tre
             assert min(rate[3:]) > 0.0
     counters = compensator.counters
     assert counters.n_unsound == 0
-    # Without an output, samples were too fast, or temperatures too old or missing.
+    # Samples have no output only if they were too fast, or temperatures too old or missing.
     assert n_sound or counters.n_too_fast or counters.n_stale or counters.n_no_temperature
     status = compensator.status()
     assert all(map(math.isfinite, status.state))

@@ -58,7 +58,7 @@ def test_fits_of_handheld_units_agree_with_a_least_squares_solution_by_scipy(uni
     direct = least_squares(residual, [0, 0, 0, 1, 1, 1, 0, 0, 0], x_scale='jac').x
     calibration = unit.calibration
     axes = calibration.axes
-    # The fit weights positions by their length, the solution by scipy does not.
+    # The fit weights positions by their duration, the solution by scipy does not.
     np.testing.assert_allclose([axis.bias for axis in axes], direct[:3], atol=1.0 * MG)
     np.testing.assert_allclose([axis.scale_factor for axis in axes], direct[3:6], atol=1e-3)
     M = np.array(calibration.misalignment)
@@ -156,7 +156,7 @@ def test_the_gyroscope_error_of_the_freezer_run_in_215_s_held_out(real_data, wor
     assert section.raw_rms > 1.7 * floor
     assert section.rms < 1.3 * floor
     assert 0.3 < section.ratio < 2.0
-    # The data sheet of the MPU-6050 has 5 mdeg/s/sqrt(Hz); the density of samples at 12.7 Hz
+    # The data sheet of the MPU-6050 states 5 mdeg/s/sqrt(Hz); the density of samples at 12.7 Hz
     # without an anti-aliasing filter is larger than that.
     assert 30.0 < np.degrees(density) * 1e3 < 45.0
 

@@ -239,7 +239,7 @@ class Recording:
 
 @pytest.fixture
 def play():
-    pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+    pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
     from thermo_comp.ros.player import play
 
     return play

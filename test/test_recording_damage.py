@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A truncated bag is read up to its last complete message; a corrupt bag gives one message."""
+"""Truncated bags are read up to the last complete message; corrupt bags give a one-line error."""
 
 import resource
 import struct
@@ -57,7 +57,7 @@ def small_bag(compression, use_chunking=True):
 
 
 def every_cut(content, position, length):
-    """List the bytes at which to cut: all of the last chunk, every 17th after this chunk."""
+    """List the bytes at which to cut: all in the last chunk, and every 17th after this chunk."""
     end = position + length
     return [*range(position, end), *range(end, len(content), 17), len(content) - 1]
 
@@ -256,7 +256,7 @@ def test_a_damaged_last_chunk_is_left_out(tmp_path):
     recording = read(path)
     assert str(recording.info.truncated).endswith('; its last chunk is damaged and left out')
     assert_columns(recording.columns, regular_messages(24)[: recording.info.n_messages])
-    # If the file ends inside the damaged chunk, the message names the cut.
+    # If the file ends inside the damaged chunk, the error names the cut.
     path.write_bytes(damaged[:-5])
     assert 'ends inside a chunk' in str(read(path).info.truncated)
 

@@ -197,7 +197,7 @@ def other(content):
 
 
 def one_by_one(data):
-    """List (place, size, channel, log time) of messages, other records, end of the last record."""
+    """Return (place, size, channel, log time) of each message, other records, and the end."""
     at, messages, others = 0, [], []
     while at + 9 <= len(data):
         opcode, length = struct.unpack_from('<BQ', data, at)
@@ -261,7 +261,7 @@ def test_a_scan_with_a_right_or_false_index_equals_a_plain_loop(data, cut, tail,
         messages, reason = scan_records(
             np.frombuffer(torn, np.uint8), lambda _, content: others.append(content)
         )
-        # If zeros follow a message, its end may be lost, too, so the scan leaves it out.
+        # If zeros follow a message, its end may be lost, too, so the scan leaves out the message.
         is_wiped = len(torn) >= wanted_end + 9 and torn[wanted_end] == 0
         assert listed(messages) == (wanted[:-1] if is_wiped else wanted)
         assert others == wanted_others

@@ -230,7 +230,7 @@ def driver_bag(path, *topics, metadata=None):
         ([('imu/data', 'imu'), ('imu/data_raw', 'imu')], '/imu/data_raw'),
         ([('a/imu/data_raw', 'imu'), ('a/accel/counts', 'vector')], '/a/accel/counts'),
         ([('adc/words', 'vector'), ('imu/mag', 'vector')], '/adc/words'),
-        # Of two topics of equal rank no topic is chosen, nor is a magnetometer.
+        # Neither of two topics of equal rank is chosen, nor is a magnetometer.
         ([('left/imu', 'imu'), ('right/imu', 'imu'), ('adc/words', 'vector')], None),
         ([('imu/mag', 'vector')], None),
         # imu/data_raw is an output of the node if regime/dynamic has the same namespace.

@@ -55,7 +55,7 @@ def test_the_reports_of_the_pieces_of_a_rest_are_combined(rng):
     assert (whole.source, whole.start_ns) == ('rest', rest.start_ns)
     assert whole.up == pytest.approx((0.0, 0.0, 1.0), abs=1e-12)
     assert whole.duration_s == pytest.approx(7200.0, abs=120.0)
-    # The mean square of 3 and 4 is 12.5.
+    # The mean square of the residuals 3 and 4 is 12.5.
     assert whole.residual_rms == pytest.approx(np.sqrt(12.5))
     assert whole.left_out_rms == pytest.approx(10.0 * np.sqrt(12.5))
 
@@ -90,7 +90,7 @@ def test_if_the_second_fit_is_refused_the_first_is_kept(rng, monkeypatch):
 
 @pytest.mark.slow
 def test_slowly_tilting_supports_are_fitted_with_an_attitude_per_hour():
-    # WHY: tilts of 60 urad within 4 h caused force errors of 12 to 15 ug in a held-out program.
+    # WHY: supports tilting by 60 urad in 4 h caused force errors of 12 to 15 ug in held-out bags.
     _, study, _ = slow_drift(1)
     calibration = strangers.fitted(study)
     assert any('may tilt from hour to hour' in note for note in calibration.provenance.notes)

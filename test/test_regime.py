@@ -78,7 +78,7 @@ def headline():
     [
         ('1 mK', 45.0, 90.0),
         ('10 mK', 150.0, 180.0),
-        # Two steps of 62.5 mK are necessary, a change of 94 mK on average: 146 s, +-6 s.
+        # Two steps of 62.5 mK are needed, on average a change by 94 mK, which takes 146 s +- 6 s.
         ('1 mK, 62.5 mK steps', 158.0, 180.0),
         ('10 mK, 62.5 mK steps', 150.0, 180.0),
     ],

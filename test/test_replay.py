@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`replay` gives the bits of a compensator that processes the bag's messages one by one."""
+"""`replay` equals, bit for bit, a compensator that processes the messages one by one."""
 
 import csv
 import dataclasses
@@ -146,7 +146,7 @@ def test_an_imu_is_refused_by_a_calibration_of_counts(tmp_path):
 
 
 def test_memory_does_not_grow_with_the_bag(tmp_path, monkeypatch):
-    # The short bag has many small blocks; with a cycle of 2 ms, samples at 500 Hz are accepted.
+    # Blocks of 2048 messages give the short bag many blocks; a cycle of 2 ms allows 500 Hz.
     monkeypatch.setattr('thermo_comp.recording.blocks.BLOCK_MESSAGES', 1 << 11)
     calibration = rich_calibration()
     unit = dataclasses.replace(calibration.unit, cycle_time_s=0.002)
@@ -174,7 +174,7 @@ def test_memory_does_not_grow_with_the_bag(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize('imu', [False, True])
 def test_an_output_table_has_the_values_of_the_output_bag(tmp_path, imu):
-    pq = pytest.importorskip('pyarrow.parquet', reason='pyarrow is the extra `parquet`')
+    pq = pytest.importorskip('pyarrow.parquet', reason='no pyarrow: install the extra `parquet`')
     bag = thermal_test(tmp_path / 'bag', imu=imu)
     calibration = rich_calibration()
     if imu:

@@ -28,7 +28,7 @@ pytestmark = pytest.mark.usefixtures('equal_fits_once')
 
 
 def test_drawn_bias_and_scale_curves_agree_with_formulas():
-    # The bias is 0.3 counts/K times t plus 0.3 counts/K times the lag of 600 s.
+    # Bias of x: 0.3 counts/K of board temperature, and 0.3 counts/K of the lag with tau = 600 s.
     static, dynamic = (
         regime_set(*[axis_set((0.0, 0.3), (1.0, 7e-5), delta=delta)] * 3, rate_range_k_min=(0, 2))
         for delta in (0.0, 0.5)

@@ -72,7 +72,7 @@ def test_few_equal_samples_are_accepted_at_any_sample_rate(rng):
 )
 @settings(max_examples=300, deadline=None)
 def test_constant_samples_are_found_in_batches_of_any_size(parts, cuts, period):
-    # In each part of a recording an axis is constant or changes with each sample; some are NaN.
+    # In each part an axis is constant or changes with each sample; some samples of y are NaN.
     stands = np.repeat([which >> np.arange(3) & 1 for _, which in parts], [n for n, _ in parts], 0)
     sizes = 1.0 + np.arange(len(stands)) % 4
     samples = 1.0 + np.cumsum((1.0 - stands.reshape(-1, 3)) * sizes[:, np.newaxis], axis=0)
@@ -118,7 +118,7 @@ def test_a_constant_axis_is_stuck_if_the_other_axes_change(axis, value):
 
 def test_a_constant_axis_at_rest_is_not_stuck(rng):
     compensator = Compensator(calibration())
-    # Noise is below a rounding step: x is constant, y and z are at an edge and alternate.
+    # Noise is below a rounding step: x repeats one value, y and z alternate between two.
     stream(
         compensator,
         recording(
@@ -135,7 +135,7 @@ def test_a_constant_axis_at_rest_is_not_stuck(rng):
 
 
 def noisy_unit(noise_counts, n_in_counts=K):
-    """Make a calibration whose samples have a noise of that many counts [sd] at 100 Hz."""
+    """Make a calibration with a white noise of `noise_counts` (sd of a sample at 100 Hz)."""
     density = noise_counts / n_in_counts / 10.0
     return calibration(
         axes=equal_axes(n_in_counts),
@@ -155,7 +155,7 @@ def test_a_constant_axis_at_rest_is_stuck_if_its_noise_would_show(dead, rng):
         return tuple(counts)
 
     stream(compensator, recording(1000, 100.0, sample))
-    # The time-out of two seconds, or somewhat later, as the other axes must have shown noise.
+    # An axis counts as stuck after the time-out of 2 s, or later, once the others show noise.
     assert 201 <= compensator.counters.n_out <= 260
     assert compensator.counters.n_stuck == 1000 - compensator.counters.n_out
 
@@ -177,7 +177,7 @@ def test_no_sample_of_a_working_sensor_is_stuck_whatever_its_bandwidth(correlati
 
 @pytest.mark.parametrize('step', [1.0, 2.0, 5.0])
 def test_a_sensor_that_is_quieter_than_its_calibration_is_not_stuck(step, rng):
-    # Calibrated on a vibrating chamber; used at rest, with a noise far below the converter's step.
+    # Noise was calibrated in a vibrating chamber; at rest it is far below the converter's step.
     compensator = Compensator(noisy_unit(3.0))
     edge = np.array([0.5, 0.0, 0.5])
     centre = step * (np.round(K * GRAVITY * np.array(UP) / step) + edge)
@@ -221,13 +221,13 @@ def test_the_gravity_check_uses_local_gravity_or_that_of_the_calibration(rng):
         compensator = Compensator(calibration(), CompensatorConfig(local_gravity_m_s2=local))
         stream(compensator, recording(6000, 100.0, lambda _: at_rest(rng)))
         gravity = compensator.status().gravity
-        # The tolerance is that of a mean of 110 samples with a noise of 1.4 mm/s^2, and rounding.
+        # The tolerance is 5 sd of a mean of 110 samples with a noise of 1.4 mm/s^2, plus rounding.
         assert gravity.residual == pytest.approx(expected, abs=5 * 1.4e-3 / math.sqrt(110) + 2e-4)
 
 
 @st.composite
 def stretches(draw):
-    """Draw events: sequences of samples, each with a kind of fault or none, and temperatures."""
+    """Draw sequences of samples, each with one kind of fault or none, and temperatures."""
     events = []
     stamp_ns = 0
     k = 0
@@ -278,7 +278,7 @@ def test_a_jump_back_in_time_does_not_restore_a_refuted_calibration(rng, is_mend
     stream(compensator, events(0.0 if is_mended else 100.0))
     assert compensator.counters.n_time_jumps == 1
     if is_mended:
-        # Windows of 5 s; the first has no window to compare with, the next two restore the output.
+        # The first window of 5 s has no predecessor to compare with; the next two restore output.
         assert compensator.counters.n_out - n_out == pytest.approx(4500, abs=200)
     else:
         assert compensator.counters.n_out == n_out
@@ -305,7 +305,7 @@ def watch(rng, *, bias=0.0, seconds=60, motion=0.0, rate_hz=100, monitor=None):
 
 def test_the_residual_of_a_good_calibration_is_near_0_and_its_sd_is_right(rng):
     result = watch(rng)
-    # The mean of 99 samples has a noise of 0.2 mm/s^2, the mean of 30 such windows 0.04 mm/s^2.
+    # The limit is 5 sd of the mean of 1500 samples; a window has 99 samples.
     assert abs(result.residual) < 5 * NOISE_SD / math.sqrt(100 * 15)
     assert result.residual_sd == pytest.approx(math.hypot(BIAS_SD, NOISE_SD / math.sqrt(99)))
     assert result.n_windows == 59  # the first of 60 windows has no predecessor to compare with
@@ -330,7 +330,7 @@ def test_a_jump_of_the_stamps_starts_a_new_window(rng):
 
 
 def steps(rng, *, offset, at_s=20.0, ramp_s=0.0, rate_hz=2.5, scatter=0.0):
-    """Change |f| at `at_s`; return the time from then to the refusal [s], and the result."""
+    """Change |f| at `at_s`; return the time from the change to the refusal [s], and the result."""
     monitor = GravityCheck(GRAVITY, tolerance=0.1)
     up = np.array([0.3, -0.5, math.sqrt(1 - 0.34)])
     for k in range(round((at_s + 10.0) * rate_hz)):
@@ -355,7 +355,7 @@ def test_a_step_at_rest_refutes_the_calibration_within_a_second(rng, rate_hz, of
 
 
 def test_a_change_by_motion_does_not_refute_the_calibration_at_once(rng):
-    # Such changes occur in a lift that accelerates for 0.8 s, and in a shaking car.
+    # |f| changes by 1 m/s^2 within 0.8 s, as in a lift, and with added noise, as in a shaking car.
     assert steps(rng, offset=1.0, ramp_s=0.8, rate_hz=5.0)[0] > 2.0
     assert steps(rng, offset=1.0, scatter=0.05, rate_hz=5.0)[0] > 2.0
 

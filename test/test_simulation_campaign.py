@@ -57,7 +57,7 @@ def test_the_true_thermal_model_leaves_only_noise(kind):
         # determine the RMS to a factor of two.
         assert 4.0 < vector < 20.0
     else:
-        # The RMS of 1311 means is uncertain by 2 % (norm) and 1.2 % (vector); limits: 5 times.
+        # The RMS of 1311 means is uncertain by 2 % (norm) and 1.2 % (vector); limits: 5 sd.
         assert np.sqrt(np.mean(np.concatenate(norms) ** 2)) == pytest.approx(0.65, abs=0.065)
         assert vector == pytest.approx(1.12, abs=0.07)
 
@@ -75,7 +75,7 @@ def test_plans_have_the_stated_durations_and_attitudes():
         ups = np.array([p.up for p in plan(name, 1)])
         np.testing.assert_allclose(np.linalg.norm(ups, axis=1), 1.0)
         assert np.any(ups != np.array([p.up for p in plan(name, 2)]))
-    # From position to position of the chamber in tumble-3, f of each axis varies by over 0.5 g.
+    # Between the chamber positions of plan tumble-3 the force on each axis varies by over 0.5 g.
     assert np.ptp(np.array([p.up for p in plan('tumble-3', 1)][18:]), axis=0).min() > 0.5
     fitted = np.array([p.up for p in plan('chamber-18', 1)])
     held_out = np.array([p.up for p in plan('held-out', 1)])
@@ -116,7 +116,7 @@ def test_a_saturated_effect_of_heat_flow_has_two_values():
 
 
 def test_a_switched_load_warms_its_part_by_the_steady_heat_balance():
-    """Before the load the warming is zero, at the end that of the steady heat balance."""
+    """The warming is zero while the load is off, and that of the heat balance in the end."""
     unit = triad('own-lags', 1)
     spell = 30_000.0
     load = SwitchedLoad('board', 0.5, (spell, 1.0001 * spell))
@@ -187,7 +187,7 @@ def test_bias_and_scale_changes_are_0_at_the_reference_temperature(name):
 
 @pytest.mark.parametrize('seed', range(8))
 def test_the_preset_bare_quartz_has_the_published_slopes(seed):
-    """Q-Flex: scale slope 68 to 87 ppm/K at 5 to 35 degC (0.31 ppm/K^2), bias 0.3 to 5 ug/K."""
+    """Q-Flex: scale slope 68 ppm/K at 5 degC, 87 ppm/K at 35 degC; bias slope 0.3 to 5 ug/K."""
     unit = unit_preset('bare-quartz', seed)
     board = np.array([4.5, 5.5, 19.5, 20.0, 20.5, 34.5, 35.5])
     bias, scale = _static(unit, board)

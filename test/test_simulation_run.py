@@ -74,7 +74,7 @@ def test_stamps_are_the_ends_of_the_cycles(unit):
 
 
 def test_a_further_error_source_does_not_change_the_random_numbers_of_other_sources(unit):
-    """Thermometer noise does not change counts; drifts of the unit do not change their noise."""
+    """Thermometer noise does not change counts; bias drifts do not change the noise of counts."""
     plain = simulate(unit, SHORT, UP)
     noisy = simulate(replace(unit, board=replace(unit.board, noise_sd=0.05)), SHORT, UP)
     assert np.all(noisy.board != plain.board)
@@ -85,7 +85,7 @@ def test_a_further_error_source_does_not_change_the_random_numbers_of_other_sour
         plain.truth.scale - 1.0
     ) * unit.scale_factor * (plain.truth.specific_force @ np.linalg.inv(unit.M).T)
     difference = np.cumsum(plain.counts - still.counts, axis=0) - np.cumsum(moved, axis=0)
-    # The sum of counts is within one count of its integral; both runs begin with equal remainders.
+    # Sums of counts are within one count of the integrals; both runs begin with equal remainders.
     assert np.abs(difference).max() < 1.0 + 1e-6
 
 
@@ -106,7 +106,7 @@ def test_simulated_white_noise_has_the_stated_density(unit):
     run = simulate(still, parse_cyclogram('soak'), UP, rate_hz=50.0, seed=3)
     accel = run.counts / np.array(unit.scale_factor) / MICRO_G
     frequency, power = welch(accel, fs=50.0, nperseg=16384, axis=0)
-    # With a carried remainder, rounding noise rises with f^2, to 1 (ug)^2/Hz at 0.4 Hz.
+    # With a carried remainder, rounding noise rises with f^2, to 1 (ug)^2/Hz at f = 0.4 Hz.
     band = (frequency > 0.01) & (frequency < 0.4)
     # The mean of 128 lines, each a mean over 86 half-overlapping segments, is uncertain by 1 %.
     np.testing.assert_allclose(
@@ -138,7 +138,7 @@ def test_simulated_thermometers_have_the_stated_rate_and_noise(unit, rate_hz):
         (run.case_stamp_ns - START_NS) * 1e-9, run.truth.grid_s, of_part(run.truth, 'case')
     )
     error = run.case - true
-    # 540 readings (noise 5 mK) determine the mean to 0.2 mK, the sd to 3 %; limits: 5 times.
+    # 540 readings (noise 5 mK) determine the mean to 0.2 mK, the sd to 3 %; limits: 5 sd.
     assert error.mean() == pytest.approx(0.0, abs=1.1e-3)
     assert error.std() == pytest.approx(0.005, rel=0.16)
 

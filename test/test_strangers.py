@@ -131,7 +131,7 @@ def test_flicker_noise_has_a_flat_allan_deviation():
 
 @pytest.fixture
 def recorded(monkeypatch):
-    """Replace `record` by a function that stores its arguments; return the arguments of a bag."""
+    """Replace `record` by a stub; return a function from a bag to the arguments of its record."""
     notes = {}
 
     def note(given, corners, up, rng, *, name='bag', **keys):
@@ -223,7 +223,7 @@ def test_the_scipy_cubic_fits_a_cubic_bias_and_constants_do_not():
         strangers.error_of([by_norm([fit], order=order)(held)], [held], is_drift=False)
         for order in (3, 0)
     )
-    # The scipy cubic neglects products of small terms, such as misalignment times bias, of 5 ug.
+    # The scipy cubic neglects products of small terms, e.g. misalignment times bias, below 5 ug.
     assert cubic.vector < 5.0
     assert constants.vector > 50.0
 
@@ -243,7 +243,7 @@ def test_the_bias_score_is_error_over_bound_and_error_over_claimed_sd():
     axes = Axes(*(AxisReference(300.0, 300.0 * b) for b in bias + np.array([1 / 300.0, 0.0, 0.0])))
     bound = cases.Bound(unit(counts=300.0), bias, np.full(3, 1e-3))
     study = cases.Study('', (), {}, bound=bound)
-    # The calibration claims a bias sd of 2e-3 m/s^2; the 5e-3 m/s^2 of a turn-on are not counted.
+    # The calibration claims a bias sd of 2e-3 m/s^2; the turn-on sd, 5e-3 m/s^2, is not counted.
     again = axis_set(residual_sd_m_s2=5e-3)
     known = regime_set(x=again, y=again, z=again)
     unknown = calibration(axes=axes, static=known, dynamic=known)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The thermal tracker agrees with closed forms: lags, blend of sets, lost sensors, restart."""
+"""The thermal tracker agrees with closed forms: lags, regime blend, lost sensors, restart."""
 
 import math
 
@@ -30,7 +30,7 @@ def test_the_lag_is_unknown_at_the_start_and_known_after_some_time():
     tracker = ThermalTracker(DetectorSettings(), LAG)
     feed(tracker, np.full(10, 20.0))
     assert not tracker.is_settled(10 * SECOND_NS)
-    # A lag of 900 s has an sd of 1.5 K at the start, which decays to 50 mK within 3061 s.
+    # A lag with tau = 900 s has an sd of 1.5 K at the start, which decays to 50 mK within 3061 s.
     feed(tracker, np.full(5000, 20.0), start_s=10)
     settled_s = TAU_S * math.log(1.5 / MEMORY_SETTLED_SD)
     assert not tracker.is_settled(round((settled_s - 10.0) * 1e9))

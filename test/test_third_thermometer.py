@@ -32,7 +32,7 @@ from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 PROGRAM = parse_cyclogram('20 10min, 40@1 25min, 5@1 25min')
 MICRO_G = STANDARD_GRAVITY * 1e-6
-#: Effect of the lid's temperature on the axes [ug/K], and warming of the lid by the load [K].
+#: Effect of the lid's temperature on the biases [ug/K], and warming of the lid by the load [K].
 LID_UG_K = (12.0, -9.0, 15.0)
 LOAD_K = 5.0
 
@@ -62,7 +62,7 @@ def record(path, run):
 
 def fitted(bags):
     sources, _ = fit_sources(bags)
-    # These groups suffice, because the effect of the lid has no lag.
+    # These groups of columns suffice, because the lid's effect has no lag.
     groups = ('curve', 'gradient', 'board')
     return fit(sources, FitOptions(gravity=STANDARD_GRAVITY, groups=groups)).calibration
 
@@ -99,8 +99,8 @@ def test_a_third_thermometer_reduces_the_error_to_the_noise(runs, tmp_path):
         index = np.searchsorted(runs[-1].accel_stamp_ns, corrected.accel_stamp_ns)
         error = corrected.accel - truth.specific_force
         use = truth.cycle_s[index] > 600.0
-        # Compare the scatter of means over 60 s: constants have no effect on it, and noise is
-        # small.
+        # Compare the scatter of means over 60 s: errors of the constants do not change the
+        # scatter, and noise is small.
         n = int(use.sum()) // 120 * 120
         means = error[use][:n].reshape(-1, 120, 3).mean(axis=1)
         errors[sees_lid] = float(np.sqrt(np.mean(np.var(means, axis=0)))) / MICRO_G

@@ -151,7 +151,7 @@ def test_a_state_beyond_the_edge_of_a_column_is_limited_and_increases_the_sd():
     edge, beyond = (correction.line(s, s, np.zeros(N_ROWS), 0.0) for s in (inside, outside))
     assert beyond[:12].tolist() == edge[:12].tolist()
     assert math.sqrt(beyond[12] - edge[12]) == pytest.approx(30.0 / 300.0 * 2.0)
-    of_y = [27, 29, 32]  # terms 1, y and y^2 of the covariance element yy
+    of_y = [27, 29, 32]  # coefficients of 1, y and y^2 in the covariance yy
     assert beyond[of_y].tolist() == edge[of_y].tolist()
     excess = correction.excess(outside, is_dynamic=False)
     assert excess.relative == pytest.approx(2.0)
@@ -198,7 +198,7 @@ def test_beyond_the_range_bias_and_scale_slopes_do_not_cancel_in_the_claimed_sd(
 
 
 def curves_at(unit, celsius):
-    """Return bias and relative scale of x in both sets at n temperatures, shape (2, 2, n)."""
+    """Return bias and relative scale of x in both regimes at n temperatures, shape (2, 2, n)."""
     return Correction(unit).curves.values(np.array(celsius))[:, ::3]
 
 
@@ -223,14 +223,14 @@ def test_beyond_the_range_curves_follow_their_tangent_for_a_quarter_of_the_range
 
 
 def test_outside_its_range_a_set_follows_the_curve_of_the_other_set():
-    # The static set has a range of 5 to 35 degC, the dynamic set of 0 to 30 degC.
+    # The static set of curves is valid from 5 to 35 degC, the dynamic set from 0 to 30 degC.
     unit = calibration(
         static=regime_set(axis_set(BENT)),
         dynamic=regime_set(axis_set(WAVY, delta=2.0), temperature_range_c=(0.0, 30.0)),
     )
     celsius = [-20.0, -7.5, -3.0, 0.0, 5.0, 30.0, 35.0, 38.0, 42.5, 60.0]
     static, dynamic = curves_at(unit, celsius)[:, 0]
-    # Outside the common range, 5 to 30 degC, the difference of the sets is that at its edge.
+    # Outside the common range, 5 to 30 degC, both sets differ by as much as at its edge.
     np.testing.assert_allclose((dynamic - static)[:5], dynamic[4] - static[4], rtol=1e-12)
     np.testing.assert_allclose((dynamic - static)[5:], dynamic[5] - static[5], rtol=1e-12)
     wavy, bent = np.polynomial.Polynomial(WAVY), np.polynomial.Polynomial(BENT)
@@ -240,8 +240,8 @@ def test_outside_its_range_a_set_follows_the_curve_of_the_other_set():
 
 
 def test_the_sd_beyond_the_range_includes_every_parameter_of_the_tangents(rng):
-    # A change of parameters must change bias and scale by regressors times change. The ranges are
-    # 5 to 35 degC (static) and 0 to 30 degC (dynamic).
+    # A change of the parameters must change bias and scale by the regressors times this change.
+    # The ranges are 5 to 35 degC (static) and 0 to 30 degC (dynamic).
     spline = CubicSpline((-15.0, 0.0, 15.0), (-4.0, 0.0, 6.0))
     exponential = Exponential(-1.0, (1.0,), (18.0,))
     splined = AxisSet(spline, Polynomial((1.0, 1e-4)))
@@ -307,8 +307,8 @@ def test_with_lags_the_sd_in_a_ramp_does_not_depend_on_the_calibrated_rates():
 
 
 def test_the_distance_of_a_squared_column_from_its_range_is_that_of_its_quantity():
-    # WHY: after bags with lags up to 0.1 K, a lag of 10 K is 100 ranges, its square 10000 ranges.
-    # The claimed sd was that of 10000 ranges, 0.1 g.
+    # WHY: after bags with lags up to 0.1 K, a lag of 10 K is 100 times its range, its square 10000
+    # times. The claimed sd was that of 10000 ranges, 0.1 g.
     unit = calibration(response=(term('square', (1.0, 0.0, 0.0), tau_s=600.0, range=(0.0, 0.01)),))
     correction = Correction(unit)
     state = np.zeros(StateLayout(correction.memory).width)

@@ -33,7 +33,7 @@ KINK = np.array([0.0, 1e-5, -1e-5])
 
 
 def fit_of(temperature, up, position, slope=1e-5, gravity=10.0):
-    """Return the parts of a fit that the functions read; the scale has a curve of one slope."""
+    """Make the parts of a fit that `thermal_ranges` reads, with one slope of all scale factors."""
     windows = SimpleNamespace(
         temperature=np.asarray(temperature, dtype=float),
         data=SimpleNamespace(

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
 
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.impl.implementation_singleton import rclpy_implementation

@@ -5,8 +5,8 @@ Owns the reading of files of limited size, and the writing of all output files.
 
 An output never replaces an input of the same command. Without `overwrite` an output replaces no
 existing file, even if another process writes at the same time; with `overwrite` an output replaces
-only an empty file or a file of the same kind. An output gets its name once it is complete; without
-hard links an empty file reserves the name. A symbolic link stays, and its target is written.
+only an empty file or a file of the same kind. An output gets its name once it is complete; if the
+file system lacks hard links, an empty file reserves the name. Writing to a link writes its target.
 """
 
 import errno

@@ -21,7 +21,7 @@ from .errors import ThermoCompError
 from .files import read_bounded
 
 DEPTH_LIMIT = 12  # largest number of nested lists and mappings
-#: Largest number of keys, values, lists and mappings of a file: three times that of a calibration
+#: Largest number of keys, values, lists and mappings of a file: three times the number in a file
 #: with all columns of `unit.columns.bank` for two thermometers, except the kind `bend`.
 NODE_LIMIT = 20_000
 # Size limit of YAML files written by hand [bytes]; usual files have a few kB.

@@ -38,7 +38,7 @@ from .typing import Ints
 from .unit.calibration import Calibration
 
 # Quantiles of the board readings that are compared with the calibrated range, so that single
-# wrong readings do not count; excess [K] that thermometer noise can explain.
+# wrong readings do not count; excess over the range [K] that thermometer noise can explain.
 _BULK, _NOISE_K = (0.01, 0.99), 0.1
 _REGIMES = np.array(['unknown', 'static', 'dynamic'])
 
@@ -51,7 +51,7 @@ class ReplayResult:
     output: Path
     counters: Counters
     n_flags: int
-    #: Stamp [ns] and value of the first regime flag, and of each flag that differs from the last.
+    #: Stamp [ns] and value of the first regime flag, and of each flag unlike the flag before it.
     switches: list[tuple[int, bool]]
     #: Warnings that the node would give: exchanged thermometers, temperatures outside the
     #: calibrated range.
@@ -156,7 +156,7 @@ def replay(
 
 
 def _beyond(calibration: Calibration, block: Block) -> float:
-    """Return how far the 1 % or 99 % quantile of board readings is outside all ranges [K]."""
+    """Return how far the 1 % or 99 % quantile of T_board is outside the calibrated ranges [K]."""
     ranges = [regime_set.temperature_range_c for regime_set in calibration.regime_sets()]
     lower, upper = min(bounds[0] for bounds in ranges), max(bounds[1] for bounds in ranges)
     celsius = block.temperatures['board'].celsius

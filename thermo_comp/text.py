@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the safe printing of texts from files and networks, and nouns with their number."""
+"""Owns the safe printing of texts from files and networks, and the plural of counted nouns."""
 
 import os
 import sys

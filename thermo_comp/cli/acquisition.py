@@ -4,7 +4,7 @@
 Owns the state of a test during recording: its positions, the expected accuracy, missing data.
 
 Blocks of samples are added in the order of arrival. A rest whose force direction differs from that
-of the present position begins the next position; handling in between belongs to the present one.
+of the present position begins the next position, to which no earlier sample belongs.
 """
 
 import math
@@ -23,14 +23,14 @@ from ..unit.gravity import STANDARD_GRAVITY
 
 # Minimum length of a rest [s], unless the wanted soak is shorter.
 _REST_S = 10.0
-# Minimum length of a cell of averaged samples [s]; number of samples for the first sample rate.
+# Minimum length of a cell of averaged samples [s]; samples that first determine the sample rate.
 _CELL_S, _SAMPLES_TO_BEGIN = 0.5, 30
 # Number of earlier cells that each search for rests includes, besides the new cells.
 _LOOKED_BACK = 200
-# Sd of the mean force in a position due to hysteresis, mounting and drift, at any rest length [g].
+# Sd of the mean force in a position due to hysteresis, mounting and drift, however long the rest.
 _FLOOR_SD = 2e-5
-# A position whose noise is above `_RESTLESS` times the median of all positions is 'restless'. A
-# still interval after the last rest is a rest below `_LOUDEST` times the noise of the rests.
+# A position is 'restless' if its noise is above `_RESTLESS` times the median of all positions. A
+# later still interval is a rest if its noise is below `_LOUDEST` times the noise of the rests.
 _RESTLESS, _LOUDEST = 3.0, 10.0
 # Smallest backward step of the stamps that shows a restart of the driver [ns].
 _STEP_BACK_NS = 10**9
@@ -83,7 +83,7 @@ class Account:
 
 @dataclass(frozen=True)
 class _Rest:
-    """Statistics of a position: of its still cells, in input units, and of its thermometers."""
+    """Statistics of a position: its samples at rest, in input units, and its thermometers."""
 
     surveys: Surveys
     mean: Floats = field(default_factory=lambda: np.full(3, np.nan))
@@ -94,7 +94,7 @@ class _Rest:
 
 
 class Acquisition:
-    """A running test; `soak_s`: rest wanted in each position [s], `offset`: reading at 0 g."""
+    """A running test; `soak_s`: wanted duration of a rest [s], `offset`: reading at 0 g."""
 
     def __init__(self, n_positions: int, soak_s: float, offset: float = 0.0) -> None:
         self._n_wanted, self._soak_s, self._offset = n_positions, soak_s, offset

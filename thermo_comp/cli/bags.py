@@ -178,7 +178,7 @@ def replay(
     keep_inputs: bool = option('Also copy the input topics.', False),
     all_topics: bool = option('Also copy all topics of the bag.', False),
     serial: str | None = options.SERIAL,
-    frame_id: str = option('frame_id of the output messages; default: that of the input.', ''),
+    frame_id: str = option('frame_id of the output messages; default: frame_id of the input.', ''),
     transition_time: float = option(
         'Time in s over which the two sets are blended after a switch of the regime, like the '
         "node's parameter; 0: no blending.",

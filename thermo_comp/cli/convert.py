@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 Tool = Literal['px4', 'ardupilot', 'imu_tk', 'imu_calib', 'kalibr']
 
-#: Texts of the findings of a conversion, before the number of rows.
+#: Texts of the findings of a conversion, printed in front of the number of rows found.
 _FINDINGS = {
     'short_rows': 'rows left out, with fewer cells than the column map needs',
     'non_numeric': 'rows left out, with a time or a sample that is not a finite number',
@@ -62,7 +62,7 @@ def convert(
     table with the columns t ax ay az wx wy wz, in this order, or without t or
     wx wy wz, needs no headings. The board temperature of a PX4 or ArduPilot log
     is the IMU's (if missing, the barometer's), the case temperature the barometer's;
-    in a bag the thermometer nearest the Imu (in namespaces) is the board thermometer.
+    in a bag the board thermometer is the one with most namespaces in common with the Imu.
 
     Example:
       thermo_comp convert log.csv --columns map.yaml -o unit42
@@ -117,7 +117,7 @@ def _print_conversion(out: Output, report: 'ConversionReport', output: Path) -> 
     if report.rate_hz < SLOW_HZ:
         out.line(
             f'{report.rate_hz:.3g} Hz is sufficient for soaks of minutes; the rate is too low for '
-            'short rests by hand, and to detect vibration or a knock between two samples'
+            'rests of seconds, and to detect vibration or a knock between two samples'
         )
     if log.hint:
         out.line(log.hint)

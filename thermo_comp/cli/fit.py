@@ -71,7 +71,7 @@ def fit(
     report: Path | None = option('Certificate to write (HTML).', metavar='HTML'),
     certificate_info: Path | None = options.CERTIFICATE_INFO,
     serial: str | None = option(
-        'Serial of the unit, instead of that in the bags.', callback=options.check_serial
+        'Serial of the unit, instead of the serial in the bags.', callback=options.check_serial
     ),
     offset: float | None = options.OFFSET,
     known_force: Any = options.force,

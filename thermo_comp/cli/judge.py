@@ -256,7 +256,7 @@ def update(
         'Days of ageing after the last rest that the claimed sd covers.', 1.0, min=0.0, max=3650.0
     ),
     allow: list[str] | None = option(
-        'gravity: take local gravity as exact; unit: accept an |f| like that of another unit.'
+        'gravity: take local gravity as exact; unit: accept |f| as wrong as of another unit.'
     ),
     force: bool = options.FORCE,
     out: Output = options.out,
@@ -268,7 +268,7 @@ def update(
     the rests, which may be in any attitude. Old and new calibration are
     compared on days left out of the update. The new calibration is written only
     if the rests determine an axis and lower the mean square of |f| - g by more than
-    its standard error; else the exit code is 3, and the present sds are printed.
+    its standard error; else the exit code is 3, and the sds with ageing are printed.
 
     Example:
       thermo_comp update unit42.yaml rests -o unit42_new.yaml
@@ -336,7 +336,7 @@ def _show_axis_changes(result: 'Update', out: Output) -> None:
 
 
 def _ageing(ageing: 'Ageing | None') -> dict[str, Any]:
-    """Return the sds of `Ageing` [m/s^2] and the ratio of the lags' sd to the assumed sd."""
+    """Return the sds of `Ageing` [m/s^2] and, separately, `lags`, a ratio of two sds."""
     values = vars(ageing).copy() if ageing else {}
     share = values.pop('lags', None)
     return {'ageing_m_s2': values or None, 'lags_at_start': share}

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the output of the command line: tables, JSON, progress, and errors of a line each.
+Owns the output of the command line: tables, JSON, progress, and one-line error messages.
 
 Results go to stdout, all texts about the run (progress, notes, errors) to stderr, so that a pipe
 carries results only. Serials, topics, metadata and file names may contain control characters and

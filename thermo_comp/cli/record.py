@@ -199,7 +199,7 @@ def _duration(text: str) -> float:
 def _print_account(
     out: Output, account: 'Account', problems: Sequence[str], last: dict[str, str]
 ) -> None:
-    """Print each text of the account that differs from that printed before (`last`, by name)."""
+    """Print the texts of the account that changed since they were printed (`last`, by name)."""
     news = {'problem': ', '.join(problems)} if problems else {}
     if not problems:
         last.pop('problem', None)

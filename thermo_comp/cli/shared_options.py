@@ -107,7 +107,7 @@ def _flag_of(name: str) -> str:
 def usage_of(what: str = '', **flags: str) -> Iterator[None]:
     """
     Turn a ValueError of a `with` block into a usage error. The error's text begins with `what`;
-    without `what`, names of options (`flags`, `_FLAGS`) replace the names of arguments in it.
+    without `what`, names of options (`flags`, `_FLAGS`) replace argument names in the text.
     """
     try:
         yield

@@ -48,7 +48,7 @@ class _Correction(NamedTuple):
     """A parameter that is 1 while the autopilot corrects thermal drift."""
 
     parameter: str
-    course: Sequence[tuple[int, float]]  # times since boot [ns] and the values from then on
+    course: Sequence[tuple[int, float]]  # times since boot [ns], and the parameter from then on
     advice: str
 
 
@@ -63,7 +63,7 @@ _PROFILE = 'add 4 to SDLOG_PROFILE (thermal calibration): PX4 then logs sensor_a
 _BAROMETERS = {'vehicle_air_data': 'baro_temp_celcius', 'sensor_baro': 'temperature'}
 _TOPICS = ('sensor_accel', 'sensor_gyro', 'sensor_combined', *_BAROMETERS)
 _NOT_THERE = 2**31 - 1  # `accelerometer_timestamp_relative` of a message without an accelerometer
-_HEADER_BYTES = 3
+_HEADER_BYTES = 3  # bytes before the content of a DataFlash message
 _VECTORS = ('AccX', 'AccY', 'AccZ', 'GyrX', 'GyrY', 'GyrZ')
 
 
@@ -199,7 +199,7 @@ def _vectors(columns: _Columns, names: Sequence[str]) -> Floats:
 
 
 def _matched(stamp_ns: Ints, columns: _Columns | None) -> Floats | None:
-    """Interpolate rates to the n accelerometer stamps; None if fewer than n / 2, or not finite."""
+    """Interpolate rates to n sample stamps; None if under n / 2 rates, or if any is not finite."""
     if columns is None:
         return None
     gyro_ns, gyro = _stamps(columns), _vectors(columns, _AXES)

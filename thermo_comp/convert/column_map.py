@@ -42,10 +42,10 @@ _SINCE_1970_S, _SINCE_1970_STEP_S = (946_684_800.0, 2_147_483_648.0), 60.0
 #: Largest ratio of the range of temperatures in a log to the duration of the log [K/s]; a hair
 #: dryer warms a board by some 0.1 K/s.
 _FASTEST_K_S = 0.5
-# Largest share of rows in which a temperature in whole degrees changes. The numbers of boards or
-# sensors in a column alternate from row to row, so these numbers change in a larger share of rows.
+# Largest share of rows in which a temperature in whole degrees changes. A column of the numbers of
+# boards or sensors alternates from row to row, so it changes in a larger share of rows.
 _FEW_CHANGES = 0.1
-_RISING = 0.7  # smallest share of rows with a later time than that of the row before
+_RISING = 0.7  # smallest share of rows whose time is later than the time of the row before
 #: A step from the uppermost to the lowest tenth of the range of a 32-bit counter of time, such as
 #: Arduino's micros(), is an overflow (after 71.6 min).
 _WRAP_EDGE = 0.1
@@ -281,7 +281,7 @@ def _unnamed(width: int) -> Headings:
 
 
 def column_map_text(columns: ColumnMap) -> str:
-    """Describe the units of a column map in a line."""
+    """Describe the columns of a column map with their units, in one line."""
     stamp = columns.stamp
     parts = [f'{stamp.rate_hz:g} Hz' if stamp.column is None else f'time [{stamp.unit}]']
     parts.append(f'x y z [{columns.accel.unit}]')

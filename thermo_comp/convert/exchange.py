@@ -147,7 +147,7 @@ def _millionths(part: float) -> str:
 
 
 def _constant(calibration: Calibration, curves: _Curves) -> Content:
-    """Return bias, scale and misalignment at the reference temperature, for a tumble test tool."""
+    """Return bias, scale and misalignment at the reference temperature, for tools like imu_tk."""
     drift = 'the calibration has no correction for temperature'
     if calibration.needs_temperature:
         bias = ug_text(float(np.max(np.abs(curves.bias))))

@@ -40,7 +40,7 @@ _OTHER = re.compile('mag|mfield|orient|euler|quat|angle|lin|free|user|grav|pos|v
 _TEMPERATURE = re.compile(
     'temp|tmp|celsius|(^|_)t_?c($|_)|^t_(board|case|imu|die|chip|sensor|air|amb|room|baro)'
 )
-# Places that are not on the board.
+# Words in headings of thermometers that are not on the board.
 _OUTSIDE = re.compile('case|air|amb|baro|bmp|aht|room|hous|env')
 # Unit of a temperature at the end of a heading; words in headings that are not of a temperature.
 _DEGREES_END = re.compile('(^|_)(deg_?[cfk]|kelvin|fahrenheit)$')
@@ -114,7 +114,7 @@ def _thermometers(
 ) -> dict[str, tuple[str, str]]:
     """
     Return column and unit by thermometer. A column whose heading only names a place, like `board`,
-    is used only if no other column is this thermometer. `names`: all headings, as from `_plain`.
+    is used only if no other column is this thermometer. `names`: all headings, after `_plain`.
     """
     units = {heading: _stated(heading, _DEGREES) or 'degC' for heading in headings}
     warm, places = [], []
@@ -146,7 +146,7 @@ def map_lines(columns: Any) -> list[str]:
 
 
 def _given(value: Any) -> Any:
-    """Turn a dataclass into a mapping of `unit` and of the keys that differ from the default."""
+    """Turn a dataclass into a mapping, without the defaults of keys other than `unit`."""
     if is_dataclass(value):
         pairs = ((field, getattr(value, field.name)) for field in fields(value))
         return {f.name: _given(x) for f, x in pairs if x != f.default or f.name == 'unit'}

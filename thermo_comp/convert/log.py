@@ -114,7 +114,7 @@ class ConversionReport:
     rate_hz: float
     duration_s: float
     findings: dict[str, Finding]
-    inferred_unit: str  # which unit follows from the readings at rest, and why
+    inferred_unit: str  # the unit that follows from the readings at rest, and the reason
     stillness: Stillness
 
 
@@ -231,7 +231,7 @@ def _refuse_wrong_units(log: ForeignLog, stillness: Stillness) -> None:
 def _log_times(stamp_ns: Ints, shifts: Ints | None = None) -> tuple[Ints, Ints]:
     """
     Return log times that never decrease, and the shift added after each restart of the clock [ns].
-    For readings of a thermometer, give the samples' `shifts`, so that both get the same shifts.
+    For a thermometer, give the `shifts` of the samples, so that readings get the same shifts.
     """
     is_restart = np.diff(stamp_ns, prepend=stamp_ns[:1]) < -_RESTART_NS
     if shifts is None or len(shifts) != is_restart.sum():

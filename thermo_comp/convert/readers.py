@@ -32,7 +32,7 @@ def read_log(path: Path, **given: Any) -> ForeignLog:
     """
     Read a table, a PX4 or ArduPilot log, or a bag with topics or units other than the node's.
 
-    Table: `columns` is the path of a table's column map (default: guessed), `rate_hz` the sample
+    Table: `columns` is the path of the column map (default: a guessed map), `rate_hz` the sample
     rate of a table without times. Log: `imu` and `baro` are numbers from 0, `allow_compensated`
     accepts samples that the autopilot has corrected. Bag: `topic` maps ``imu``, ``board`` and
     ``case`` to topics, `unit` is the unit of acceleration of the Imu topic.

@@ -120,8 +120,8 @@ def read_text(
 def layout(head: str, delimiter: str | None = None) -> tuple[str, int]:
     """
     Return the delimiter of a text table and the number of cells per row: the delimiter that splits
-    most lines into the same number of cells (a blank is any run of white space). Only the last 50
-    lines of `head` count, as a preamble may come first, without the last, which may be cut.
+    most lines into the same number of cells (a blank is any run of white space). `head` may begin
+    with a preamble and end in a cut line: only the 50 lines before its last line are examined.
     """
     lines = [line for line in head.splitlines() if line.strip() and not _is_comment(line)]
     lines = lines[:-1] if len(lines) > 2 else lines
@@ -130,7 +130,7 @@ def layout(head: str, delimiter: str | None = None) -> tuple[str, int]:
     for sign in (';', '\t', '|', ',', ' ') if delimiter is None else (delimiter,):
         rows = [row for _, row in _rows(lines, sign)]
         width, n_rows = _most_frequent([_n_cells(row) for row in rows[-_LAYOUT_ROWS:]])
-        # Most rows may lack the last cell, a slow thermometer's: use the width of the full rows.
+        # Often most rows lack the last cell, of a slow thermometer: use the full rows' width.
         whole, _ = _most_frequent([len(row) for row in rows[-_LAYOUT_ROWS:]])
         is_whole = any(len(row) == whole and row[-1].strip() for row in rows)
         candidates.append((n_rows if width > 1 else 0, sign, whole if is_whole else width))
@@ -302,7 +302,7 @@ def _iso_ns(text: str) -> int:
 def read_parquet(
     path: Path, columns: Sequence[Column] | None, stamp: Stamp, _style: Format | None = None
 ) -> Table:
-    """Read a Parquet file as `read_text` reads a text; of all columns, those of texts are NaN."""
+    """Read columns of a Parquet file, as `read_text`; if `columns` is None, texts become NaN."""
     pq = import_extra('pyarrow.parquet', 'parquet', 'a Parquet file')
     import pyarrow as pa
 

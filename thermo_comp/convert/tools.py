@@ -58,7 +58,7 @@ class Content:
     range_c: tuple[float, float]
     notes: list[str]  # parts of the calibration that are lost or missing
     source: str = ''  # the tool and the parameter set that was read
-    # For export: white noise [m/s^2/sqrt(Hz)], random walk [m/s^2/sqrt(h)], samples per second.
+    # For export: white noise [m/s^2/sqrt(Hz)], random walk [m/s^2/sqrt(h)], sample rate [Hz].
     noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rate_bias: Floats | None = None  # like `bias`, for the angular rate [rad/s]
     text: str = ''  # the written file

@@ -30,11 +30,11 @@ from ..unit.calibration import Calibration
 from ..unit.gravity import MICRO_G
 from .series import RestSeries
 
-#: Prior centres of sds, divided by the prior centre of the turn-on offset's sd: of the random
-#: walks of bias and of scale times g, per root day, and of the scatter of a rest. Prior sd of the
-#: natural logarithm of each sd in `Ageing` (1 sd is a factor of 5).
+#: Prior medians, divided by that of the turn-on offset's sd: sd of the random walks of bias and of
+#: scale times g, per root day; sd of the scatter of rests. Prior sd of the natural logarithm of
+#: each sd in `Ageing` (1 sd is a factor of 5).
 _WALK_SHARE, _SCATTER_SHARE, _LOG_SD = 0.5, 0.3, 1.6
-#: Smallest centre of the prior of the turn-on offset's sd [m/s^2].
+#: Smallest prior median of the turn-on offset's sd [m/s^2].
 _LEAST_TURN_ON = 5.0 * MICRO_G
 #: Prior standard deviations tried for a jump of the levels, or of gravity [m/s^2].
 _JUMPS = (50.0 * MICRO_G, 500.0 * MICRO_G, 5000.0 * MICRO_G)
@@ -253,7 +253,7 @@ class Model:
 
 
 def usual(calibration: Calibration) -> Ageing:
-    """Return the prior centres of the sds, from the residual sd of the fit or noise in 1 Hz."""
+    """Return prior medians of `Ageing` from the fit's residual sd, or else the noise in 1 Hz."""
     residual = max(axis.residual_sd_m_s2 for axis in calibration.static.axes())
     turn_on = max(residual or max(calibration.noise_density_m_s2_sqrt_hz), _LEAST_TURN_ON)
     walk = _WALK_SHARE * turn_on

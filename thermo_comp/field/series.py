@@ -50,7 +50,7 @@ class RestSeries:
     `time`: days since 1970; `start`: number of the node's start, from 0; `direction`, `force`,
     `by_parameter`: v, x and H, see this module's docstring; `gravity`: stated g; `residual`: ``|f|
     - g``; `by_level`: derivatives of |f| w.r.t. the bias, and the scale times g, of each axis, (n,
-    6); `noise`: variance of |f| in a rest by noise of samples, thermometers, regime; `by_start`:
+    6); `noise`: variance of |f| due to noise of samples, thermometers, regime; `by_start`:
     derivatives of |f| w.r.t. unknown lag states at the start, scaled to unit variance; `lack`: sd
     of the lack of fit of each axis times `direction`; `claim`: claimed sd of `residual`;
     `n_windows`: number of windows averaged to a rest

@@ -242,7 +242,7 @@ def _axis_changes(
 
 
 def _judged(series: RestSeries, model: Model, solution: Solution, determined: Bools) -> Judged:
-    """Score on each day, or on each start in fewer than 5 days, an update by earlier rests."""
+    """Score an update by earlier rests on each day (on each node start if under 5 days)."""
     over, labels = 'days', series.day
     if len(np.unique(labels)) < 5:
         over, labels = 'starts', series.start

@@ -66,7 +66,7 @@ class Watch:
     inside_since: first day after the last time outside the claim; None if there was no such time,
         or if the unit is outside its claim
     forecast: quantiles (10, 50, 90 %) of the time from the last rest until the unit's error
-        exceeds its claim [days]; infinite if later than ten years; () if unknown or outside
+        exceeds its claim [days]; infinite if later than ten years; () if unknown or exceeded
     interval: the same quantiles if the calibration is updated at the last rest
     """
 
@@ -190,7 +190,7 @@ def _forecasts(
     Return the quantiles of the time until the error of the unit exceeds the limit, with the
     present calibration and with an update at the last rest.
 
-    The attitudes are those of the rests of the last week, and of the last ten starts.
+    The attitudes are those of the rests of the last week, and of the last ten node starts.
     """
     used, ageing, solution = updated.series, updated.ageing, updated.solution
     is_recent = used.time > used.time[-1] - _WINDOW_DAYS

@@ -43,7 +43,7 @@ def model_of(
         {name for name, readings in bag.temperatures.items() if len(readings.value)}
         for bag in bags
     )
-    # The case thermometer, recorded or not, then all others of every bag except that of the board.
+    # Case thermometer, recorded or not, and all thermometers but the board's that every bag has.
     sensors = 'case', *sorted(set.intersection(*recorded) - {'board', 'case'})
     detector = options.detector or learn_detector(bags)
     columns: tuple[Column, ...] = ()
@@ -51,8 +51,8 @@ def model_of(
         rests = gradients_at_rest(bags, sensors)
         columns = bank(sensors, rests, board_span(bags, reference), parts)
     if not any(len(bag.case.value) for bag in bags):
-        # Without a case thermometer the gradient is estimated from the board's rate, so the
-        # columns of the gradient would be linear combinations of those of the board.
+        # Without a case thermometer the gradient T_case - T_board is estimated from the board's
+        # rate, so its columns would be linear combinations of the columns of group `board`.
         columns = tuple(column for column in columns if not column.is_of_sensor)
     if options.groups is not None:
         groups = {*options.groups, *options.forced}
@@ -69,8 +69,8 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     fit = _with_lags(windows, problem)
     has_case = all(len(bag.case.value) for bag in bags)
     has_choice = has_case and options.prior is None and options.detector is None
-    # The detector matters for two sets, if a model with two sets is chosen, or is at most one
-    # standard error worse and, on each axis, has less than 80 % of the chosen model's noise.
+    # The regime detector matters if a model with a set of curves per regime is chosen, or is at
+    # most one standard error worse and, on each axis, has under 80 % of the chosen model's noise.
     trials = fit.selected.trials
     chosen = next(trial for trial in trials if trial.is_chosen)
     limit = 0.8 * chosen.posterior.prior.sigma
@@ -87,7 +87,7 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     closed = replace(model, detector=replace(model.detector, end_condition='case'))
     undisturbed = fit.windows.data.undisturbed
     early = regress(windows_of(bags, closed, options, undisturbed=undisturbed), problem)
-    # Errors of left-out halves serve to limit the number of columns, not to compare detectors.
+    # Errors of left-out halves of the program limit the columns; they do not compare detectors.
     return early if is_better(fit.selected.score, early.selected.score, by_halves=False) else fit
 
 

@@ -54,7 +54,7 @@ def build_calibration(
     """Make a fit's calibration, with valid ranges that include those of the prior `known`."""
     (windows, regression, *_), posterior = fit, fit.posterior
     model, prior, state, layout = windows.model, posterior.prior, posterior.state, claim.layout
-    # Response columns in the covariance, with a weight or with zero weight.
+    # The response columns that have rows in the covariance; their weights may be 0.
     used = _of_columns(windows, np.any(layout.weights[:, 0] >= 0, axis=0))
     kinds = tuple(term.kind for term in nonlinearity.terms) if nonlinearity else ()
     to_file = file_jacobian(regression, layout, state, model, used, kinds)
@@ -143,10 +143,10 @@ def _valid_columns(
                 most = (upper - lower) ** order
                 valid = ranges.union((valid, (-most, most)))
         if k in of_parts and column.term.order % 2:
-            # A part lags in cooling and in heating, so the range of an odd power of its lag is
+            # A part lags both in cooling and in heating: the range of an odd power of its lag is
             # extended to the same values of opposite sign.
             valid = ranges.union((valid, (-valid[1], -valid[0])))
-        # A column whose weight is only that of curves over parts' temperatures is of group `part`.
+        # A column used only by curves over the temperatures of parts is of group `part`.
         group = PART if k in weighed and not alone[k] else column.group
         valid = valid if known is None else ranges.union((valid, column.range))
         result.append(replace(column, group=group, range=valid))
@@ -166,7 +166,7 @@ def _provenance(
     residuals: Sequence[ResidualRow],
     findings: Sequence[Finding],
 ) -> Provenance:
-    # The left-out RMS of ``|f| - g`` is stated only if every position was scored when left out.
+    # The left-out RMS of ``|f| - g`` is stated only if left-out fits determine |f| everywhere.
     is_norm = bool(np.isfinite(fit.selected.score.norms.square).all())
     now = datetime.now(timezone.utc)
     end_s = 1e-9 * max(bag.end_ns for bag in bags)
@@ -204,7 +204,7 @@ def blank_terms(columns: Iterable[Column]) -> tuple[ResponseTerm, ...]:
 
 
 def parameters_of(calibration: Calibration) -> Floats:
-    """Return the parameters in the order of the file's posterior; levels of the scale are 0."""
+    """Return the parameters in the order of the file's posterior, 0 for constant scale errors."""
     values: list[float] = []
     pairs = zip(calibration.static.axes(), calibration.dynamic.axes(), strict=True)
     for axis, (reference, sets) in enumerate(zip(calibration.axes, pairs, strict=True)):
@@ -228,7 +228,7 @@ def with_parameters(
     """
     Replace the scale factors and the parameters of a calibration.
 
-    `values`: parameters in the order of the posterior; the levels of the scale are not used
+    `values`: parameters in the order of the posterior; constant scale errors are not used
     """
     layout = parameter_layout(calibration)
     levels = values[[bias.static for bias in layout.bias]]

@@ -6,7 +6,7 @@ not determine, and for effects that the model lacks.
 
 The standard deviation of mounting and turn-on offsets, unless the user states it, is marginalised:
 the covariance is that of a mixture of fits on a grid of this standard deviation. The weight of a
-fit is the fit's evidence, limited by the evidence of the positions' norms, times a prior of the
+fit is the fit's evidence, limited by the evidence of |f| in the positions, times a prior of the
 offset sd (half-Student [1]_ without a prior calibration). An error of local gravity, included in
 the covariance, changes all scale factors by the same ratio.
 
@@ -89,8 +89,8 @@ def claim_of(fit: Fit, gravity_sd: float = 0.0, known_offset_sd: float = 0.0) ->
         by_offset = np.array([point.by_offset(axis) for axis in range(3)])
         covariance = covariance + turn_on_variance * (by_offset.T @ by_offset)
     if fit.typical is not None:
-        # `_widened` computes the covariance for the mounting sd of the mode, so the variance that
-        # mixtures, jackknife and turn-ons have added is added to the result.
+        # `_widened` computes the covariance for the sd of mounting offsets at the mode, so the
+        # variance that mixtures, jackknife and turn-ons have added is added to its result.
         excess = covariance - posterior.covariance
         layout, covariance = _widened(regression, posterior, fit.typical, fit.of_means)
         at = _places(posterior.layout, layout)
@@ -117,8 +117,8 @@ def _over_offsets(
     n_mountings = int(windows.mounting[-1]) + 1
     is_single = windows.n_turn_ons == 1 < n_mountings
     if scale <= 0.0:
-        # A stated offset sd also holds for the turn-on. The regression's offsets of m mountings
-        # have a mean with 1 / m of the variance; 1 - 1 / m of the variance is added.
+        # A stated offset sd also holds for a turn-on. The mean of the regression's m mounting
+        # offsets has 1 / m of the variance; the remaining 1 - 1 / m of the variance is added.
         variance = offset_sd**2 * (1.0 - 1.0 / n_mountings) if is_single else 0.0
         return posterior.covariance, offset_sd, variance
     kind = 'mounting' if is_single or windows.has_turn_ons else 'both'
@@ -193,7 +193,7 @@ def _widened(
     is_of_means = np.mean(within**2, axis=0) < np.mean((regression.columns - within) ** 2, axis=0)
     weights = np.where(is_of_means, of_means.weights, state.weights)
     other = replace(of_means, weights=weights)
-    # Columns that only the fit to the means has need rows in the covariance: give them a tiny sd.
+    # Columns active only in the fit to the means need rows in the covariance: set a tiny sd.
     is_used = other.weights.any(axis=1) & (prior.column_sd == 0.0)
     prior = replace(prior, column_sd=np.where(is_used, 1e-9, prior.column_sd))
     with_unseen = regression.solve(state, prior, n_steps=0)
@@ -210,7 +210,7 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
     sqrt(S)``, S being the information about the weight given the active columns. A column whose
     bound exceeds two sd of a window's noise enters the covariance with zero weight, and with
     the bound, or its prior sd if smaller, as sd. In this comparison the bound of a nearly constant
-    column is scaled to the RMS of t [K].
+    column is scaled to the RMS of the board temperature t [K].
     """
     groups, prior = np.array(regression.windows.groups), posterior.prior
     kelvins = regression.windows.kelvins
@@ -226,7 +226,7 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
     sd[inactive.part, inactive.column] = 1.0 / np.sqrt(np.maximum(information, 1e-300))
     is_of_lags = np.isin(groups, LAGS)
     if not regression.windows.has_drifts:
-        # At constant temperatures only thermometer errors change the lags: no bound on weights.
+        # At constant temperatures only thermometer errors change lags, and do not bound weights.
         sd = np.where((sd > 0.0) & (regression.windows.lag >= 0), np.inf, sd)
     sd = np.where(is_of_lags, sd, np.minimum(sd, typical))
     if CURVE in active:
@@ -237,14 +237,14 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
         slopes = np.sqrt(np.sum(square[:, is_curve] / kelvins[is_curve] ** 2, axis=1))
         of_curve = np.outer(slopes, kelvins)
         typical = np.minimum(typical, of_curve)
-        # A curve column that the data do not determine changes this slope by up to half the slope.
+        # A curve column that the data do not determine changes the curve's slope by up to a half.
         sd = np.where(groups == CURVE, np.minimum(sd, 0.5 * of_curve), sd)
     # The variance of n lags is limited to that of one lag, so each lag gets 1 / n of the variance.
     is_lag = is_of_lags & (sd > 0.0)
     share = np.sqrt(np.maximum(is_lag.sum(axis=1, keepdims=True), 1))
     sd = np.where(is_lag, np.minimum(sd, typical / share), sd)
     units = np.array([[1.0], [1.0 / (regression.gravity or 1.0)]])
-    # A column counts as constant if its temperature change (`kelvins`) is below 1 % of that of t.
+    # A column is nearly constant if its temperature change (`kelvins`) is below 1 % of t's change.
     is_constant = kelvins < 0.01 * float(kelvins[0])
     ratio = np.where(is_constant, float(kelvins[0]) / np.maximum(kelvins, 1e-9), 1.0)
     matters = (sd > 0.0) & (sd * ratio > 2.0 * float(np.mean(prior.sigma)) * units)
@@ -266,15 +266,15 @@ def _over_mountings(
         return _fits(regression, posterior, priors)
 
     fits = fits_with(tried)
-    # With a large mounting sd the attitudes absorb errors of the model, which increases the log
-    # evidence; at most the increase of the norms' log evidence plus `CLEAR_GAIN` counts.
+    # With a large sd of mounting offsets attitudes absorb errors of the model, which raises the
+    # log evidence; at most the rise of the log evidence of |f| plus `CLEAR_GAIN` counts.
     of_data = np.array([fit.log_evidence for fit in fits])
     of_norms = _norm_evidence(regression, posterior, tried, fits[-1].root)
     nearest = int(np.argmin(np.abs(np.log(tried * n_rests**0.5 / prior.offset_sd))))
     of_data, of_norms = of_data - of_data[nearest], of_norms - of_norms[nearest]
     evidence = np.minimum(of_data, of_norms + CLEAR_GAIN)
     if n_rests > 1.0:
-        # The rests of a mounting share its offset: only the means of mountings determine the sd.
+        # The rests of a mounting share its offset: only mountings' means determine the offset sd.
         fits, evidence = fits_with(n_rests**0.5 * tried), of_norms
     covariance, weight = _mixture(posterior, fits, evidence + log_prior)
     return covariance, float(np.sqrt(weight @ tried**2))
@@ -313,7 +313,7 @@ def _norm_evidence(
     regression: Regression, posterior: PosteriorMode, offset_sd: Floats, by_drifts: Floats
 ) -> Floats:
     """
-    Return the log evidence, up to a constant, of mountings' mean norms for k offset sds, (k,).
+    Return the log evidence, up to a constant, of the mountings' mean |f| for k offset sds, (k,).
 
     `by_drifts`: root of the unit's covariance at the largest offset sd, at which drifts alone
     determine the thermal weights; only the rows of these weights are used
@@ -324,7 +324,7 @@ def _norm_evidence(
     weight = np.add.reduceat(regression.weight, first)
     residual = regression.weight[:, None] * regression.residual(state, layout)
     residual = np.add.reduceat(residual, first) / weight[:, None]
-    # Covariance of the norms, without the mounting offsets.
+    # Derivatives and errors of |f|, averaged over each mounting; the errors contain its offset.
     errors = np.sum(point.norm_by_axes * (residual + state.offset), axis=1)
     first = np.flatnonzero(np.diff(regression.windows.mounting, prepend=-1))
     rows = np.column_stack((along, errors, np.ones(len(along))))

@@ -59,11 +59,11 @@ def worst_sd(covariance: Floats) -> float:
 def next_direction(covariance: Floats, sd: float, positions: Floats) -> Floats:
     """
     Find the direction of a new position, of noise `sd` [g], that most reduces the variance of the
-    force in the mean of all attitudes.
+    force, averaged over all attitudes.
 
-    A face of a cube, which is the easiest to hold, is preferred if its reduction is at least half
-    of the largest reduction, then an edge, then a corner. Directions closer than 20 degrees to a
-    direction in `positions`, shape (n, 3), are not proposed.
+    A face of a cube, the easiest to hold, is preferred if it reduces the variance of the force at
+    least half as much as the best direction, then an edge, then a corner. Directions closer than
+    20 degrees to a direction in `positions`, shape (n, 3), are not proposed.
     """
     columns = force_columns(_SPHERE)
     weight = np.einsum('nij,nik->jk', columns, columns) / len(columns)
@@ -109,7 +109,7 @@ def n_directions(means: Floats) -> int:
 
 def rough_centre(means: Floats) -> Floats:
     """
-    Return the reading at zero force: 0, or the centre of a fitted sphere if the norms differ.
+    Return the reading at zero force: 0, or the centre of a sphere if the readings' norms differ.
 
     `means`: mean readings, shape (n, 3). The result is 0 for fewer than four readings, readings in
     a plane or almost one attitude, and an implausible sphere.
@@ -144,7 +144,7 @@ def rough_centre(means: Floats) -> Floats:
 
 
 def geometry(up: Floats, with_misalignment: bool) -> float:
-    """Return the ratio of the largest sd of a constant to the noise sd of |f|, inf if unknown."""
+    """Return the largest sd of a constant over the noise sd of |f|, inf if not determined."""
     jacobian = norm_columns(up)[:, : 9 if with_misalignment else 6]
     values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
     if values[0] < 1e-9 * values[-1]:
@@ -158,8 +158,8 @@ def best_rests(candidates: list[Floats]) -> int:
 
     The sd of the constants follows from the directions of the rests of a set and from the
     residuals of |f|. The best set is the first whose sd is within 2 % of the smallest sd: the
-    first sets have the longest, quietest rests. If no set of rests has six attitudes,
-    the first is taken.
+    first sets have the longest, quietest rests. If no set has six attitudes, the first set is
+    returned.
     """
     counts = [n_directions(means) for means in candidates]
     costs = np.array([
@@ -204,7 +204,7 @@ class LeastKnown:
 
 
 def least_known(calibration: Calibration, up: Floats) -> LeastKnown | None:
-    """Find the attitude of largest sd of |f|, None without covariance; `up`: positions, (n, 3)."""
+    """Find the attitude of largest sd of |f|; None without covariance; `up`: of the positions."""
     if calibration.posterior is None:
         return None
     layout = parameter_layout(calibration)
@@ -247,7 +247,7 @@ def _cube() -> Floats:
 
 
 def _spiral(n: int) -> Floats:
-    """Spread unit vectors evenly over the sphere."""
+    """Return n unit vectors spread evenly over the sphere, shape (n, 3)."""
     k = np.arange(n)
     z = 1.0 - (2.0 * k + 1.0) / n
     turn, radius = math.pi * (3.0 - math.sqrt(5.0)) * k, np.sqrt(1.0 - z * z)

@@ -146,7 +146,7 @@ def _has_drift(windows: ThermalWindows) -> bool:
 
 
 def _ramp_rates(windows: ThermalWindows) -> Floats:
-    """Return the board's rate [K/min], (n,); 0 where it is over twice the windows' slope."""
+    """Return the rate of T_board [K/min], (n,); 0 if over twice the slope between windows."""
     rate, edges = windows.rate * 60.0, windows.data.edges
     for rows in map(slice, edges[:-1], edges[1:]):
         if rows.stop - rows.start > 1:
@@ -223,7 +223,7 @@ def _judge_positions(up: Floats) -> Finding:
 
 
 def judge_coverage(least: LeastKnown | None) -> Iterator[Finding]:
-    """Advise a position if the largest sd of |f| is 3 times the positions' median or more."""
+    """Advise a position if the sd of |f| in an attitude is >= 3 times the positions' median."""
     if least is not None and least.sd_m_s2 >= 3.0 * least.seen_sd_m_s2:
         yield advice(
             'unseen',
@@ -237,14 +237,14 @@ def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator
     """
     Report the sd of mounting and turn-on offsets if the fit had to assume this sd.
 
-    `offset_sd`: published sd of the bias offset of a mounting [m/s^2]. Nine constants explain the
-    norms of nine positions, whatever the offsets; drifts of scale factors show only large offsets.
+    `offset_sd`: published sd of the bias offset of a mounting [m/s^2]. Nine constants explain |f|
+    in nine positions, whatever the offsets; drifts due to scale factors show only large offsets.
     """
     prior = fit.posterior.prior
     n, n_turn_ons = int(fit.windows.data.mounting[-1]) + 1, fit.windows.data.n_turn_ons
     if options.mounting_sd is not None or options.prior is not None or n < POSITIONS_NEEDED:
         return
-    assumed = f'the uncertainty assumes an sd of {ug_text(offset_sd)}: state --mounting-sd'
+    assumed = f'it is assumed to repeat to {ug_text(offset_sd)} (1 sd): state --mounting-sd'
     # Smallest number of turn-ons that determine the sd of turn-on offsets.
     needed = 4
     if n_turn_ons < min(n, needed):
@@ -268,8 +268,8 @@ def determines_misalignment(up: Floats) -> bool:
     Whether the number and the spread of positions are sufficient to estimate the misalignment M.
 
     The largest sd of a constant, divided by the noise of one position, must be at most 6. The
-    sd of a constant over the noise of a position is 1 for 18 well spread positions, 3 for nine,
-    and 4.5 to 8 for the six faces held three times each by hand.
+    largest sd divided by the noise is 1 for 18 well spread positions, 3 for nine, and 4.5 to 8 for
+    the six faces held three times each by hand.
     """
     distinct = distinct_directions(up)
     is_enough = len(distinct) >= POSITIONS_FOR_MISALIGNMENT
@@ -324,7 +324,7 @@ def judge_result(
     fit: Fit, overall: ResidualRow, norms: Floats, slow: float, options: FitOptions
 ) -> Iterator[Finding]:
     """
-    Check the residuals of a fit, `overall`: of all windows.
+    Check the residuals of a fit; `overall`: statistics of the residuals of all windows.
 
     norms: ``|f| - g`` of each window, shape (n,) [m/s^2]
     slow: sd of the bias offset of a mounting or turn-on [m/s^2]
@@ -357,7 +357,7 @@ def judge_result(
         yield Finding('residual', 'good', text)
     alone = overall.two_sets.rms
     # A bias offset of up to 2 sd (2 `slow`) after a new turn-on does not contradict the prior, nor
-    # does a residual that the initial lag states explain: then `sigma` is about the noise.
+    # does a residual that the initial lag states explain, which leaves `sigma` near the noise.
     contradiction, sigma = '', float(np.mean(prior.sigma))
     is_above = overall.fitted.rms > np.hypot(1.5 * alone, 2.0 * slow) and sigma > 1.5 * alone
     if options.prior is not None and is_above:

@@ -153,7 +153,7 @@ class Reduced:
         return sum(block.log_determinant for block in blocks if block is not None)
 
     def with_prior_of_sum(self, total: Floats, variance: float) -> Reduced:
-        """Add a prior (mean 0, `variance`) on the sum of the bags' lag states, now `total`."""
+        """Add a prior (mean 0, `variance`) on the bags' sum of lag states, at present `total`."""
         r = len(total)
         cross = self.bags.solved[:, :r].sum(axis=0, keepdims=True)
         cross[..., -1] += total
@@ -198,7 +198,7 @@ class Reduced:
 
     def eliminate_from(self, rows: Floats) -> tuple[Floats, Floats]:
         """
-        Eliminate the unknowns of positions and bags from the equations of m unknowns per axis.
+        Eliminate the unknowns of positions and bags from the equations of m new unknowns per axis.
 
         `rows`: products of the derivatives by the new unknowns with those by the unknowns of the
         fit and with the residual, shape (n_positions, 3, m, k + 1). Returns the reduction of the

@@ -44,7 +44,7 @@ def _is_far_above(square: Floats | float, usual: float) -> Bools:
 
 def contradicting_bag(fit: Fit) -> list[int]:
     """
-    Return, in a list, the number of a bag that may be of another environment; [] if none may.
+    Return, in a list, the index of a bag that may be of another environment; [] if none may.
 
     A bag is suspect if its left-out drift exceeds five times both the median over the bags and the
     white noise of a window. If the other bags do not determine the drift of exactly one bag, and
@@ -80,9 +80,9 @@ def contradiction(
     windows: ThermalWindows, known: Calibration, options: FitOptions
 ) -> tuple[list[int], bool]:
     """
-    Return the numbers of the bags whose drift the calibration `known` of their unit does not
+    Return the indices of the bags whose drift the calibration `known` of their unit does not
     explain with any lag states at start, or of all bags if these are more than half of the bags;
-    and whether the bags can update `known`: ``|f| - g`` is far above the drift and the claimed sd
+    and whether the bags can update `known`: ``|f| - g`` far exceeds the drift and the published sd
     of |f|, so that bias or scale has changed, too, or the bags have the six attitudes that
     determine bias and scale.
     """
@@ -114,7 +114,7 @@ def contradiction(
     may_update = bool(_is_far_above(float(np.mean(norm**2)), usual))
     is_far = _is_far_above(mean, 1.0)
     if np.mean(is_far) > 0.5:
-        # All bags are of one environment, whose effect on drifts is small in some attitudes.
+        # If most bags are far, all are of one environment: its effect is small in some attitudes.
         is_far[:] = True
     may_update |= len(distinct_directions(state.up)) >= POSITIONS_NEEDED
     return np.flatnonzero(is_far).tolist(), may_update
@@ -141,8 +141,8 @@ def with_excluded_error(
     calibration: Calibration, bags: Sequence[ReducedBag], others: str, *, is_updated: bool
 ) -> tuple[Calibration, Finding]:
     """
-    Add the drift, and the error of |f|, that remain in `bags` after the correction to the lack of
-    fit of both regimes.
+    Add to the lack of fit of both regimes the drift, and the error of |f|, that remain in `bags`
+    after the correction.
 
     `others`: text that names what these bags contradict, other bags or the prior; `is_updated`:
     whether `bags` were used in the fit

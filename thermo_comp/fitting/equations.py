@@ -3,7 +3,7 @@
 """
 Owns the measurement equation of the windows, and its linearisation.
 
-Equation of window w of position p and axis i, in m/s^2 of the nominal scale factor K0::
+Equation [m/s^2] of the mean reading N of window w, position p, axis i; K0: nominal scale::
 
     N / K0 = kappa a (1 + S s) + b + B beta + o_p + o_b + kappa (A l_p)_i g + noise,
     a = (A u_p)_i g,  A = M^-1,  kappa: scale factor / K0,  b: bias,  u_p: attitude,
@@ -67,7 +67,7 @@ class Equations(Series):
         )
 
     def norms(self, state: State) -> Floats:
-        """Return |f| of each position, without the error `State.stretch`, (n_positions,)."""
+        """Return |f| of each position, without its error `State.stretch`, (n_positions,)."""
         if self.forces is None:
             return np.full(self.windows.n_positions, self.gravity)
         return self.forces.norms(state.radius, np.zeros_like(state.stretch))
@@ -78,7 +78,7 @@ class Equations(Series):
         return np.asarray(self.forces.norms(state.radius, state.stretch)[:, None])
 
     def layout(self, used: Bools, nonlinear: Bools | None = None) -> Layout:
-        """Return the same object of `lay_out` for equal arguments; `nonlinear`: None for all."""
+        """Return `lay_out`'s result, cached; `nonlinear`: active coefficients, None for all."""
         if nonlinear is None:
             nonlinear = np.ones(self.n_coefficients, dtype=bool)
         key = used.tobytes() + nonlinear.tobytes()
@@ -176,7 +176,7 @@ class Equations(Series):
         Return index and factor (as in `Tangent`) of each active nonlinear coefficient's series.
 
         The factor 1 + S s of the scale multiplies the terms at the reference temperature. In the
-        terms' change per kelvin this factor is left out, as its effect is negligible.
+        terms' change per kelvin the factor of the scale is left out, as its effect is negligible.
         """
         active = np.flatnonzero(layout.nonlinear[0] >= 0)
         if self.forces is None or not len(active):
@@ -217,7 +217,7 @@ class Equations(Series):
         return np.asarray(np.einsum('nb,nib->ni', series, self.misfit(state, base)[position]))
 
     def force(self, state: State, rows: slice = slice(None)) -> Floats:
-        """Correct windows as the compensator does, with no mounting offsets, shape (n, 3)."""
+        """Return the force of windows, corrected as by the compensator, (n, 3) [m/s^2]."""
         active = np.flatnonzero(state.weights.any(axis=(0, 1)))
         columns, (on_bias, on_scale) = self.columns[rows, active], state.weights[:, :, active]
         along = self.measured[rows] - state.bias - columns @ on_bias.T

@@ -12,7 +12,7 @@ The lack of fit in a regime, near a temperature, is the mean square of the left-
 noise and the published variance of this drift. The lack of fit covers effects that no column
 describes, such as a kink of the curve, a tilt of the support or a drift of the bias. For models
 whose score is at most one standard error worse than that of the chosen model, half of the largest
-squared difference between the drift of such a model and that of the chosen model is added.
+squared difference of such a model's drift from the chosen model's is added to the lack of fit.
 """
 
 from __future__ import annotations
@@ -62,14 +62,14 @@ class PositionReport:
 @dataclass(frozen=True)
 class ResidualRow:
     """
-    Statistics of ``|f| - g`` over the windows of one section, after each step of the correction.
+    Statistics of ``|f| - g`` over the windows of a regime, after each step of the correction.
 
     section: regime of the windows, ``static``, ``dynamic`` or ``all``
     raw: corrected with the constants at the reference temperature
     one_set: corrected with one curve for both regimes; empty if each regime has its own curve
     two_sets: corrected with a curve for each regime
     fitted: corrected with the calibration, in sample
-    left_out: corrected by fits without the position; RMS drifts where these do not determine |f|
+    left_out: corrected by fits without the position; drift if such a fit does not determine |f|
     """
 
     section: str
@@ -93,7 +93,7 @@ def residual_rows(fit: Fit) -> tuple[tuple[ResidualRow, ...], Floats, Floats]:
     ]
     sizes = regression.norms(state)[regression.windows.position]
     residuals = [norm_residual(regression.force(step), sizes) for step in steps]
-    # If other positions do not determine the norm, the left-out error is the drift, RMS of axes.
+    # If other positions do not determine |f|, the left-out error is the RMS drift of the axes.
     norm = norm_residual(selected.score.force, sizes)
     drift = np.sqrt(np.mean(selected.score.drift**2, axis=1))
     left_out = np.where(np.isfinite(norm), norm, drift)

@@ -66,7 +66,7 @@ def fit(
     """
     Fit a calibration to bags of a thermal test.
 
-    Raises FitError if the data do not allow a fit, as without a still interval in a recording.
+    Raises FitError if the data do not allow a fit, as if a recording has no still interval.
     """
     check_serial(sources, options)
     if not sources:
@@ -79,7 +79,7 @@ def fit(
 
 
 def reduce_bag(source: FitSource, options: FitOptions) -> ReducedBag:
-    """Reduce a source to its statistics; raises FitError without samples or still intervals."""
+    """Compute the statistics of a source; FitError without samples or still intervals."""
     return _checked(_reduced(source, options))
 
 
@@ -105,7 +105,7 @@ def _checked(bag: ReducedBag) -> ReducedBag:
 def fit_bags(
     bags: Sequence[ReducedBag], options: FitOptions, progress: Progress = lambda _part: None
 ) -> FitResult:
-    """Fit a calibration to reduced bags; raises FitError if the bags do not allow a fit."""
+    """Fit a calibration to the statistics of bags; FitError if they do not allow a fit."""
     # One bag of a split recording may have no rest, so the bags are joined before the check.
     recordings = [_checked(bag) for bag in joined(bags)]
     # Threads would slow down the products of small matrices in the fit.
@@ -331,7 +331,7 @@ def _fit(
 def _judged(
     bags: Sequence[ReducedBag], options: FitOptions
 ) -> tuple[list[ReducedBag], list[Finding]]:
-    """Return the bags without thermometers that repeat the board's; findings on raw data."""
+    """Return the bags less the copies of the board's thermometer; and findings on raw data."""
     has_board = [bool(len(bag.board.value)) for bag in bags]
     if any(has_board) and not all(has_board):
         name = bags[has_board.index(False)].source.name

@@ -78,7 +78,7 @@ def settle(
 def _updated(
     regression: Regression, posterior: PosteriorMode, candidates: Candidates
 ) -> tuple[Prior, float]:
-    """Move prior sds and noises towards their modes; return also the largest change of a log."""
+    """Move prior sds and noises towards their modes; return also the largest log ratio."""
     prior, layout, determined = posterior.prior, posterior.layout, posterior.determined
     sd, power = prior.column_sd, np.sum(posterior.state.weights**2, axis=1)
     moves = (sd > 0.0) & ~candidates.fixed
@@ -110,7 +110,7 @@ def _updated(
 
     return moved, max(
         change('column_sd', moves & (effective > 0.3)),
-        # Offsets that the data do not determine do not count.
+        # A change of the sd of offsets that the data do not determine does not count.
         change('offset_sd') * bool(determined[layout.offset].sum() > 1.0),
         change('turn_on_sd') * bool(determined[layout.turn_on].sum() > 1.0),
         # An error of 15 % of the sd of tilts hardly changes the fit.
@@ -131,7 +131,7 @@ def _misalignment_sd(posterior: PosteriorMode) -> float:
     share = 1.5 * max(1.0 - 1.0 / max(gamma, 1.0), 0.0)
     square = share * np.sum(misalignment**2) + prior.misalignment_scale**2
     # The misalignment sd is limited to 0.03 rad, a value for separate sensors on a printed
-    # bracket: larger misalignments would explain the norms of six faces, to second order.
+    # bracket: larger misalignments would explain |f| on six faces, to second order.
     return min(float(np.sqrt(square / (share * gamma + 1.0))), 0.03)
 
 

@@ -85,7 +85,7 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     # similar amounts, so only the differences of |f| between positions determine the curve.
     everywhere = np.ones(windows.data.n_positions, dtype=bool)
     at_rest = replace(windows, data=rests.constant_in(windows.data, everywhere, everywhere))
-    # A regression reports progress from 0.7 to 0.95: map it to one half of this range for each.
+    # Each of the two regressions reports progress from 0.7 to 0.95: map it to half of this range.
     first = replace(problem, progress=lambda part: problem.progress(0.35 + 0.5 * part))
     second = replace(problem, progress=lambda part: problem.progress(0.475 + 0.5 * part))
     fit, of_drifts = _regress(at_rest, first, is_at_rest=True), _regress(windows, second)
@@ -101,7 +101,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     """Fit the windows; `is_at_rest`: whether the columns are set constant in each position."""
     data, options, start = windows.data, problem.options, problem.start
     known, n_directions = options.prior, problem.n_directions
-    # With a prior calibration, drifts in one attitude separate bias and scale: assume no bench.
+    # With a prior calibration, drifts in one heated attitude do separate bias and scale.
     is_bench = known is None and rests.is_bench(windows, problem.up)
     has_poses = n_directions < POSITIONS_NEEDED and rests.is_constant(windows, data.position)
     if (has_poses or n_directions == 1) and known is None and data.forces is None:
@@ -117,7 +117,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     state = initial_state(regression, start, problem.up)
     prior = _initial_prior(windows, problem)
     if n_directions >= POSITIONS_NEEDED and not data.has_turn_ons:
-        # Misalignments would explain turn-on offsets, no unknowns here: reduce the sd of M.
+        # Misalignments would explain turn-on offsets, which are no unknowns here: reduce M's sd.
         prior = _with_faces(prior, problem.up)
     steepness = _steepness(windows, problem, is_at_rest=is_at_rest)
     candidates = _candidates(windows, problem, steepness, is_bench=is_bench)
@@ -162,7 +162,7 @@ def _updating_priors(
     *others, widest = informative_priors(
         known, regression, state, windows.model, options, LARGE_OFFSETS * _mounting_scale(noise)
     )
-    # Few windows may be fitted exactly: the noise is at least half of that in the prior.
+    # Few windows may be fitted exactly: assume at least half of the prior calibration's noise.
     window_s = windows.typical_count * known.unit.cycle_time_s
     least = 0.5 * float(np.min(known.noise_density_m_s2_sqrt_hz)) / window_s**0.5
     prior = replace(
@@ -173,7 +173,7 @@ def _updating_priors(
     )
     if prior.offset_scale and (known_sd := offset_sd_of(known)):
         # The prior calibration states the sd of the bias over mountings and turn-ons, to a factor
-        # of two: larger changes of the norms are an ageing of the unit.
+        # of two: larger changes of |f| count as ageing of the unit.
         scale = min(prior.offset_scale, 2.0 * known_sd)
         offset_sd = prior.offset_sd if data.has_turn_ons else known_sd
         prior = replace(prior, offset_sd=offset_sd, turn_on_sd=known_sd, offset_scale=scale)
@@ -222,8 +222,8 @@ def _initial_prior(windows: ThermalWindows, problem: Problem) -> Prior:
 
 def _with_faces(prior: Prior, up: Floats) -> Prior:
     """
-    Return the prior with a smaller misalignment sd if a noisy sensor is only held on its faces:
-    there misalignments of some degrees would, to second order, explain any errors of |f|. The
+    Return the prior with a smaller misalignment sd if a noisy sensor is only held on its faces,
+    where misalignments of some degrees would, to second order, explain any errors of |f|. The
     published covariance keeps the sd of `prior`.
     """
     by_element = up[:, [1, 2, 2]] * up[:, [0, 0, 1]]
@@ -239,7 +239,7 @@ def _with_faces(prior: Prior, up: Floats) -> Prior:
 def _narrowed(prior: Prior, regression: Regression, state: State) -> Prior:
     """
     Return the prior for the selection of the columns: the sds of bias and scale are five times the
-    largest error of |f|, but 5 % to 100 % of those of `prior`. With wider priors, bias and scale
+    largest error of |f|, within 5..100 % of the sds of `prior`. With wider priors, bias and scale
     would take large values in a model that lacks columns, as few attitudes do not determine both.
     """
     norms = np.linalg.norm(position_means(regression.windows) / regression.nominal_scale, axis=1)
@@ -261,7 +261,7 @@ def _is_slow(windows: ThermalWindows) -> Bools:
 
 
 def _noise_in_1_hz(windows: ThermalWindows, scale: Floats) -> float:
-    """Return the noise of the samples in 1 Hz [m/s^2], the median of the axes; 0 if unknown."""
+    """Return the samples' noise in a 1 Hz bandwidth [m/s^2], median of axes; 0 if unknown."""
     data, inner = windows.data, windows.data.inner
     if not len(inner):
         return 0.0
@@ -270,10 +270,10 @@ def _noise_in_1_hz(windows: ThermalWindows, scale: Floats) -> float:
 
 
 def _mounting_scale(noise: float) -> float:
-    """Return the prior scale of mounting offsets [m/s^2]: 3 times the noise in 1 Hz, bounded."""
+    """Return the prior scale of mounting offsets [m/s^2], from the noise in a 1 Hz bandwidth."""
     # Bounds of the scale: 30 ug, typical of navigation grade, and 0.5 mg, of consumer MEMS; the
     # tail of the Student prior allows for larger offsets. With almost no noise the lower bound is
-    # 100 times the noise in 1 Hz, because an offset 1e6 times as large as the noise cannot be
+    # 100 times this noise, because an offset 1e6 times as large as the noise cannot be
     # estimated in double precision.
     least, most = max(min(3e-4, 100.0 * noise), 1e-7), 5e-3
     return float(np.clip(3.0 * noise, least, most))
@@ -325,7 +325,7 @@ def _typical_slopes(steepness: float, steepest: Floats, gravity: float) -> Float
 
 
 def _steepness(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool) -> float:
-    """Return the RMS change of a reading per kelvin, taken for a change of bias [m/s^2 per K]."""
+    """Return the RMS change of a reading per kelvin, attributed to the bias [m/s^2 per K]."""
     data, start = windows.data, problem.start
     within = within_positions(data.mean / start.scale, data.position)
     drift = float(np.sqrt(np.mean(within**2, axis=0)).max())
@@ -333,7 +333,7 @@ def _steepness(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool) -
         change = within_positions(windows.temperature[:, None], data.position)
         return drift / (float(np.sqrt(np.mean(change**2))) or 1.0)
     kelvins = float(np.std(windows.temperature)) or 1.0
-    # If the temperature differs between rests only, the drift appears in differences of their |f|.
+    # If only rests differ in temperature, the drift appears in differences of |f| between rests.
     force = (position_means(data) - start.bias) / start.scale
     sizes, norms = sizes_of(windows, problem.options), np.linalg.norm(force, axis=1)
     errors = norms - sizes

@@ -45,9 +45,9 @@ def _continues(part: ReducedBag, bag: ReducedBag) -> bool:
     is_at_1g = bag.source.force is None and part.source.force is None
     is_of_unit = bag.source.serial == part.source.serial
     # The overlap is at most 3 s, and at most a tenth of a part: recordings whose stamps all begin
-    # at 0 exceed this. The gap is at most 60 s, the time to turn the unit by hand and to start the
-    # recorder again. If the unit is nevertheless switched off and on in the gap, the offsets of
-    # its turn-ons count as those of mountings.
+    # at 0 exceed this. The gap is at most 60 s, to turn the unit and restart the recorder, or two
+    # sample intervals if longer. If the unit is nevertheless switched off and on in the gap, the
+    # offsets of its turn-ons count as those of mountings.
     overlap_s = min(3.0, 1e-10 * (part.end_ns - part.start_ns))
     is_next = -overlap_s < gap_s < max(60.0, 2.0 * bag.cycle_s)
     return bool(is_next and is_alike and is_at_1g and is_of_unit)

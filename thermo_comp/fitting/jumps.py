@@ -12,7 +12,7 @@ is almost constant in a rotation, or a gyroscope measures no rotation during the
 If a sensor has a low-pass filter, neighbouring samples have a correlation r, and the slow noise of
 the samples hides a step. The noise of the differences ``a_i - r a_(i-1)`` is white (generalised
 least squares for first-order noise), so a step within one sample is significant in these
-differences. A shock that decays is also significant there, so for a jump the mean levels of the
+differences. A decaying shock is as significant as a step, so for a jump the mean levels of the
 quiet samples before and after the step must differ, too.
 """
 
@@ -28,7 +28,7 @@ from ..typing import Floats
 from .reduction import ReducedBag
 from .sources import angular_velocity
 
-# Shortest time for the mean level before or after a gap [s].
+# Shortest time over which the level before or after a gap is averaged [s].
 _MARGIN_S = 10.0
 # Smallest number of samples before a step, and after it, for a test of the step.
 _FEWEST_SAMPLES = 8
@@ -65,7 +65,7 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     Two rests are compared if the gap between them is at most 30 s or 250 samples, whichever is
     longer, and their directions differ by less than 10 degrees.
     """
-    # At a low sample rate gaps are long: a rest is made of cells, usually of 30 samples each.
+    # At a low sample rate gaps are long: a rest consists of cells, usually of 30 samples each.
     longest_ns = 1e9 * max(30.0, 250.0 * bag.cycle_s)
     margin_s = max(_MARGIN_S, 120.0 * bag.cycle_s)  # at least 120 samples
     means = [np.average(rest.mean, axis=0, weights=rest.count) for rest in bag.intervals]
@@ -104,7 +104,7 @@ def _beside_gaps(
 
 
 def _margin(samples: Floats, quiet_sd: Floats) -> float:
-    """Return the time before and after a gap to use: 60 time constants of the noise, 10..100 s."""
+    """Return the time [s] to use beside a gap: 60 time constants of the noise, 10 to 100 s."""
     time, accel = samples[:, 0], samples[:, 1:4]
     if len(time) < 2 * _FEWEST_SAMPLES:
         return _MARGIN_S
@@ -216,8 +216,8 @@ def _place_of_step(time: Floats, accel: Floats, quiet_sd: Floats, r: float) -> i
     residual = residual - trend @ (trend.T @ residual)
     candidates = np.arange(_FEWEST_SAMPLES, n - _FEWEST_SAMPLES + 1)
     # A unit step at sample k, whitened for the lag-1 correlation r, is 1 at k and 1 - r after k.
-    # Its product with a residual is a sum over the samples from k on. The square of the whitened
-    # step, after removal of the trend, follows from such sums of the trend.
+    # The step's product with a residual is a sum over the samples from k on. The square of this
+    # whitened step, after removal of the trend, follows from such sums of the trend.
     tail = _sums_behind(residual, r)[candidates]
     trend_tail = _sums_behind(trend, r)[candidates]
     square = 1.0 + (1.0 - r) ** 2 * (n - candidates - 1) - (trend_tail**2).sum(axis=1)

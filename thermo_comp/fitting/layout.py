@@ -28,8 +28,8 @@ class Layout:
     start, turn_on: unknowns of each bag: initial lag states, and the bias offset of its turn-on,
         shapes (n_bags, r) and (n_bags, 3) or (n_bags, 0)
     own: attitude, error of |f|, bias offset and tilts of each position, shape (n_positions, k)
-    pose_of: number of each position's pose, -1 without one
-    bag: number of each position's bag
+    pose_of: index of each position's pose, -1 without a pose
+    bag: index of each position's bag
     n_unit, n: number of unknowns of the unit, and number of all unknowns
     """
 

@@ -91,7 +91,7 @@ class Folds:
         before, after = ((folds.square * folds.windows)[known] + 1e-300 for folds in (self, other))
         of_sums = float(np.log(before.sum() / after.sum()))
         if n == 1:
-            # The standard error of a single fold is unknown: the least log ratio that matters.
+            # The standard error of a single fold is unknown: use the largest negligible log ratio.
             return of_sums, _NEGLIGIBLE_LOG_RATIO
         each = np.log(before / after)
         others = (np.maximum(square.sum() - square, 1e-300) for square in (before, after))
@@ -115,9 +115,9 @@ class Score:
     Left-out errors of a model.
 
     positions, sections: drift of left-out positions, and of left-out sections of the test
-    norms: ``|f| - g`` of left-out positions whose norm the other positions determine
-    force: force in each window, corrected by a fit without the window's position; NaN if the norm
-        of this position is not scored, shape (n, 3)
+    norms: ``|f| - g`` of left-out positions in which the other positions determine |f|
+    force: force in each window, corrected by a fit without the window's position; NaN if |f| of
+        this position is not scored, shape (n, 3)
     drift: drift of each window by a fit without its position or, if that fit does not determine
         the drift, without its section, shape (n, 3)
     halves: drift of left-out halves of the test, at temperatures that occur in the other half
@@ -174,9 +174,9 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
 
     The gain is the sum of the log ratios (`Folds.gain_of`) of the drift of positions and of
     sections. If the drifts of both models agree to 5 %, the gain is the log ratio of the errors of
-    left-out norms, if that exceeds two standard errors. `by_halves`: whether an increased error of
+    left-out |f|, if that exceeds two standard errors. `by_halves`: whether an increased error of
     left-out halves of the chamber program, a sign of too many columns, excludes a gain. Increased
-    errors of left-out norms exclude a gain, and so does an increased expected error of the settled
+    errors of left-out |f| exclude a gain, and so does an increased expected error of the settled
     bias, unless noise explains the drift. A drift that noise explains need not decrease: left-out
     bags of soaks contain no effects of ramps.
     """
@@ -203,7 +203,7 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
 
 
 def is_worse_by_norms(before: Score, after: Score) -> bool:
-    """Whether errors of left-out norms are larger in `after`, by more than a standard error."""
+    """Whether errors of left-out |f| are larger in `after`, by more than a standard error."""
     norms = before.norms.gain_of(after.norms)
     return norms is not None and norms[0] < -norms[1]
 
@@ -211,7 +211,7 @@ def is_worse_by_norms(before: Score, after: Score) -> bool:
 def is_undecided(before: Score, after: Score) -> bool:
     """
     Whether left-out data do not decide between two models, of which `after` is not better: the
-    drifts agree to 5 %, and errors of norms are not scored for both models, or are smaller in
+    drifts agree to 5 %, and errors of |f| are not scored for both models, or are smaller in
     `after` by one to two standard errors.
     """
     *drift, norms = _beyond_thermometer(before, after)
@@ -228,8 +228,8 @@ def is_near(chosen: Score, other: Score) -> bool:
 def _beyond_thermometer(before: Score, after: Score) -> list[tuple[float, float] | None]:
     """
     Return the log ratios of `Score.kinds` (`Folds.gain_of`), None for a kind whose errors a coarse
-    thermometer explains. Such errors repeat in all bags of one chamber program: a model of
-    these errors is better on left-out bags, but fails in another program.
+    thermometer explains. Errors of a thermometer repeat in all bags of one chamber program: their
+    model is better on left-out bags, but fails in another program.
     """
     is_known = before.norms.rms > _NOISE_RATIO * before.by_thermometer
     keep = (not before.is_by_thermometer, not before.is_by_thermometer, is_known)
@@ -296,7 +296,7 @@ def _sd_of_changes(posterior: PosteriorMode, columns: Floats) -> float:
 def _by_positions(
     regression: Regression, posterior: PosteriorMode
 ) -> tuple[Folds, Folds, Floats, Floats]:
-    """Leave out each mounting; return folds of drift and norm, corrected force, and drift."""
+    """Leave out each mounting; return `Folds` of drift and |f|, windows' force and drift."""
     windows, share = regression.windows, regression.weight / regression.windows.weight
     point, edges = regression.at(posterior.state, posterior.prior), windows.edges
     counts = np.diff(edges).astype(np.float64)
@@ -348,7 +348,7 @@ def _is_drift_determined(
 
 def _is_norm_determined(point: Point, posterior: PosteriorMode, root: Floats, p: int) -> bool:
     """
-    Whether the variance of the norm of position `p`, by a fit of covariance ``root @ root.T``, is
+    Whether the variance of |f| in position `p`, by a fit of covariance ``root @ root.T``, is
     below ten times the sum of this variance by a fit of all positions and of the offsets.
     """
     if not point.regression.gravity:

@@ -181,11 +181,11 @@ class _TermFits:
         return self.posterior(used).log_evidence - self.posterior(used - dropped).log_evidence
 
     def left_out_gain(self, used: _Active, dropped: _Active) -> tuple[float, float]:
-        """Return the gain (`Folds.gain_of`) by `dropped` in the errors of left-out norms."""
+        """Return the gain (`Folds.gain_of`) in left-out |f| by the coefficients `dropped`."""
         return self.score(used - dropped).norms.gain_of(self.score(used).norms) or (0.0, 0.0)
 
     def is_determined(self, used: _Active, at: int) -> bool:
-        """Whether the data determine a nonlinear coefficient, in the mean of the axes."""
+        """Whether the data determine a nonlinear coefficient, averaged over the axes."""
         posterior = self.posterior(used)
         share = posterior.determined[posterior.layout.nonlinear[:, at]]
         return bool(share.mean() > _DETERMINED_SHARE)
@@ -203,7 +203,7 @@ class _TermFits:
 def choose(
     regression: Regression, selected: Selected, options: FitOptions
 ) -> tuple[Selected, tuple[NonlinearTerm, ...]]:
-    """Choose the nonlinear terms, and which depend on temperature; a prior's terms are kept."""
+    """Choose nonlinear terms, and their changes per kelvin; a prior's terms are kept."""
     forces = regression.forces
     if forces is None or options.prior is not None:
         return selected, ()

@@ -70,11 +70,11 @@ class FitOptions:
     serial: serial of the unit, or None for the serial of the sources
     input: unit of the samples
     full_scale: magnitude of a saturated sample [input units], or None for 32767 counts or, in
-        m/s^2, for the smallest usual range that contains the data
+        m/s^2, for the smallest usual range 10 % above all samples
     offset: code at zero force, such as 32768, or None to estimate it from the bags
     reference_temperature: T_ref [degC], 20 in Golovach's paper
     detector: thermometer and detector settings, or None to estimate them from the bags
-    min_rest_s: length of the shortest rest [s], or None for 1, 2 or 3 s, chosen by the rests
+    min_rest_s: length of the shortest rest [s], or None to choose 1, 2 or 3 s from the data
     still_sd: largest sd of the samples at rest [m/s^2]
     allow: names of the refusals of data, of `REFUSALS`, that the user overrides
     """

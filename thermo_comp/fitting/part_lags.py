@@ -185,7 +185,7 @@ class _PartCurves:
     def _is_of_use(
         self, lag: Part, axis: int, noise: float, most_noise: float = 3.0, reduction: float = 4.0
     ) -> bool:
-        """Whether the residual is below `most_noise` noises or reduced by `reduction` or more."""
+        """Whether residual / noise <= `most_noise`, or `self.reduction` is >= `reduction`."""
         typical = 1.4826 * np.median(np.abs(self._weighted(lag, axis) / self._root_weight[:, 0]))
         return bool(typical <= most_noise * noise or self.reduction(lag, axis) >= reduction)
 
@@ -228,8 +228,8 @@ class _PartCurves:
         Add a share of the gradient to a lag or, without a case thermometer, a positive lead time,
         if the residual then is significantly smaller.
 
-        The residual is linearised in the time constant and in the share or lead. The sum of its
-        squares must decrease by a factor that white residuals reach with a probability of 1e-5.
+        The residual is linearised in time constant and in share or lead. The sum of squared
+        residuals must decrease by a factor that white residuals reach with a probability of 1e-5.
         """
         tau = lag.tau_s
         if not tau:
@@ -356,7 +356,7 @@ class _PartCurves:
         """Return the residuals of an axis times the roots of the windows' weights, shape (n,)."""
         series, measured = self._series(lag, axis), self._measured[:, axis]
         normal, right = series.T @ series, series.T @ measured
-        # Regressors of any magnitude are divided by their size.
+        # Regressors are divided by their norms, because their magnitudes differ.
         size = np.sqrt(np.diag(normal)) + 1e-12
         normal = normal / np.outer(size, size)
         normal[np.diag_indices_from(normal)] += 1e-7  # a ridge, for nearly collinear regressors
@@ -401,7 +401,7 @@ class _PartCurves:
 
 def _in_two_stages(lag: Part) -> Part:
     """Split a lag of one stage into two stages, as the start of a search."""
-    # Two stages have almost the residual of one stage with the sum of their time constants.
+    # Two stages leave almost the same residual as one stage with the sum of both time constants.
     tau, _, share, lead = lag
     return Part(0.8 * tau + 1.0, 0.2 * tau + 1.0, share, lead)
 

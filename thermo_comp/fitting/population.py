@@ -44,11 +44,11 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     """
     Make the prior of a type of unit from calibrations of at least three units.
 
-    Raises FitError for fewer than three calibrations, for two of one unit or one without
+    Raises FitError for fewer than three calibrations, two of the same unit, a calibration without
     covariance, or if the calibrations differ in the input unit, the reference temperature, the
     sensors or the form of the curves.
     """
-    # Nonlinear terms are left out: few calibrations have them, as a centrifuge determines them.
+    # Leave out nonlinear terms: they need |f| above 1 g, as in a centrifuge; few units have any.
     calibrations = [without_terms(each) for each in calibrations]
     _check_alike(calibrations)
     keys: dict[Column, list[Column]] = {}

@@ -31,7 +31,7 @@ from .windows import Model, Sets
 
 
 def prior_columns(calibration: Calibration) -> tuple[Column, ...]:
-    """Return the response columns; FitError for a term of one regime, as in format version 1."""
+    """Return the response columns; FitError for a term of one regime only (format version 1)."""
     for term in calibration.response:
         if term.during != 'always':
             raise FitError(
@@ -67,7 +67,7 @@ def constants_of(calibration: Calibration) -> ConstantCalibration:
 
 
 def offset_sd_of(calibration: Calibration) -> float:
-    """Return the smallest sd of any axis of a mounting's or turn-on's bias offset [m/s^2]."""
+    """Return the sd of the bias offset of a mounting or turn-on, smallest of axes [m/s^2]."""
     axes = [axis for part in calibration.regime_sets() for axis in part.axes()]
     return min(axis.residual_sd_m_s2 for axis in axes)
 
@@ -96,7 +96,7 @@ def informative_priors(
     usual_ageing: float = 1.0,
 ) -> Iterator[InformativePrior]:
     """
-    Return priors from a calibration for several amounts of ageing. The fit compares their log
+    Return priors from a calibration for several amounts of ageing. The fit compares priors by log
     evidence plus the log density of the ageing: half-Student, of scale `usual_ageing` [m/s^2].
 
     The fit begins with the last, widest prior. A calibration without covariance raises FitError.
@@ -106,8 +106,8 @@ def informative_priors(
             'the prior has no covariance: use a calibration that was fitted to bags; an imported '
             'calibration cannot be a prior'
         )
-    # The priors to try: stated ageing, or ageing, the sd of the biases [g] and of the scale
-    # factors; and `share`, the ratio of uncorrelated variances to add to those of the prior.
+    # Pairs to try: the ageing, sd of biases [g] and of scale factors (0: as the user states); and
+    # `share`, the ratio of uncorrelated variances to add to the variances of the prior.
     tried = [(0.0, share) for share in (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)]
     # The fit begins with the last, widest prior: in a first fit with a narrow prior, the noise
     # would absorb changes of the unit.

@@ -152,7 +152,7 @@ def _why_dead(bags: Sequence[ReducedBag], dead: Sequence[_DeadAxis]) -> str:
     is_at_top = np.isclose([abs(axis.value) for axis in dead], largest, rtol=1e-4, atol=0.0)
     ends = {(axis.axis, axis.value > 0.0) for axis in dead}
     if not largest or not is_at_top.all() or len(ends) == 1:
-        return 'the axis is dead there, leave out a bag with a dead axis'
+        return 'the axis is dead; leave out each bag with a dead axis'
     # The advised full scale is just below the clipped reading, which counts as saturated.
     limit = f'--full-scale {largest * (1.0 - 1e-4):.5g}'
     return (
@@ -246,7 +246,7 @@ def judge_missing(bags: Sequence[ReducedBag], windows: ThermalWindows) -> Iterat
 def _missing(bag: ReducedBag, track: Track) -> tuple[float, float, float]:
     """
     Count a bag's samples at rest: all; those before the estimate of the board temperature is
-    accurate; later ones without a temperature, but between readings of each thermometer.
+    accurate; later samples without a temperature, but between readings of each thermometer.
     """
     read = [readings.stamp_ns for readings in bag.temperatures.values() if len(readings.stamp_ns)]
     begin_s = 1e-9 * (max(stamp_ns[0] for stamp_ns in read) - bag.start_ns)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the reduction of a bag: still intervals and their windows, temperature readings, counters.
+Owns the statistics of a bag: still intervals, their windows, temperature readings, counters.
 
 The blocks of a bag are read once, in bounded memory. Samples are averaged to cells of about half a
 second (see `stillness`), and the cells of a still interval to windows of ten seconds. Windows of a
@@ -54,7 +54,7 @@ class StillInterval:
     start_ns, end_ns: stamps of the middles of the interval's first and last cell
     begin_s: start of the interval's first window, since the bag's first sample [s]
     n_whole: number of windows of full length; a shorter last window may follow them
-    time, count, mean: by window, mean time since the first sample [s], number and mean of samples
+    time, count, mean: each window's time since the first sample [s], number and mean of samples
     sample_sd: root of the median over the cells of the variance of single samples, shape (3,)
     rounding_sd: sd of the error of the mean by rounding; 0 if samples have noise, shape (3,)
     angular_rate: mean angular rate of each window [rad/s], or None if samples of the bag lack it
@@ -92,7 +92,7 @@ class ReducedBag:
     since_s: time from the bag's first sample to the part of the bag that was read [s]
     restless: reason why the bag cannot be used, such as no rests; '' if the bag can be used
     angular_rate: whether none, a part or all of the bag's samples have a finite angular rate
-    n_spikes: number of readings of each thermometer left out, over 10 K from those about them
+    n_spikes: number of left-out readings of each thermometer, over 10 K from their neighbours
     n_glitches: number of single samples far from their neighbours, which are left out
     n_repeated: number of dropped samples with the same stamp as the preceding sample
     parts: the bags that were joined to this recording, see `joining`; () for a single bag
@@ -232,7 +232,7 @@ def _reduced(
     still_sd: float,
     fewest_windows: int,
 ) -> tuple[ReducedBag, float]:
-    """Reduce a source with the cells of `accumulator`; return also the length of a cell [s]."""
+    """Return a source's statistics from the cells of `accumulator`, and a cell's length [s]."""
     reading = _Pass(source, accumulator)
     cells = reading.cells
     if source.force is None:
@@ -299,7 +299,7 @@ def _cycle_s(cells: Cells) -> float:
 
 
 def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
-    """Keep plausible readings with rising stamps; average those of over 10 Hz over 0.2 s."""
+    """Keep plausible readings with rising stamps; average readings above 10 Hz over 0.2 s."""
     stamp_ns, value = np.asarray(stamp_ns, np.int64), np.asarray(value, np.float64)
     before = np.concatenate((last_ns if len(last_ns) else stamp_ns[:1] - 1, stamp_ns[:-1]))
     use = (value >= COLDEST) & (value <= HOTTEST)
@@ -318,15 +318,15 @@ def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
 
 
 def is_spike(value: Floats) -> Bools:
-    """Return which readings are over 10 K from the median of the five about them, shape (n,)."""
-    # A thermometer with a loose contact reads -127 or 85 degC for a moment. The fit estimates its
-    # noise without such readings, so that the tracker rejects them as outliers.
+    """Return which readings are over 10 K from the median of five readings about them, (n,)."""
+    # A thermometer with a loose contact reads -127 or 85 degC for a moment. Thermometer noise is
+    # estimated without such spikes, so that the tracker rejects them as outliers.
     far = np.zeros(len(value), dtype=bool)
     if len(value) > 4:
         middle = np.median(sliding_window_view(value, 5), axis=1)
         far[2:-2] = np.abs(value[2:-2] - middle) > 10.0
-        # The first reading, and the last, has neighbours on one side only. A large step to its
-        # neighbour belongs to a ramp if the following step is similar.
+        # The first reading, and the last, has neighbours on one side only. A large step at
+        # an end of the readings belongs to a ramp if the following step is similar.
         for place, nearest in ((0, value[:3]), (-1, value[:-4:-1])):
             step, after = np.abs(np.diff(nearest)).tolist()
             far[place] = step > 10.0 and after < CONTINUED_SHARE * step
@@ -344,7 +344,7 @@ def _max_abs(cells: Cells) -> float:
 def _rests(cells: Cells, min_rest_s: float | None, still_sd: float) -> list[tuple[int, int]]:
     """Find the rests, with the thresholds whose rests determine bias and scale best."""
     candidates: list[list[tuple[int, int]]] = []
-    # Largest ratio of a rest's variance to that of the quietest cells; smallest length of a rest.
+    # Values to try for the largest variance of a rest, relative to that of the quietest cells.
     ratios = tuple(stillness.VARIANCE_RATIO * 2.0**power for power in range(6))
     of_ratios = stillness.still_runs(cells, still_sd, ratios)
     for shortest_s in (3.0, 2.0, 1.0) if min_rest_s is None else (min_rest_s,):

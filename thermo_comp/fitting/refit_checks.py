@@ -23,7 +23,7 @@ from .windows import CURVE
 
 # Length of a piece of a rest in which a slow tilt of the support is taken as constant [s].
 _PIECE_S = 3600.0
-# Smallest number of positions whose left-out norms are scored, for a reliable standard error of
+# Smallest number of positions whose left-out |f| is scored, for a reliable standard error of
 # the gain by slow tilts.
 _FEWEST_NORMS = 6
 
@@ -50,8 +50,8 @@ def extrapolates(fit: Fit) -> bool:
 def may_have_slow_tilts(fit: Fit) -> bool:
     """
     Whether the hourly mean drifts of left-out positions exceed 6 times their noise and a tenth of
-    the error of left-out norms, of which at least `_FEWEST_NORMS` must be known. Slow tilts change
-    the readings of axes across gravity, but hardly the norms.
+    the error of left-out |f|, known in `_FEWEST_NORMS` positions or more. Slow tilts change the
+    readings of axes across gravity, but hardly |f|.
     """
     score, data = fit.selected.score, fit.windows.data
     if np.isfinite(score.norms.square).sum() < _FEWEST_NORMS:
@@ -77,7 +77,7 @@ def _slow_drift(data: Windows, drift: Floats) -> tuple[float, float]:
 
 
 def is_better_with_tilts(fit: Fit, tilted: Fit) -> bool:
-    """Whether errors of left-out norms decrease if the supports may tilt from hour to hour."""
+    """Whether errors of left-out |f| decrease if the supports may tilt from hour to hour."""
     before, after = fit.selected.score.norms, tilted.selected.score.norms
     n_common = np.sum(np.isfinite(before.square) & np.isfinite(after.square))
     gain = before.gain_of(after)

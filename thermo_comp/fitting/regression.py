@@ -180,7 +180,7 @@ class Point:
         return step - self.solution[0][: self.layout.n_unit]
 
     def unit_step(self, matrix: Floats) -> tuple[Floats, Floats]:
-        """Return the unit's step and its Hessian's Cholesky factor, given `Reduced.matrix`."""
+        """Return the unit unknowns' step and Hessian's Cholesky factor; see `Reduced.matrix`."""
         n = self.layout.n_unit
         information, gradient, deviation = matrix[:n, :n], matrix[:n, n], self.deviation[:n]
         if not np.isfinite(information).all():
@@ -212,7 +212,7 @@ class Point:
     def linear_step(self) -> Floats:
         """Return the step in which damping keeps the nonlinear unknowns almost constant."""
         layout, local, unit = self.layout, self.normal.local.copy(), self.normal.unit.copy()
-        # A diagonal multiplied by 1e6 divides the step of these unknowns by about 1e6. With an
+        # A factor 1e6 on the diagonal divides the step of nonlinear unknowns by about 1e6. With an
         # informative prior, which correlates the unknowns, a factor far above 1e6 would cause
         # errors of double precision.
         at = [*range(2 + layout.stretch.shape[1]), *range(layout.of_axis.shape[1], layout.n_local)]
@@ -282,7 +282,7 @@ class Regression(Equations):
     _linearised: tuple[State, Layout, Floats, Tangent, Normal] | None = None
 
     def at(self, state: State, prior: Prior, grams: Floats | None = None) -> Point:
-        """Return the equations at a state without inactive weights, by default of all windows."""
+        """Return the equations at a state, inactive weights 0; `grams`: None for all windows."""
         layout = self.layout(prior.column_sd > 0.0, prior.nonlinear_sd > 0.0)
         grams = self.products(layout.used).of_positions if grams is None else grams
         return Point(self, without_inactive(state, layout), prior, layout, grams)

@@ -22,7 +22,7 @@ from .windows import LAGS, ThermalWindows
 def is_constant(windows: ThermalWindows, part: Ints) -> bool:
     """
     Whether the board temperature changes less (RMS) within positions, or within bags, than from
-    one position or bag to the next; `part`: number of position, or of bag, of each window, (n,).
+    one position or bag to the next; `part`: index of each window's position, or of its bag, (n,).
     """
     t = windows.temperature
     within = within_positions(t[:, None], part)[:, 0]
@@ -52,7 +52,7 @@ def is_steady(windows: ThermalWindows) -> Bools:
     """
     Return the positions whose temperatures, and their differences, change (RMS) by less than three
     sd of the estimated board temperature, shape (n_positions,). In such a position noise would
-    count as temperature changes that cause no drift: at three sd it is a ninth of the mean square
+    count as temperature changes without drift: at three sd noise is a ninth of the mean square
     change, and the fitted slopes would be a ninth too small.
     """
     data, model = windows.data, windows.model
@@ -65,7 +65,7 @@ def is_steady(windows: ThermalWindows) -> Bools:
 
 
 def is_without_drift(data: Windows, scale: Floats) -> Bools:
-    """Return positions whose RMS drift is within 3 times a window's noise, (n_positions,)."""
+    """Return positions whose RMS drift is at most 3 times a window's noise, (n_positions,)."""
     drift = within_positions(data.mean / scale, data.position) * np.sqrt(data.weight)[:, None]
     square = np.add.reduceat(drift**2, data.edges[:-1], axis=0) / np.diff(data.edges)[:, None]
     return np.asarray((square <= (3.0 * white_noise_of(data, scale)) ** 2).all(axis=1))
@@ -87,7 +87,7 @@ def constant_in(data: Windows, steady: Bools, settled: Bools) -> Windows:
 
 def poses_of(windows: ThermalWindows, up: Floats) -> Ints | None:
     """
-    Return the number of the pose of each position, -1 for a position without a pose, shape
+    Return the index of the pose of each position, -1 for a position without a pose, shape
     (n_positions,), or None if no position has a pose.
 
     `up`: attitudes, shape (n_positions, 3). The positions of an attitude form a pose if the unit

@@ -177,19 +177,19 @@ class Growth:
             progress(1.0 - part)
             if not better:
                 return chosen
-            # The smallest model that is not significantly worse than that of the largest gain.
+            # Choose the smallest model not significantly worse than the model of the largest gain.
             best = max(better, key=lambda trial: gain(chosen.score, trial.score))
             better.sort(key=lambda trial: len(trial.groups))
             chosen = next(t for t in better if t is best or not is_better(t.score, best.score))
 
     def with_bends(self, before: Trial, groups: Sequence[str]) -> list[Trial]:
-        """Fit `before` with further groups, then also with columns of `BEND`; return all fits."""
+        """Fit model `before` plus groups, then also with columns of `BEND`; return all fits."""
         added = tuple(group for group in groups if group in self.free)
         smooth = self.extended(before, added, self._candidates.typical)
         return [smooth, *self.trials(smooth, [BEND])]
 
     def lowest_degree(self, constants: Trial) -> Trial:
-        """Fit the curve with its first column, and with more if the log density clearly rises."""
+        """Fit the curve's first column, and further ones if the log density clearly rises."""
         prior, state = constants.posterior.prior, constants.posterior.state
         prior = replace(prior, offset_sd=prior.offset_scale or prior.offset_sd)
         number = np.cumsum(self._names == CURVE)
@@ -198,7 +198,7 @@ class Growth:
             self.fit(groups, state, prior, self._candidates.typical * (number <= degree))
             for degree in range(1, int(number[-1]) + 1)
         )
-        # Curves of high degree fit the norms of few positions exactly.
+        # Curves of high degree fit |f| in few positions exactly.
         for curve in larger:
             if log_density(curve.posterior) - log_density(chosen.posterior) > CLEAR_GAIN:
                 chosen = curve
@@ -238,8 +238,8 @@ def better_start(fits: Sequence[Trial]) -> Trial:
     """
     Choose by left-out data between fits begun with a small and with a large prior sd of mounting
     offsets. If left-out data do not decide, the fit begun with the large sd is chosen only if its
-    log density is larger by `CLEAR_GAIN`. Mounting offsets and misalignments explain the
-    norms of few positions equally well, but only misalignments predict the norm of a new position.
+    log density is larger by `CLEAR_GAIN`. Mounting offsets and misalignments explain |f|
+    in few positions equally well, but only misalignments predict |f| in a new position.
     """
     small, large = fits[0], fits[-1]
     evidence_gain = log_density(large.posterior) - log_density(small.posterior)
@@ -331,7 +331,7 @@ def fit_all(
     informative: Sequence[InformativePrior] = (),
 ) -> Selected:
     """Fit all columns, with the prior of `informative` whose fit has the largest log density."""
-    # Offsets of mountings would explain the norms of few positions as well as an ageing of the
+    # Offsets of mountings would explain |f| in few positions as well as an ageing of the
     # unit, so the sd of these offsets is constant until an informative prior is chosen.
     scale = prior.offset_scale
     prior = replace(prior, offset_scale=0.0 if informative else scale)
@@ -355,7 +355,7 @@ def finish(
     regression: Regression, chosen: Trial, candidates: Candidates
 ) -> tuple[PosteriorMode, Score]:
     """
-    Complete the chosen model: reduce the weights of outliers, drop columns of little evidence, try
+    Complete the chosen model: reduce the weights of outliers, drop columns of small gain, try
     a large sd of mounting offsets, and try slow noise.
 
     Slow noise may replace columns as the explanation of thermal effects, so it is kept only if the
@@ -369,7 +369,7 @@ def finish(
     large = LARGE_OFFSETS * prior.offset_scale
     is_noise = score.rms <= 4.0 * float(np.hypot(score.noise, score.by_thermometer))
     if prior.offset_sd < prior.offset_scale and is_noise:
-        # Nine constants explain the norms of nine positions, whatever the mounting offsets. The
+        # Nine constants explain |f| in nine positions, whatever the mounting offsets. The
         # drift of a scale factor is proportional to the specific force along its axis, so drifts
         # also determine mounting offsets, if the model explains the drifts.
         prior = replace(prior, offset_sd=large, turn_on_sd=large)

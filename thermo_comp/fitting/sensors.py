@@ -3,8 +3,8 @@
 """
 Owns the estimation of thermometer and detector settings from bags.
 
-The rates of temperature here are central differences over two minutes, which are not causal and
-need a recording. The lag and the ramps of the test that these rates show, and the noise of the
+Rates of temperature are central differences over two minutes, which are not causal and so need a
+recording. The lag and the ramps of the test that the rates show, and the noise of the
 readings, become settings of the thermometers and of the regime detector, which are causal.
 """
 
@@ -168,7 +168,7 @@ def _rate_histories(
 
 
 def _slowest_ramp(histories: Sequence[RateHistory], usual: float) -> float:
-    """Return 0.7 times the slowest rate of ramps over 10 min, RAMP_K_MIN to `usual` [K/min]."""
+    """Return 0.7 times the slowest ramp of > 10 min, from RAMP_K_MIN to `usual` [K/min]."""
     slowest = usual / 0.7
     for history in histories:
         is_ramp = np.abs(history.rate) > max(history.least_ramp, 0.1 / 60.0)
@@ -227,7 +227,7 @@ def gradients_at_rest(bags: Sequence[ReducedBag], sensors: Sequence[str]) -> dic
 
 
 def without_copies(bags: Sequence[ReducedBag]) -> tuple[list[ReducedBag], list[str]]:
-    """Return the bags without thermometers that repeat the board's readings; their names."""
+    """Return the bags less copies of the board's thermometer, and the names of the copies."""
     names = sorted(set.intersection(*({*bag.temperatures} for bag in bags)) - {'board'})
     copies = [
         name
@@ -252,7 +252,7 @@ def board_span(bags: Sequence[ReducedBag], reference: float) -> tuple[float, flo
 
 
 def readings_in_order(bag: ReducedBag, inputs: Sequence[str]) -> list[tuple[str, int, float]]:
-    """Return thermometer, stamp, value of readings by stamp; equal stamps as in `inputs`."""
+    """Return (thermometer, stamp, value) sorted by stamp, equal stamps in `inputs` order."""
     rows = [
         (name, stamp_ns, value)
         for name in inputs

@@ -47,7 +47,7 @@ class Whitener:
         n_steps = int(lengths.max())
         step = np.arange(n_steps)[:, None]
         self._is_there = step < lengths
-        #: Number of the window at each step in each position; 0 after a position's last window.
+        #: Index of the window at each step in each position; 0 after a position's last window.
         self._row = np.where(self._is_there, starts + step, 0)
         self._n = len(position)
         since = np.diff(time[self._row], axis=0, prepend=time[self._row[:1]])
@@ -63,7 +63,7 @@ class Whitener:
             time_s *= 10.0**0.5
         #: Upper bound of the correlation time in a search: half a decade above `times_s` [s].
         self._longest_s = time_s
-        #: Number of processes of flicker noise. Their correlation times are 3 windows times powers
+        #: Number of processes of flicker noise, with correlation times of 3 windows times powers
         #: of ten, up to a time at least as long as a position.
         self.n_flicker = 1 + math.ceil(math.log10(max(span_s / (3.0 * typical_s), 1.0)))
 
@@ -79,7 +79,7 @@ class Whitener:
         """
         Run the Kalman filter over series, (n, m), for k noises with equal numbers of processes.
 
-        Yields for step j: number of the j-th window of each position, whether the position has j
+        Yields for step j: index of the j-th window of each position, whether the position has j
         windows, innovations, (k, n_positions, m), and their variances [sigma^2], (k, n_positions).
         """
         times_s = np.array([[noise.times_s] for noise in noises])
@@ -151,7 +151,7 @@ class Whitener:
 
 
 def _vertex(values: Floats, at: int) -> float:
-    """Return the vertex of the parabola through the smallest value, `at`, and its neighbours."""
+    """Return the vertex, relative to `at`, of the parabola through three values; 0 at an end."""
     if not 0 < at < len(values) - 1:
         return 0.0
     before, here, after = values[at - 1 : at + 2].tolist()
@@ -166,8 +166,8 @@ class Base:
     lag its derivative w.r.t. the initial state of the lag; t, if there are nonlinear terms; the
     functions `Windows.tilt`; the readings of the three axes less their mean in the position.
 
-    columns: numbers of the active columns; lagged: indices in `columns` of columns with a lag
-    lag: number of the lag of each column in `lagged`
+    columns: indices of the active columns; lagged: indices in `columns` of columns with a lag
+    lag: index of the lag of each column in `lagged`
     at_start, t, tilts, measured: indices of the derivatives w.r.t. the initial lag states, of t,
         (1,) or (0,), of the functions `Windows.tilt`, and of the readings, in the base series
     """
@@ -182,7 +182,7 @@ class Base:
 
     @classmethod
     def of(cls, columns: Ints, lags: Ints, n_t: int, n_tilts: int) -> Base:
-        """Assign indices to the series; `lags`: number of the lag of each column, -1 for none."""
+        """Assign indices to the series; `lags`: index of each column's lag, -1 for none."""
         lagged = np.flatnonzero(lags[columns] >= 0)
         counts = 1 + len(columns), len(lagged), n_t, n_tilts, 3
         _, *places = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
@@ -201,7 +201,7 @@ class Products:
 
     means: mean of each series (not whitened) in each position, shape (n_positions, n_base)
     cells: sums over each cell, the windows of one position and section, (n_cells, n_base, n_base)
-    first: index of the first cell of each position; section: section number of each cell
+    first: index of each position's first cell; section: index of each cell's section
     """
 
     base: Base

@@ -57,7 +57,7 @@ def temperature_range(windows: ThermalWindows) -> Range:
 def soak_gradient(windows: ThermalWindows, known: Calibration | None) -> Range | None:
     """
     Return the gradient of the first sensor in soaks and its robust scatter [K]; both are those of
-    the prior calibration, `known`, if it has both. None without the sensor or without a soak.
+    the prior calibration, `known`, if it has both; None without the sensor or without a soak.
     """
     if known is not None and known.soak_gradient_k is not None:
         return known.soak_gradient_k
@@ -104,7 +104,7 @@ def _has_gradients(windows: ThermalWindows) -> bool:
 
 
 def usable_board_lag(windows: ThermalWindows) -> float:
-    """Return the lag of the board behind the case [s]; `USUAL_BOARD_LAG_S` if not 1..1e5 s."""
+    """Return the lag of the board behind the case [s]; outside 1..1e5 s the usual lag."""
     lag = _slope_of_gradient(windows)
     return lag if 1.0 <= lag <= 1e5 else USUAL_BOARD_LAG_S
 
@@ -122,7 +122,7 @@ def with_unseen_axes(
     """
     Add the error of extrapolated scale factors to the lack of fit of each regime, `lacks`.
 
-    `known`: calibration that was the prior, or None. At temperatures at which no position of the
+    `known`: calibration used as prior, or None. At temperatures at which no position of the
     bags determines the scale of an axis, the lack of fit of the axis is at least the prior's.
     """
     (lower, upper), (new_lower, new_upper) = _known_ranges(fit, known), _seen(fit, None)

@@ -28,9 +28,9 @@ MISALIGNMENT_SD = 1e-3
 
 def misalignment_scale(noise: float) -> float:
     """
-    Return the built-in prior sd of an element of the misalignment [rad], by the noise in 1 Hz
-    [m/s^2]. The sd is 1 mrad for a noise up to 10 ug (navigation grade, machined faces) and
-    proportional to a larger noise, up to 10 mrad (cross-axis sensitivity of consumer MEMS).
+    Return the built-in prior sd of an element of the misalignment [rad], by the noise in a 1 Hz
+    bandwidth [m/s^2]. The sd is 1 mrad for a noise up to 10 ug (navigation grade, machined faces),
+    and proportional to a larger noise, up to 10 mrad (cross-axis sensitivity of consumer MEMS).
     """
     return float(np.clip(10.0 * noise, MISALIGNMENT_SD, 1e-2))
 
@@ -40,15 +40,15 @@ class Windows:
     """
     The data of a fit: windows sorted by position and time, with every column of the table.
 
-    position, bag: number of each window's position (within one bag), and bag, from 0, shape (n,)
-    section: number of the section of the position, from 0, see `windows.N_SECTIONS`, shape (n,)
+    position, bag: index of each window's position (within one bag), and of its bag, shape (n,)
+    section: index of each window's section of its position, see `windows.N_SECTIONS`, shape (n,)
     time: time since the bag's first sample [s], shape (n,)
-    weight: number of samples divided by the median number of a window, shape (n,)
+    weight: number of samples of each window, divided by the median of these numbers, shape (n,)
     mean: mean raw samples, in input units, shape (n, 3)
     columns: values of the columns in their physical units, with the initial lag states at their
         prior mean, shape (n, m)
     kelvins: temperature change that corresponds to each column's RMS [K]; 0: constant, shape (m,)
-    lag: number of the lag of each column; -1 for none, shape (m,)
+    lag: index of each column's lag; -1 for a column without lag, shape (m,)
     start: derivative of each column w.r.t. the initial state of its lag, shape (n, m)
     start_covariance: prior covariance of the initial lag states [K^2], shape (n_lags, n_lags)
     in_scale: whether each column may act on the scale as well as on the bias, shape (m,)
@@ -56,7 +56,7 @@ class Windows:
     forces: known |f| and nonlinear terms, or None if |f| is gravity in all positions
     undisturbed: factors (< 1: disturbed) of the weights, (n,), or None: the fit estimates them
     acts_on: axes on which each column acts, shape (m, 3); None if on all axes
-    pose: number of the pose of each position, -1 without a pose, shape (n_positions,), or None if
+    pose: index of each position's pose, -1 without a pose, shape (n_positions,), or None if
         the unit was never returned to an attitude
     board: board temperature [degC] and the variance of its estimate [K^2], (n, 2); None: unknown
     board_noise: sd of the noise of a reading of the board's thermometer [K]
@@ -111,13 +111,13 @@ class Windows:
 
     @cached_property
     def edges(self) -> Ints:
-        """First window of each position, then the number of windows, shape (n_positions + 1,)."""
+        """Index of each position's first window, then number of windows, (n_positions + 1,)."""
         return np.searchsorted(self.position, np.arange(self.n_positions + 1))
 
     @cached_property
     def mounting(self) -> Ints:
         """
-        Number of the mounting of each position, from 0, shape (n_positions,).
+        Index of each position's mounting, from 0, shape (n_positions,).
 
         Successive positions of a bag whose mean readings differ in direction by less than 2
         degrees are rests of one mounting, interrupted by a knock or a gap.
@@ -130,7 +130,7 @@ class Windows:
 
     @property
     def bag_of_position(self) -> Ints:
-        """Bag of each position."""
+        """Index of each position's bag, shape (n_positions,)."""
         return self.bag[self.edges[:-1]]
 
     @property
@@ -278,7 +278,7 @@ class State:
     radius: relative error of a centrifuge's radius, common to all positions, shape (1,) or (0,)
     stretch: relative error of the known |f|, shape (n_positions, 1) or (n_positions, 0)
     pose: upward unit vectors of the poses, shape (n_poses, 3)
-    pose_of: number of each position's pose, -1 without one, (n_positions,); (0,) without poses
+    pose_of: index of each position's pose, -1 without a pose, (n_positions,); (0,) without poses
     """
 
     kappa: Floats

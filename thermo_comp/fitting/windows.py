@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the table of windows and columns of the regression, made from reduced bags.
+Owns the table of windows and columns of the regression, made from the statistics of bags.
 
 Fit and compensator use the same thermal tracker and the same columns, of `unit.columns`, so a
 column has the same values in the fit and online.
@@ -89,7 +89,7 @@ class Model:
 
     name: name of the model in the provenance
     parts: the lag of the part of each axis, or None in a model without one lag per axis
-    sensors: thermometers other than the board's; the first is the case's
+    sensors: thermometers other than the board's; the first is that of the case
     """
 
     name: str
@@ -169,7 +169,7 @@ class ThermalWindows:
     The windows of a regression with their thermal states.
 
     data: means of the samples, and columns, for the regression
-    temperature, rate: of the board [degC, K/s], shape (n,); weight: of the dynamic set, shape (n,)
+    temperature, rate: board temperature [degC], its rate [K/s]; weight: of the dynamic set; (n,)
     gradient: T_case - T_board [K], shape (n,)
     raw: values u of the columns of the response, before they are limited to their ranges and
         multiplied by powers of t, shape (n, k)
@@ -293,7 +293,7 @@ def _rows(
 ) -> _Rows:
     """
     Average the windows of a rest selected by `use` to windows of 60 s, shorter in a short rest.
-    `states`: thermal states, (width, n); `begin_s`: time at which the lags begin [s]
+    `states`: thermal states, (width, n); `begin_s`: time of the initial lag states [s]
     """
     time, count = interval.time[use], interval.count[use]
     window_s = min(60.0, float(time[-1] - time[0]) / (FEWEST_WINDOWS - 1) or 60.0)
@@ -366,7 +366,7 @@ def _windows(
 
 
 def _settled(model: Model, spec: MemorySpec, rows: _Rows, table: ColumnTable) -> Floats:
-    """Return the columns at 9 board temperatures over the windows' range, lags settled, (9, m)."""
+    """Return the columns at 9 board temperatures over the windows' range, with lags settled."""
     board, is_static = rows.thermal[:, 0], rows.thermal[:, 3] <= 0.5
     some = is_static if is_static.any() else np.ones_like(is_static)
     states = np.zeros((StateLayout(spec).width, 9))
@@ -379,7 +379,7 @@ def _settled(model: Model, spec: MemorySpec, rows: _Rows, table: ColumnTable) ->
 
 
 def _sections(position: Ints, time: Floats) -> Ints:
-    """Return the section number of each window in its position, shape (n,)."""
+    """Return the index of each window's section in its position, shape (n,)."""
     first = np.searchsorted(position, np.arange(int(position[-1]) + 1))
     last = np.append(first[1:], len(position)) - 1
     begin, end = time[first][position], time[last][position]
@@ -413,7 +413,7 @@ def _part_kelvins(values: Floats) -> Floats:
 
 
 def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
-    """Run the tracker over the readings of a bag, at 5 states per window."""
+    """Run the thermal tracker over the readings of a bag, with 5 states per window."""
     spec = replace(spec, lags=(), plays=())
     if not len(bag.board.value):
         # Without readings, assume the reference temperature since 1e9 s, so that all lags are 0.

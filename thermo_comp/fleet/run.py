@@ -61,7 +61,7 @@ class FleetResult:
 
     @property
     def is_whole(self) -> bool:
-        """Whether every unit has a valid calibration, fitted to all of its bags, all complete."""
+        """Whether every unit has a valid calibration, and no bag is incomplete or left out."""
         return all(is_valid(row) and not (row['n_left_out'] or row['n_torn']) for row in self.rows)
 
 
@@ -77,7 +77,7 @@ def fit_fleet(
     progress: Callable[[int, int], None] = lambda *_: None,
 ) -> FleetResult:
     """
-    Fit all units without a stored result. Raises ThermoCompError if the folder of bags has none, a
+    Fit all units without a stored result. Raises ThermoCompError if the folder has no bag, a
     package is missing or the Dask cluster cannot be used, OutputError if a file cannot be written.
 
     `progress` is called with the numbers of finished and of all tests of a round: without a prior,

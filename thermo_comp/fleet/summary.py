@@ -24,9 +24,9 @@ _UNITS_NEEDED = 8
 # Efficiency of the median absolute deviation relative to the sample sd, for a normal distribution.
 _MAD_EFFICIENCY = 0.37
 # Largest ratio of a value's sd (by its fit) to the spread over the units. With a larger ratio
-# the data do not determine the quantity, and its value is about that of the prior of the fit.
+# the data do not determine the quantity, and its value is about the prior mean of the fit.
 _LARGEST_SD = 5.0
-# Residuals [ug] and noises [ug/sqrt(Hz)] below this number are set to it, for their logarithms.
+# Lower limit of residuals [ug] and noises [ug/sqrt(Hz)] whose logarithms are compared.
 _LEAST = 1e-12
 #: Columns of the table in which units are compared.
 QUANTITIES = tuple(column for column in COLUMNS if column.label)
@@ -39,8 +39,8 @@ class Spread(NamedTuple):
     Spread of a quantity over the units about its median, and the distance `z` of each unit.
 
     Only units whose data determine the quantity (`is_counted`) are used for `middle`, `sd` and
-    `limit`. A distance z from the median is in units of the root of the sum of squares of `sd` and
-    of the sd of the unit's value by its fit.
+    `limit`. A distance `z` is the deviation from the median divided by its sd, whose square is the
+    sum of the squares of `sd` and of the sd that the unit's fit gives to the value.
     """
 
     quantity: TableColumn
@@ -176,7 +176,7 @@ def _determined(quantity: TableColumn, values: Floats, own_sd: Floats) -> Bools:
 
 
 def _deviations(quantity: TableColumn, values: Floats, middle: float) -> Floats:
-    """Return deviations from the median: of values, in ppm or of logarithms (`TableColumn.by`)."""
+    """Return the deviations of values, ppm or logarithms (`TableColumn.by`) from the median."""
     if quantity.by == 'ppm':
         return (values / middle - 1.0) * 1e6
     if quantity.by == 'logarithm':
@@ -229,7 +229,7 @@ def _drifts(rows: Sequence[Row], earlier: Sequence[Row]) -> list[Retest]:
 
 
 def _sds(drift: Drift) -> float:
-    """Return the magnitude of a change / its standard deviation; 0 if the sd is unknown."""
+    """Return the magnitude of a change divided by its sd; 0 if the sd is unknown."""
     return abs(drift.change) / drift.sd if drift.sd > 0.0 else 0.0
 
 

@@ -34,7 +34,7 @@ Row = Mapping[str, Cell]
 REFUSED, FAILED, NOT_JUDGED = 'refused', 'failed', 'not judged'
 # Characters with which a formula in a spreadsheet begins.
 _FORMULA = ('=', '+', '-', '@')
-# Names of findings of incomplete data: a part of the calibration then follows from the prior.
+# Findings of a fit that show incomplete data, so that the prior determines some parameters.
 _LACKS = {'temperature', 'ramps', 'directions', 'misfit'}
 
 
@@ -44,7 +44,7 @@ class TableColumn(NamedTuple):
     name: str
     kind: str  # text, whole, number
     meaning: str
-    label: str = ''  # name of a compared quantity, '' if not compared; see `_COMPARED`
+    label: str = ''  # name of a quantity compared between units, else ''; see `_COMPARED`
     unit: str = ''
     by: str = 'value'  # comparison of units: value, ppm or logarithm
     sd: str = ''  # name of the column with the standard deviation of a compared quantity
@@ -92,7 +92,7 @@ _TABLE = (
     (
         'board_lag_s',
         'number',
-        'lag of the board temperature behind that of the case in ramps; negative if it leads',
+        'lag of the board temperature behind the case in ramps; negative if the board leads',
     ),
     ('window_s', 'number', 'length of the windows at rest'),
     ('raw_ug', 'number', 'RMS of |f| - g at rest, corrected with the constants at T_ref alone'),
@@ -181,7 +181,7 @@ def fitted_cells(
         'm_sd_{0}_urad': np.array(calibration.misalignment_sd) * 1e6,
         'noise_{0}_ug_sqrt_hz': np.array(calibration.noise_density_m_s2_sqrt_hz) / MICRO_G,
     }
-    # Without a prior, few positions do not separate the slopes of bias and scale: omit their sd.
+    # Without a prior, few positions do not separate the slopes of bias and scale: omit both sds.
     is_separable = has_prior or len(distinct_directions(up)) >= POSITIONS_NEEDED
     for quantity, unit, slope, sd in _slopes(calibration):
         parts[f'{quantity}_slope_{{0}}_{unit}'] = slope
@@ -265,7 +265,7 @@ def write_tables(rows: Sequence[Row], folder: Path) -> tuple[Path, Path]:
     writer = csv.DictWriter(text, [column.name for column in COLUMNS], lineterminator='\n')
     writer.writeheader()
     for row in rows:
-        # Begin texts that a spreadsheet would evaluate as a formula with an apostrophe.
+        # Put an apostrophe before texts that a spreadsheet would evaluate as a formula.
         armed = [k for k, v in row.items() if isinstance(v, str) and v.startswith(_FORMULA)]
         writer.writerow({**row, **{name: f"'{row[name]}" for name in armed}})
     paths = folder / 'fleet.parquet', folder / 'fleet.csv'

@@ -34,7 +34,7 @@ def sha256(content: str | bytes) -> str:
 
 @dataclass(frozen=True)
 class FleetOptions:
-    """Options of the fits of all units, except for serial and input, which the bags state."""
+    """Options of the fits of all units, except serial and input, which are read from the bags."""
 
     fit: FitOptions
     topics: Topics | None = None
@@ -166,7 +166,7 @@ def dask_setup(_worker: object) -> None:
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Make workers started in the context ignore Ctrl-C; delay its exception to the end."""
+    """Make workers started in the context ignore Ctrl-C; raise KeyboardInterrupt at its end."""
     heard: list[int] = []
     # Workers inherit the ignored SIGINT (Ctrl-C) from the fork server.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)

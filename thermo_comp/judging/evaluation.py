@@ -115,7 +115,7 @@ def judge_bags(
     window_s: float = WINDOW_S,
     tolerance: float | None = None,
 ) -> Judgement | None:
-    """Judge a calibration on reduced bags; return None if no window was corrected."""
+    """Judge a calibration on bags; return None if no window was corrected."""
     windows = corrected_windows(bags, calibration, gravity=gravity, window_s=window_s)
     known = {source.sha256 for source in calibration.provenance.sources if source.sha256}
     is_seen = all(source.sha256 in known for bag in bags for source in bag.sources)

@@ -19,11 +19,11 @@ from .windows import JudgedWindows
 
 #: Largest ratio of RMS error to claimed RMS of a valid calibration, if no tolerance is given.
 LARGEST_RATIO = 2.0
-#: Ratio of claimed RMS to raw RMS above which, without a tolerance, a valid calibration is wide.
+#: Ratio of claimed RMS to raw RMS above which, without a tolerance, a valid calibration is WIDE.
 WIDE_PART = 0.5
 # Smallest number of windows of a regime that is judged separately.
 _FEWEST_WINDOWS = 6
-# Largest ratio of a known |f| to the next smaller known |f| whose windows share one section.
+# Largest ratio of successive known |f|, in ascending order, whose windows share a section.
 _LEVEL_RATIO = 1.02
 
 SECTIONS = ('static', 'dynamic', 'all', 'outside')

@@ -33,7 +33,7 @@ WINDOW_S = 60.0
 # Largest sum of the distances outside the calibrated ranges [half ranges], due to noise of the
 # thermometers, at which a window counts as inside.
 _RANGE_TOLERANCE = 0.02
-# Smallest number of samples of a used partial sum, divided by the median of this number.
+# Smallest number of samples of a used partial sum / median number of all partial sums.
 _LEAST_FILLED = 0.9
 
 
@@ -99,12 +99,12 @@ class JudgedWindows:
 
 
 def sum_length(window_s: float) -> float:
-    """Divide `window_s` by a whole number, for a duration of partial sums of 10 s or less [s]."""
+    """Divide `window_s` by the smallest integer that gives partial sums of 10 s or less [s]."""
     return window_s / float(np.ceil(window_s / reduction.WINDOW_S))
 
 
 def usual_window(bags: Sequence[ReducedBag]) -> float:
-    """Choose the duration of windows [s], 60 or more: a multiple of that of the partial sums."""
+    """Return the length of windows: 60 s or more, a multiple of the longest partial sum [s]."""
     longest = max(bag.window_s for bag in bags)
     return float(np.ceil(WINDOW_S / longest - 1e-6)) * longest
 

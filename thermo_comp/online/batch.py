@@ -26,7 +26,7 @@ from .status import DROPPED
 _Arrivals: TypeAlias = list[tuple[int, int, str, int, float]]
 #: Segments of the correction, each with its number of samples.
 Segments: TypeAlias = list[tuple[Segment, int]]
-#: Arithmetic of samples: function of a line, time since the segment's start [s], and x, y, z.
+#: Function of a `Correction.line` result, time since the segment's start [s], sample x, y, z.
 _Arithmetic: TypeAlias = Callable[..., Sequence[Floats]]
 #: Code of the reason for which a sample is dropped; the code 0 marks a published sample.
 _REASONS = {name: number for number, name in enumerate(DROPPED, 1)}
@@ -124,8 +124,8 @@ def _push(
     while arrivals and arrivals[-1][0] <= place:
         _, _, name, stamp_ns, celsius = arrivals.pop()
         if len(thermal.queue) >= PENDING_LIMIT:
-            # The node applies waiting readings while no samples come. Here the old readings of a
-            # full queue are applied; after the first sample only those up to the next stamp.
+            # The node applies waiting readings while no samples come. A batch applies old readings
+            # if the queue is full, but once it has a sample, none later than the next sample.
             limit_ns = NEVER_NS if compensator.now_ns is None else due_ns
             thermal.flush(min(limit_ns, stamp_ns - DISORDER_NS))
         thermal.push(name, stamp_ns, celsius)
@@ -224,7 +224,7 @@ def _lines(model: Model, segments: Segments) -> tuple[Floats, Floats, Bools]:
 def _corrected(
     evaluate: _Arithmetic, table: Floats, segments: Segments, stamps: Stamps, samples: Floats
 ) -> Floats:
-    """Apply the arithmetic of samples to segments, whose lines are the columns of `table`."""
+    """Correct the samples of segments, whose `Correction.line` results are columns of `table`."""
     start_ns = np.array([segment.start_ns for segment, _ in segments], dtype=np.int64)
     ends = np.cumsum([count for _, count in segments])
     n, parts = len(stamps), []

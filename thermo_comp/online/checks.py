@@ -65,9 +65,9 @@ REFUTING_SIGMAS: Final = 5.0
 
 
 #: Run of equal readings of an axis: its first sample with the stamp [ns], number of samples after
-#: the first, the largest change since then that both other axes have made [input unit], and, from
-#: the `STUCK_SAMPLES`th repeat on, the changes of the other axes from sample to sample: number of
-#: changes that noise explains and the smallest change, the converter's step [input unit].
+#: the first, the largest change since then that both other axes have made [input unit], and, after
+#: the `STUCK_SAMPLES`th repeat, the changes of the other axes from sample to sample: number of
+#: changes by `NOISY_SDS` sd or more; smallest change, the converter's step [input unit].
 Run: TypeAlias = tuple[tuple[float, float, float, int], int, float, int, float]
 
 
@@ -121,7 +121,7 @@ class StuckCheck:
         j: int,
         k: int,
     ) -> Run:
-        """Return the run of an axis with a sample more; `j`, `k`: the other axes."""
+        """Return the run of an axis, extended by `sample`; `j`, `k`: the other axes."""
         first, n, moved, n_noisy, step = run
         change, other = abs(sample[j] - first[j]), abs(sample[k] - first[k])
         if change > moved and other > moved:
@@ -177,11 +177,11 @@ class StuckCheck:
         self, run: Run, columns: Floats, here: slice, equal: Ints, axis: int
     ) -> tuple[Floats, Ints, Floats]:
         """
-        Continue the last three values of a run over the samples `here`: columns (3, n) of which
-        `equal` samples are equal to the first.
+        Return `moved`, `n_noisy`, `step` of a run after each of the samples `here` of `columns`;
+        `equal`: number of repeats of the first reading of the run up to each sample.
         """
         first, _, moved, n_noisy, step = run
-        # With the sample before, which the first difference needs.
+        # Include the sample before `here`, which the first difference needs.
         before = self.last[:3] if here.start == 0 else columns[:, here.start - 1]
         values = np.column_stack([before, columns[:, here]])[[axis - 2, axis - 1]]
         with np.errstate(invalid='ignore'):

@@ -254,13 +254,13 @@ class Compensator:
         self.stuck = self._stuck_check()
         is_refuted = self.gravity.is_refuted
         self.gravity = GravityCheck(*self._gravity_settings)
-        # A jump of time does not mend a wrong calibration: windows that agree restore the output.
+        # A calibration refuted before the jump stays so until still windows agree with gravity.
         self.gravity.is_refuted = is_refuted
         self.counters.n_time_jumps += 1
         self.last_ns = stamp_ns - 1
 
     def take_flags(self) -> list[tuple[int, bool]]:
-        """Return new regime flags, once each: stamp of the deciding reading [ns], is dynamic."""
+        """Return new regime flags once: stamp of the deciding reading [ns], whether dynamic."""
         flags, self.thermal.flags = self.thermal.flags, []
         return flags
 

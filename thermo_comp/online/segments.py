@@ -61,7 +61,7 @@ class Segment(NamedTuple):
     noise_excess: float  # relative excess of the noise variance because of the samples' rate
     start: tuple[float, ...]  # thermal state at the start of the segment
     end: tuple[float, ...]  # thermal state at the end of the segment
-    slow: SlowState  # successive segments with equal arguments have the same object
+    slow: SlowState  # one object for successive segments with equal arguments
 
 
 _NO_STATE: Final = SlowState((), [], 0.0)
@@ -215,7 +215,7 @@ class ThermalSide:
 
     @property
     def fresh_until_ns(self) -> int:
-        """Last stamp of a fresh board temperature; NEVER_NS: none needed, EVER_NS: none yet."""
+        """Last stamp with a fresh board temperature; NEVER_NS: none needed, EVER_NS: none read."""
         if not self.model.needs_temperature:
             return NEVER_NS
         board_ns = self.tracker.board.stamp_ns
@@ -267,7 +267,7 @@ class ThermalSide:
         if key != self._slow_key:
             self._slow_key = key
             if self.is_unmeasured:
-                # Evaluate the variance one sd of the unknown temperature from the reference.
+                # Temperature unknown: evaluate the variance one sd above the reference.
                 end_state = (end_state[BOARD] + UNMEASURED_SD_K, *end_state[1:])
             memory = self.tracker.memory
             shares = memory.remaining_shares(start_ns + SEGMENT_NS)

@@ -31,16 +31,16 @@ BLOCK_MESSAGES = 1 << 15
 
 #: Stands for the stamp of a message without a stamp: the earliest stamp that a header can hold.
 NO_STAMP_NS = -(2**31) * 10**9
-_JUMP_NS = 10**9  # a larger backward step of the stamps is a jump of time [ns]
+_JUMP_NS = 10**9  # backward steps of the stamps above this are jumps of time [ns]
 LONGEST_PAUSE_NS = 3600 * 10**9  # longer jumps of the stamps are shortened to this length [ns]
 #: Largest number of jumps of the stamps by over an hour in a recording that is read.
 _MOST_JUMPS = 100
 # A thermometer is taken to use another clock than the accelerometer if `_FEWEST_READINGS` or more
 # of its readings are in the median more than `_APART_S` s before or after the samples around them.
 _FEWEST_READINGS, _APART_S = 10, 10.0
-#: Time between two equal readings that `Readings.thinned` keeps [ns].
+#: Shortest time between successive equal readings in the result of `Readings.thinned` [ns].
 _REPEAT_NS = 10_000_000_000
-#: Longest recording without a limit of the mean interval between messages, and this limit [ns].
+#: Duration above which the mean interval between messages is limited, and its upper limit [ns].
 _SPARSE_NS, _SPARSEST_NS = 10 * 86400 * 10**9, 10 * 10**9
 
 
@@ -59,7 +59,7 @@ class BagFile:
     storage = 'mcap'
 
     def __init__(self, path: Path) -> None:
-        self.path = path  # the path that errors name
+        self.path = path  # the path stated in error messages
         self.topics: dict[int, Topic] = {}  # by channel number
         self.definitions: dict[str, tuple[str, str]] = {}  # encoding and text by message type
         self.metadata: dict[str, str] = {}
@@ -73,9 +73,9 @@ class RecordingInfo:
     """
     The content of a bag, known before its messages are read.
     `topics`: message type (several joined by `` | ``) and number of messages by name. `start_ns`
-    and `end_ns` are log times, 0 without messages. `truncated` describes missing parts, if any;
-    `metadata` holds the writer's pairs of key and value; `input` is the kind of the accelerometer
-    topic; `chosen` has notes on topics selected by their type and on stamps.
+    and `end_ns`: first and last log time, 0 without messages. `truncated` describes missing parts,
+    if any; `metadata` holds the key-value pairs stored in the bag; `input` is the input whose
+    topic has the samples; `chosen` has notes on topics selected by their type and on stamps.
     """
 
     path: Path
@@ -108,7 +108,7 @@ class ImuColumns(NamedTuple):
 
     @classmethod
     def of_rate(cls, rate: Floats | None) -> ImuColumns:
-        """Build from angular rates or None; orientation absent, covariances unknown (REP 145)."""
+        """Build from angular rates, None if absent; orientation marked as absent (REP 145)."""
         none, unknown = np.array([-1.0] + 8 * [0.0]), np.zeros(9)
         level = np.array([0.0, 0.0, 0.0, 1.0])
         if rate is None:
@@ -132,8 +132,8 @@ class Readings(NamedTuple):
         return Readings(self.stamp_ns[which], self.celsius[which])
 
     def thinned(self) -> Readings:
-        """Keep finite readings that differ from the last kept one, and a reading every 10 s."""
-        # A table repeats a reading in each row up to the next reading, as a stuck sensor does.
+        """Drop readings that are not finite, or that repeat the last kept reading within 10 s."""
+        # Tables repeat a slow sensor's reading in each row until its next reading.
         kept: list[int] = []
         last_ns, last = 0, math.nan
         rows = zip(self.stamp_ns.tolist(), self.celsius.tolist(), strict=True)
@@ -151,8 +151,8 @@ class Block:
     """
     Consecutive messages in reading order, as columns; a block ends where `frame_id` changes.
     `accel`, shape (n, 3), is in counts per cycle, or m/s^2 if the input is sensor_msgs/Imu; `imu`
-    holds the other fields of sensor_msgs/Imu. The keys of `temperatures` are thermometers; those
-    of `log_ns` and, if requested, of the serialized messages `raw` also include ``accel``.
+    holds the other fields of sensor_msgs/Imu. `temperatures` has a key for each thermometer;
+    `log_ns` and, if requested, the serialized messages `raw` also have the key ``accel``.
     """
 
     accel_stamp_ns: Ints
@@ -244,9 +244,9 @@ def joined(blocks: Sequence[Block]) -> Block:
 
 def with_stamps(block: Block, last_ns: int) -> tuple[Block, int]:
     """
-    Give a reading without a stamp the newest stamp of the samples before the reading, and not the
-    log time, which depends on the speed of a playback; `last_ns` is the newest stamp before the
-    block. Return block and newest stamp. Readings without a stamp before all samples are dropped.
+    Give each reading without a stamp the newest stamp of the samples before it, because its log
+    time depends on the speed of a playback; drop such readings before the first sample. `last_ns`:
+    newest stamp before the block. Return the block and the newest stamp up to the block's end.
     """
     samples = np.concatenate(([last_ns], block.accel_stamp_ns))
     jumps = np.flatnonzero(np.diff(samples) < -_JUMP_NS) + 1

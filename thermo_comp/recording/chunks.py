@@ -47,7 +47,7 @@ MAX_CHUNK_BYTES = 1 << 26  # largest declared content of a chunk [bytes]
 _MAX_GROWTH = 1024
 _FREE_GROWTH_BYTES = 1 << 26
 _MAX_WINDOW = 1 << 27  # largest window of zstd [bytes]
-_STEP_BYTES = 1 << 16  # size of a decompressed piece; the piece with the first damage is lost
+_STEP_BYTES = 1 << 16  # bytes decompressed at a time; the first damaged piece of data is lost
 _ENGINES: Mapping[str, Callable[[], Any]] = {
     'lz4': lz4.frame.LZ4FrameDecompressor,
     'bz2': bz2.BZ2Decompressor,

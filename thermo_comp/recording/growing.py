@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns live recording: new messages of a bag that another program writes, and numbered bags.
+Owns live recording: reads a bag that another program is writing, and writes numbered bags.
 
 Each pass reads the growing bag from its beginning; the pause after a pass is at least five times
 as long as the pass. New messages are written with the node's topic names to numbered bags, from
-`01.mcap` on. The newest messages are held in memory until their position is known.
+`01.mcap` on. New messages are held in memory until it is known to which position they belong.
 """
 
 import re
@@ -24,12 +24,12 @@ from .reader import open_recording
 from .topics import Topics
 from .writer import BagWriter
 
-_CHUNK_BYTES = 1 << 17  # size of a chunk, 17 s of counts at 100 Hz; lost if the process is killed
+_CHUNK_BYTES = 1 << 17  # chunk size [bytes]: 17 s of counts at 100 Hz, lost by a killed process
 _PERIOD_S = 1.0  # shortest pause between two passes over the growing bag [s]
 _NEVER_NS = 2**63 - 1
 #: Hidden name of an unfinished bag: number of the bag, and id of the process that writes the bag.
 _LEFT = re.compile(r'\.(?P<number>\d+)\.(?P<process>\d+)-[0-9a-f]+\.partial\.mcap')
-_SHARE = 0.2  # largest share of time spent reading the growing bag
+_SHARE = 0.2  # largest ratio of the duration of a pass to that of the pause after the pass
 
 #: A new block with its serialized messages, and a description of its bag (None: live topics).
 News = tuple[Block, RecordingInfo | None]
@@ -38,7 +38,7 @@ News = tuple[Block, RecordingInfo | None]
 def growing_blocks(
     path: Path, topics: Topics, wait: Callable[[float], bool]
 ) -> Iterator[News | None]:
-    """Yield new blocks until the bag is complete or `wait(s)` is true; None after each pass."""
+    """Yield new blocks, and None after each pass, until the bag ends or `wait(s)` returns True."""
     if not path.exists():
         raise RecordingError('no such file or directory', path)
     n_seen: Counter[Role] = Counter()
@@ -90,8 +90,8 @@ def leftovers(folder: Path) -> dict[Path, int]:
 
 def finish(path: Path, number: int) -> Path | None:
     """
-    Copy an unfinished bag to a bag with `number` (if taken, the next after all), and delete
-    the unfinished bag; None for a bag without messages. RecordingError for an unreadable bag.
+    Copy an unfinished bag to a bag named `number` (if that exists, the largest number plus 1) and
+    delete the unfinished bag; None for a bag without messages, RecordingError if unreadable.
     """
     with open_recording(path, require=()) as reader:
         numbers = {int(bag.stem) for bag in numbered_bags(path.parent)}
@@ -140,7 +140,7 @@ class PositionBags:
             if self._writer is not None:
                 self._writer.flush()
         except OutputError:
-            self._writer, self._held = None, []  # after a failed write, write nothing else
+            self._writer, self._held = None, []  # after a failed write, write no further message
             raise
 
     def _write(self, block: Block) -> None:

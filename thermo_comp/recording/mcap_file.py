@@ -48,7 +48,7 @@ _CUTS = {
     int(Opcode.MESSAGE_INDEX): 'it ends inside the index of its last chunk; the chunk is complete',
     -1: 'it ends inside a record; all records before it are read',
 }
-#: Record types other than messages that are read.
+#: Types of the records that are read besides messages, by opcode.
 _KINDS: Any = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.METADATA: Metadata}
 _new_stream: Any = ReadDataStream  # type hints differ between versions of the `mcap` library
 
@@ -196,7 +196,7 @@ class McapFile(BagFile):
                     raise DamagedError(f'the record at byte {at} is not complete')
                 words = _CUTS.get(opcode, _CUTS[-1]).format('{}', at=at)
                 if opcode == 0 and at == last.position + last.length:
-                    # Let the span contain zeros, so that `scan_records` drops its last message.
+                    # Extend the span over the zeros: `scan_records` drops a message before zeros.
                     kind = last.kind if last.kind == 'loose' else 'torn'
                     spans[-1] = replace(last, length=last.length + PREFIX.size, kind=kind)
                 elif opcode == Opcode.CHUNK:
@@ -248,7 +248,7 @@ class McapFile(BagFile):
 
 
 def _in_order(pieces: Iterable[tuple[int, Messages, int | None]]) -> Iterator[Messages]:
-    """Merge numbered pieces by log time; the third item is the next piece's first log time."""
+    """Merge pieces, given as number, messages, first log time of the next piece, by log time."""
     # Messages before the first log time of the next piece are final; later messages are held.
     held: dict[int, Messages] = {}
     for row, piece, next_ns in pieces:

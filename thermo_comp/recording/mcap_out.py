@@ -39,7 +39,7 @@ _COMPRESSORS: Mapping[Compression, Callable[[Any, int], Any]] = {
     'lz4': lambda data, _: lz4.frame.compress(data),
     'zstd': zstandard.compress,
 }
-#: Transient-local topics: a late subscriber gets the last message; a namespace may be in front.
+#: Transient-local topics (a late subscriber gets the last message), without their namespace.
 _LATCHED = tuple(topic.name for topic in OUTPUTS if topic.is_latched)
 _INFINITE = {'sec': 9223372036, 'nsec': 854775807}
 # Any callable, because the type hints differ between versions of the `mcap` library.
@@ -60,7 +60,7 @@ def known_definition(kind: str) -> tuple[str, str, str]:
 
 
 class McapOutput:
-    """A new MCAP file with the metadata at the front, so that an unfinished file has them, too."""
+    """A new MCAP file, with the metadata first, so that an unfinished file has the metadata."""
 
     def __init__(
         self,
@@ -249,7 +249,7 @@ class McapOutput:
 
 
 def _offered_qos(topic: str) -> dict[str, Any]:
-    """Return the QoS profile to record as offered: reliable, so that any subscriber matches."""
+    """Return a publisher's QoS profile for metadata.yaml: reliable, to match any subscriber."""
     is_flag = topic.endswith(_LATCHED)
     return {
         'history': 'keep_last',

@@ -24,7 +24,7 @@ _SDS = 25.0
 # Smallest distance of a glitch from the mean of its neighbours, divided by the samples' norm: the
 # carried remainder of a converter changes single samples by a count, which is no glitch.
 _LEAST = 0.02
-# Smallest number of samples from which the noise is estimated; with fewer no glitch is searched.
+# Smallest number of samples in which glitches are searched; fewer do not determine the noise.
 _FEWEST = 30
 # Standard normal quantiles of the probabilities 0.1 and 1 - 1e-11.
 _TENTH, _NEVER = -1.2816, 6.7
@@ -64,7 +64,7 @@ def is_glitch(samples: Floats, quantum: Floats) -> Bools:
 def spread_of_variances(cells: Cells, plausible: Bools, level: Floats) -> Floats:
     """
     Return the spread of the variances of cells at rest, relative to white noise, per axis: the
-    ratio of the 1 - 1e-11 quantile to the 0.1 quantile, divided by that ratio of white noise.
+    ratio of the 1 - 1e-11 quantile to the 0.1 quantile, divided by this ratio for white noise.
     With a correlation r of successive samples the effective number of samples is (1 - r) / (1 + r)
     times their number, and the roughness is 1 - r times the mean variance. The mean variance
     follows from the tenth percentile `level` of the variances and the effective number of samples.
@@ -86,8 +86,8 @@ def spread_of_variances(cells: Cells, plausible: Bools, level: Floats) -> Floats
 
 def roughest_at_rest(cells: Cells, quiet: Bools, is_coloured: Bools, ratio: float) -> Floats:
     """
-    Return the largest roughness of a cell at rest, per axis, for the largest ratio of variances
-    `ratio`; infinite for white noise. Coloured noise hides a step in a cell's mean and variance,
+    Return the largest roughness of a cell at rest, per axis; infinite for white noise. `ratio`:
+    largest variance at rest / noise variance. Coloured noise hides a step in mean and variance,
     but not in the changes from sample to sample. The roughness is taken as chi-square distributed,
     with the degrees of freedom that give the ratio of its tenth percentile to its median.
     """
@@ -106,6 +106,6 @@ def roughest_at_rest(cells: Cells, quiet: Bools, is_coloured: Bools, ratio: floa
 
 
 def _quantile(n_free: float, sigmas: float) -> float:
-    """Return a quantile of chi-square / degrees of freedom (Wilson and Hilferty); 0.0: median."""
+    """Return the chi-square / `n_free` quantile at a normal quantile (Wilson and Hilferty)."""
     width = 2.0 / (9.0 * n_free)
     return float((1.0 - width + sigmas * np.sqrt(width)) ** 3)

@@ -68,7 +68,7 @@ class Survey:
 def thermal_findings(
     thermometers: Mapping[str, ThermometerSurvey], candidates: Sequence[str] = ()
 ) -> list[str]:
-    """List faults and lacks of thermometers; `candidates`: unused topics of temperatures."""
+    """List faulty and missing thermometers and ramps; `candidates`: unused temperature topics."""
     findings = []
     among = f': {", ".join(candidates)}' if candidates else ''
     board = thermometers.get('board')
@@ -184,7 +184,7 @@ class _Clock:
         later = stamp_ns[not self.n :]
         steps = np.diff(later, prepend=self.last_ns)
         self.n, self.last_ns = self.n + len(stamp_ns), int(stamp_ns[-1])
-        # After a backward step by an hour or less, samples up to the newest stamp are left out.
+        # After a backward step by an hour or less, samples are left out until stamps are new.
         restarts = np.flatnonzero(steps < -LONGEST_PAUSE_NS)
         self.n_restarts += len(restarts)
         for number, part in enumerate(np.split(later, restarts)):

@@ -54,8 +54,8 @@ class RecordingReader(ExitStack):
     An open bag: a rosbag2 directory, a bare ``.mcap`` or ``.db3`` file, or a ROS 1 ``.bag``.
     A role is ``accel`` or the name of a thermometer; the roles in `require` must be in the bag.
     `info` describes the bag; after all blocks are read, `info.truncated` names the missing
-    messages. `topics` are topics by role, `fields` the fields with a thermometer's reading by
-    role, `definitions` encoding and text by message type.
+    messages. `topics`: topic of each role; `fields`: field with the reading of a thermometer, by
+    role; `definitions`: encoding and text of each message type's definition.
     Raises RecordingError if the file is not a bag, is damaged, or a topic is missing or ambiguous.
     """
 
@@ -83,7 +83,7 @@ class RecordingReader(ExitStack):
                 raise RecordingError(f'cannot be opened: {error.strerror}', path) from error
             raise
         self._part = topics.part
-        #: Time from the bag's first sample to that of the part [s]; 0 until both are read.
+        #: Time from the bag's first sample to the selected part's [s]; 0 before both are read.
         self.since_s = 0.0
         self.apart = ''  # warning about stamps that are all equal, or of a second clock
 
@@ -240,7 +240,7 @@ def inspect_recording(path: str | Path) -> RecordingInfo:
 
 @dataclass(frozen=True, slots=True)
 class _Description:
-    """The files of a bag, their compression, message counts by topic, a note on missing parts."""
+    """Files of a bag, their compression, number of messages by topic, a note on missing parts."""
 
     storage: str
     files: tuple[Path, ...]

@@ -25,8 +25,8 @@ from .noise import is_glitch, roughest_at_rest, spread_of_variances
 VARIANCE_RATIO = 4.0
 #: Largest sd of samples at rest [g]: above the noise of any sensor, below that of most flights.
 STILL_SD = 0.05
-# Largest sd of the angular rate within a cell at rest, and largest distance of a cell's mean rate
-# from the level [rad/s]. The level (medians over `_LEVEL_S` [s], interpolated) follows the bias.
+# Largest sd of the angular rate in a cell at rest, and largest difference of a cell's mean rate
+# from the bias of the rate [rad/s], interpolated between medians over `_LEVEL_S` [s].
 _STILL_RATE_SD, _STILL_RATE = np.radians(2.0), np.radians(1.0)
 _LEVEL_S = 120.0
 # `without_rotation` subtracts from the angular rate its median over this time [s].
@@ -89,8 +89,8 @@ class Cells:
 
 class CellAccumulator:
     """
-    Reduces streamed samples to cells of `cell_s`, or of `least` samples if these last longer. A
-    whole number of cells fills a window of `window_s`, or several (`STRETCHES`) for longer cells.
+    Reduces streamed samples to cells of `cell_s`, or of `least` samples if these last longer.
+    Whole cells fill a window of `window_s`, or up to 60 windows if a cell exceeds a window.
     """
 
     def __init__(
@@ -164,12 +164,12 @@ class CellAccumulator:
     def cells(self) -> Cells:
         """Return all cells so far, including the unfinished last cell."""
         sums = np.concatenate(self._sums)
-        self._sums = [sums]  # join only once
+        self._sums = [sums]  # join earlier sums only once
         index, count = sums[:, 0].astype(np.int64), sums[:, 1]
         total, square = np.split(sums[:, 3:-6], 2, axis=1)
         n_free = np.maximum(count[:, None] - 1.0, 1.0)
         mean = total / count[:, None]
-        # Set a variance below the rounding error of the two sums to 0, as for equal samples.
+        # Set variances below their rounding error to 0, as for equal samples.
         spread = square - count[:, None] * mean**2
         spread[spread < np.finfo(np.float64).eps * count[:, None] * square] = 0.0
         variance = spread / n_free
@@ -200,8 +200,8 @@ class CellAccumulator:
         step, between = float(np.median(steps)), 0.0
         gaps = steps[steps > 10.0 * step]
         if gaps.sum() > 0.5 * steps.sum():
-            # A polled buffer gives a burst of samples at a constant interval of at most 5 s; a
-            # cell then has two bursts. Pauses of a tumble by hand are irregular or longer.
+            # A polled buffer gives bursts of samples at a constant interval below 5 s; a cell
+            # then has two bursts. Pauses between positions held by hand are irregular or longer.
             usual = float(np.median(gaps))
             is_regular = np.mean(np.abs(gaps - usual) < 0.2 * usual) > 0.9
             if is_regular and usual < 5e9:
@@ -265,7 +265,7 @@ def _quantum_of(samples: Floats, few: list[Floats]) -> Floats:
     for axis in range(3):
         changes = np.abs(np.diff(samples[:, axis]))
         changes = np.sort(np.concatenate((few[axis], changes[changes > 0.0])))
-        # One or two changes may be turns of the unit.
+        # One or two changes may be turns of the unit: wait for further changes.
         few[axis] = changes[: 3 * (len(changes) < 3)]
         if len(changes) < 3:
             continue
@@ -335,8 +335,8 @@ def still_runs(
 
 def without_rotation(cells: Cells) -> Cells:
     """
-    Subtract from the angular rate of each cell its median over the 10 s up to it: a unit at a
-    constant angular rate counts as at rest, and a unit whose rate changes does not.
+    Subtract from each cell's angular rate the median rate of the 10 s that end with the cell: a
+    unit at a constant angular rate counts as at rest, and a unit whose rate changes does not.
     """
     n = max(1, round(_ROTATION_S / cells.cell_s)) if cells.cell_s else 1
     if len(cells.rate) <= n or not cells.rate.any():
@@ -383,7 +383,7 @@ def is_under(cells: Cells, still_sd: float) -> Bools:
 
 
 def _is_turning(cells: Cells) -> Bools:
-    """Whether the unit turns in a cell: angular rates scatter, or differ from their level."""
+    """Whether the unit turns in a cell: angular rates scatter, or differ from the rate's bias."""
     shakes = (cells.rate_variance > _STILL_RATE_SD**2).any(axis=1)
     calm = np.flatnonzero(~shakes)
     if not len(calm) or not cells.rate.any():
@@ -398,7 +398,7 @@ def _is_turning(cells: Cells) -> Bools:
 
 
 def _drift(cells: Cells, plausible: Bools) -> Floats:
-    """Return the drift at each step between cells: the median of nine steps, with a limit."""
+    """Return the drift at each step between cells: the median of nine steps, at most 50 ug/s."""
     both = plausible[1:] & plausible[:-1] & (np.diff(cells.index) == 1)
     step = np.where(both[:, None], np.diff(cells.mean, axis=0), 0.0)
     half = _DRIFT_STEPS // 2

@@ -34,7 +34,7 @@ TWINS = (
 _MAX_LISTED = 20  # largest number of topics in a message
 _MAX_SHOWN = 80  # largest length of a name in a message [characters]
 
-_FIRST_STAMP_S = 1e8  # limits of a `BagPart` from this number on are stamps (the year 1973) [s]
+_FIRST_STAMP_S = 1e8  # a limit of a `BagPart` of at least this time [s] is a stamp (after 1973)
 
 #: Message type and number of messages of each topic of a bag.
 Present = Mapping[str, tuple[str, int]]
@@ -87,9 +87,9 @@ class Topics:
     """
     Topics of the inputs in a bag, the choice of counts or Imu, and the part to read.
     A name matches with or without its leading slash and, if only one topic fits, with any
-    namespace. If no topic has the default name of an input (not `case`), imu/data_raw or else the
-    bag's only topic of the input's type is used, preferably an Imu. Further thermometers are given
-    in `further`, or found as ``temperature/<name>`` in the namespace of the board's topic. The
+    namespace. If no topic has the default name of an input (not `case`), the bag's only topic of
+    the input's type is used: an Imu, preferably imu/data_raw, or else counts. Thermometers besides
+    board and case: `further`, and ``temperature/<name>`` in the board topic's namespace. The
     reading of a thermometer may be a field, ``TOPIC:FIELD``, as for ``ros2 topic echo --field``.
     """
 
@@ -176,7 +176,7 @@ def shown(name: str) -> str:
 
 
 def choice_note(name: str, key: str, wanted: str, among: str) -> str:
-    """Note that a topic was chosen for an input by its type; '' if its name is the wanted name."""
+    """Return the note that a topic was chosen by its type; '' if it has the wanted name."""
     if is_called(name, split_field(wanted)[0]):
         return ''
     return f'{shown(name)}, its {among} {_TYPES[key].rpartition("/")[2]}, is taken for {key}'

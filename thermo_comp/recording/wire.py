@@ -10,7 +10,7 @@ All three input types are a std_msgs/Header followed by float64 numbers alone. I
     12  uint32 length of frame_id with its final NUL, then its characters
     4 + align8(12 + length)   the float64 numbers
 
-The size of messages of one type depends on `frame_id` alone; equal layouts are gathered as rows
+The size of messages of one type depends on `frame_id` alone; messages of one layout become rows
 of bytes, with stamps and numbers as views. `rosbags` converts ROS 1 messages one by one.
 """
 
@@ -152,7 +152,7 @@ def encode_stamped(
     head = pack('<BBHiII', 0, 1, 0, 0, 0, len(text)) + text
     body = 4 + (len(head) + 3) // 8 * 8
     row = np.frombuffer(bytearray(head.ljust(body, b'\0') + bytes(8 * n_numbers)), np.uint8)
-    # Values that are equal in all messages are in the row that is copied: this saves much time.
+    # `row` is copied for each message, so write values equal in all messages into `row` once.
     for column, values in pieces:
         if values.ndim == 1:
             row[body:].view('<f8')[column : column + len(values)] = values

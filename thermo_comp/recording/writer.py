@@ -4,7 +4,7 @@
 Owns the writing of columns to a rosbag2 directory or a bare MCAP file, or block by block to a
 table in CSV or Parquet (with the optional dependency ``parquet``).
 
-A bag or table gets its name when it is complete; if writing fails, an older file stays.
+A bag or table gets its name when it is complete; if writing fails, an older file is kept.
 """
 
 import csv
@@ -156,7 +156,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
             raise
 
     def abort(self) -> None:
-        """Delete the unfinished bag, unless `is_precious`; a file of the target's name stays."""
+        """Delete the unfinished bag, unless `is_precious`; an older bag of this name is kept."""
         file, self._file = self._file, None
         if file is not None:
             with suppress(OSError):

@@ -87,7 +87,7 @@ class AxisOverTemperature(NamedTuple):
     Cells of a row, as rounded texts: soak or ramp; temperature [degC]; bias, its expanded
     uncertainty and its deviation [micro-g]; scale relative to that at the reference temperature,
     its expanded uncertainty and its deviation [ppm]. A deviation is the bias or scale less a line
-    with the slope in a soak through the value in a soak at the reference temperature.
+    that has this slope and passes through the value in a soak at the reference temperature.
     """
 
     axis: str
@@ -127,13 +127,13 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
         Contribution('gravity', 'B', gravity, info.gravity.source or in_fit),
         Contribution('attitude', 'A', attitude, 'uncertainty of the misalignment of the axes'),
         Contribution('thermometers', 'B', drift, slope),
-        Contribution('model', 'A', model, 'posterior of all parameters at the judged windows'),
+        Contribution('model', 'A', model, 'posterior at the judged windows, without misalignment'),
         Contribution('repeatability', 'A', excess, beyond),
     )
 
 
 def unclaimed_gravity_sd(evidence: Evidence, info: CertificateInfo) -> float | None:
-    """Return the standard uncertainty of gravity not in the covariance [m/s^2]; None: unstated."""
+    """Return the uncertainty of gravity that the covariance lacks [m/s^2]; None if not stated."""
     stated = info.gravity.standard_uncertainty_m_s2
     if stated is None:
         return 0.0 if evidence.gravity_sd else None
@@ -227,7 +227,7 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
 
 
 def _gravity_part(evidence: Evidence, info: CertificateInfo) -> float:
-    """Return the scale's relative uncertainty due to gravity; NaN if that is not stated."""
+    """Return the scale's relative uncertainty due to gravity; NaN if gravity's is not stated."""
     sd = unclaimed_gravity_sd(evidence, info)
     if sd is None or evidence.calibration is None:
         return np.nan
@@ -266,7 +266,7 @@ def _rms(values: Floats) -> float:
 
 
 def programs(calibration: Calibration) -> list[Program]:
-    """Return a soak and, if bias or scale depend on the rate, ramps at half the valid rates."""
+    """Return a soak and, if bias or scale depend on the rate, ramps at half the largest rates."""
     static, dynamic = calibration.regime_sets()
     result = [Program('soak', static, 0.0)]
     if calibration.response or static != dynamic:

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the data of a report of a fit, of bags, or of a calibration, and of the bag that figures over
-time show; nothing is drawn here.
+Owns the data of a report on a fit, on bags, or on a calibration, and the data of the bag that the
+figures over time show; nothing is drawn here.
 """
 
 from collections.abc import Mapping, Sequence
@@ -149,7 +149,7 @@ class Evidence:
 
     @property
     def level(self) -> Literal['good', 'reserved', 'poor', 'open']:
-        """Good: valid; reserved: wide claim or reservations; poor: not valid; open: no verdict."""
+        """Good: valid; reserved: reservations or large sd; poor: not valid; open: no verdict."""
         if self.judgement is None or self.judgement.kind in (Verdict.OUTSIDE, Verdict.NO_CLAIM):
             return 'open'
         if not self.judgement.is_valid:
@@ -353,7 +353,7 @@ def shown_bag(bag: ReducedBag, index: int, detector: DetectorSettings) -> ShownB
         rows.append((b.rate, b.var_rate, c.rate, c.var_rate, *lead.acceleration))
         flags.append((tracker.detector.regime, tracker.detector.direction))
     time: Floats = np.array([stamp_ns - start_ns for _, stamp_ns, _ in readings]) * 1e-9
-    # Of several regimes at one time the last applies; equal successive regimes are joined.
+    # The last of several regimes at one time applies; equal successive regimes are joined.
     state_at = {
         0.0: (Regime.UNKNOWN, 0),
         **dict(zip(np.clip(time, 0.0, end).tolist(), flags, strict=True)),

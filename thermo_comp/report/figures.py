@@ -115,7 +115,7 @@ def draw_residuals(evidence: Evidence) -> Figure:
 
 
 def draw_gravity(evidence: Evidence) -> Figure:
-    """Draw |f| - g over time, raw and corrected, and corrected in detail (the paper's Fig. 7)."""
+    """Draw |f| - g over time: raw and corrected, then corrected alone (the paper's Fig. 7)."""
     residuals = evidence.residuals
     corrected = [name for name in residuals if name != RAW]
     sets = [forces for forces in (list(residuals), corrected) if forces]
@@ -140,7 +140,7 @@ def _panels(
     unit, name = style.time_unit(shown.duration_s)
     figure = style.new_figure(more + sum(heights))
     panels = figure.subplots(len(heights), sharex=True, height_ratios=heights, squeeze=False)[:, 0]
-    # Shade adjoining heating and cooling as one span, without a bright line.
+    # Shade adjoining heating and cooling as one span, without a bright line between.
     for regime, run in groupby(shown.stretches, key=attrgetter('regime')):
         start, *_, stop = (edge / unit for stretch in run for edge in stretch[:2])
         if regime == Regime.DYNAMIC:

@@ -19,7 +19,7 @@ from .evidence import LEFT_OUT, Evidence, span_of
 from .statements import CertificateInfo
 from .style import caption, drawing, png, render, svg, utc
 
-# Mean radius of the Earth [m]: GRS 80.
+# Mean radius of the Earth in GRS 80 [m].
 _EARTH_RADIUS = 6.371e6
 
 

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the typography of pages, which cannot run or load code, and the look of the figures, whose
-lines differ in dashes, and in colours of Okabe and Ito.
+Owns the style of pages, whose content policy forbids scripts and external files, and of figures,
+whose lines differ in dashes and in colours (from the palette of Okabe and Ito).
 """
 
 import datetime as dt
@@ -201,7 +201,7 @@ def _css_text(value: str) -> Markup:
 
 
 def number(value: float, digits: int = 3) -> str:
-    """Format a number with `digits` significant digits, at most `digits` of them decimals."""
+    """Format a number with `digits` significant digits, but with at most `digits` decimals."""
     if not math.isfinite(value):
         return '–'
     if value == 0.0:

@@ -35,7 +35,7 @@ from .waitloop import WaitLoop
 IDLE_S = 5.0
 #: Readings stamped later than the samples by more than this time use another clock [s].
 AHEAD_S = 5.0
-#: Samples have stopped if the next sample is late by the larger of two times [cycles], [s].
+#: Samples have stopped if none arrives for the larger of two times [cycles], [s].
 SILENT_CYCLES, SILENT_S = 5.0, 0.5
 #: Largest error of |f| at rest without a warning, in standard deviations of the error.
 GRAVITY_SIGMAS = 5.0

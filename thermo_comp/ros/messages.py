@@ -93,7 +93,7 @@ class LiveField:
 
 
 def live_field(node: Node, topic: str) -> LiveField | None:
-    """Return the field of ``TOPIC[:FIELD]``; None if not given and the type is not Float32/64."""
+    """Return the field of ``TOPIC[:FIELD]``; None if nobody publishes, or FIELD has no default."""
     name, path = split_field(topic)
     name = node.resolve_topic_name(name)
     offers = node.get_publishers_info_by_topic(name)

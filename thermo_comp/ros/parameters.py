@@ -304,7 +304,7 @@ class ParameterRequests:
             raise
 
     def _repeats_fixed_value(self, change: Parameter) -> bool:
-        """Whether a change sets a fixed parameter to its value, as `param load` of a dump does."""
+        """Whether a change sets a fixed parameter to its present value, as a loaded dump does."""
         node = self._loop.node
         return bool(
             node.has_parameter(change.name)

@@ -157,7 +157,7 @@ class Reader:
 
 
 def serve(handle: int, parent: int) -> None:
-    """Answer reading requests until the connection closes."""
+    """Answer requests to read calibrations until the connection closes."""
     os.nice(NICENESS)
     pipe = Connection(handle)
     with suppress(AttributeError, OSError):

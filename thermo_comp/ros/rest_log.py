@@ -42,7 +42,7 @@ _JUMP_NS = 10**9
 # First bytes of a message in little-endian CDR; offsets of counts, force and angular rate from the
 # end of a message [bytes].
 _PLAIN, _COUNTS, _FORCE, _RATE = (0, 1, 0, 0), -24, -96, -192
-_SHORTEST = {False: 44, True: 316}  # shortest message [bytes]: of counts, and of an Imu (True)
+_SHORTEST = {False: 44, True: 316}  # shortest message [bytes], by whether it is an Imu
 
 
 class RestLog:

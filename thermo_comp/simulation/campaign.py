@@ -42,7 +42,7 @@ _PROGRAMS = {
     'three-soaks': '20 60min, 35@1 60min, 5@1 60min',
 }
 _FACES = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
-# Edges of the cube: three edges that sum to 0, one per pair of axes; their opposites; other edges.
+# Midpoints of a cube's edges: three that sum to 0, one per pair of axes; their opposites; others.
 _EDGES = [
     *[(1, 1, 0), (0, -1, 1), (-1, 0, -1), (-1, -1, 0), (0, 1, -1), (1, 0, 1)],
     *[(1, -1, 0), (0, 1, 1), (-1, 0, 1), (-1, 1, 0), (0, -1, -1), (1, 0, -1)],
@@ -197,10 +197,10 @@ class Position:
 
 def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
     """
-    Return the positions of a test in the order of their recording: 'chamber-18' (18 positions of
-    9.5 h), 'chamber-9' (9 of 3 h), 'tumble' (18 of 20 min at room temperature), 'tumble-3',
-    'tumble-1' ('tumble', then 3 positions or 1 of 3 h in the chamber), 'held-out' (3 positions
-    with ramps and attitudes that no other plan has), 'centrifuge' or 'rate-table' (12 mountings,
+    Return the positions of a test in recording order: 'chamber-18' (18 positions of 9.5 h),
+    'chamber-9' (9 positions of 3 h), 'tumble' (18 positions of 20 min at room temperature),
+    'tumble-3' or 'tumble-1' ('tumble', then 3 positions or 1 of 3 h in the chamber), 'held-out' (3
+    positions with ramps and attitudes of no other plan), 'centrifuge', 'rate-table' (12 mountings,
     each at rest and at four rates in three soaks). `seed` determines attitudes and temperatures.
     """
     if name not in PLAN_NAMES:
@@ -229,7 +229,7 @@ def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
 def steps(
     begins_s: tuple[float, ...], rates: tuple[float, ...], dwell_s: float, ramp_s: float
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return times and rates of runs from `begins_s` [s] on: all `rates`, with ramps between."""
+    """Return times [s] and rates of runs that begin at `begins_s` and step through all `rates`."""
     time, rate = [0.0], [0.0]
     for begin in begins_s:
         now = begin

@@ -87,7 +87,7 @@ class PartEffect(Effect):
 @dataclass(frozen=True)
 class FlowEffect(Effect):
     """
-    Effect of a heat flow between two parts in either direction, less that in the reference state.
+    Effect of the size of a heat flow between two parts, less its effect in the reference state.
 
     With ``x = |T_hot - T_cold| / knee`` the first signal is ``x ** exponent`` times the deviation
     of `cold` to the `power`. The exponent is 1.25 for convection in a gap, 1 for the load of a
@@ -116,7 +116,7 @@ class FlowEffect(Effect):
 
 @dataclass(frozen=True)
 class CreepEffect(Effect):
-    """Creep in a part: its temperature less that lagged with the time constant [s]."""
+    """Creep in a part: the signal is its temperature less a lag of `time_constant` [s] of it."""
 
     part: str
     time_constant: float

@@ -25,8 +25,8 @@ LARGEST_RATE: Final = 0.2
 #: may be wrong.
 SETTLED_READINGS: Final = 5
 
-#: A sensor's first reading is wrong if the step to the second reading is impossible and the change
-#: to the third is less than this share of the step, and of the change at the step's rate.
+#: A sensor's first reading is wrong if its step to the second is impossible, and the change from
+#: second to third is below this share of the step, and of the change expected at the step's rate.
 CONTINUED_SHARE: Final = 0.25
 
 #: Smallest number of equal readings, and shortest time [s], after which a sensor counts as

@@ -134,7 +134,7 @@ class ThermalTracker:
         return True
 
     def _compare(self, name: str, stamp_ns: int, celsius: float) -> None:
-        """Compare a reading of the board or of a sensor with the other's."""
+        """Test whether sensors repeat readings of the board; `name`: origin of the reading."""
         is_board = name == BOARD_INPUT
         for other in self.copies if is_board else (name,):
             self.copies[other].update(is_board, stamp_ns, celsius)

@@ -143,8 +143,8 @@ class RegimeSet:
     lack_of_fit: Annotated[
         tuple[LackOfFit, ...],
         'Error on data left out of the fit, beyond the sd of the posterior; includes the error of '
-        'scale factors at temperatures at which no position had their axis along gravity. The '
-        'variance is linear between two entries, and constant outside all entries.',
+        'scale factors at temperatures at which no position had the axis along gravity. The '
+        'variance is linear between the temperatures of entries, and constant outside them.',
     ] = ()
 
     def __post_init__(self) -> None:
@@ -250,7 +250,7 @@ class Calibration:
         check_limits(self, parameter_layout(self))
         if self.gyroscope is not None:
             try:
-                rate_triad(self)  # the rules for the three accelerometers apply
+                rate_triad(self)  # a gyroscope must keep the rules of an accelerometer triad
             except ValueError as error:
                 raise ValueError(str(error).replace('`', '`gyroscope.', 1)) from error
 

@@ -9,9 +9,9 @@ dynamic regime. u is limited to the column's range, and t to the calibrated temp
 the calibrated temperatures the curves of the sets first continue along tangents, but t^power is
 constant, because no recording determines the weights of columns at these temperatures.
 
-The function `bank` makes the columns in groups, which have one kind or more. The fit makes group
-*part* of board, square and cube: their sum with a curve over the board temperature is a curve over
-a part's temperature.
+The function `bank` makes the columns in groups of one kind or more. The fit makes group *part* of
+the kinds board, square and cube: with a curve over the board temperature, the sum of such columns
+is a curve over a part's temperature.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -43,8 +43,8 @@ BANK_TAUS: Final = FINE_TAUS[::2]
 EVEN_WIDTHS: Final = (0.375, 0.75, 1.5, 3.0, 6.0)
 PLAY_WIDTHS: Final = (0.4, 0.8, 1.6, 3.2, 6.4)
 PLAY_TAUS: Final[tuple[float, ...]] = (0.0, 450.0, 900.0, 1800.0)
-#: Kind bend: time constants [s]; least temperature span per knee (temperature at which the slope
-#: changes) [K]; most knees per lag, and, for lags given to `bank`, with a third of the span.
+#: Kind bend: time constants [s]; least span of board temperatures per knee (change of slope) [K];
+#: most knees per lag, and most per lag given to `bank`, whose knees are three times as dense.
 BEND_TAUS: Final = (0.0, *FINE_TAUS[4:11])
 LEAST_KNEE_K, MOST_KNEES, MOST_PART_KNEES = 1.0, 20, 60
 
@@ -174,7 +174,7 @@ def bank(
 ) -> tuple[Column, ...]:
     """
     Return the candidate columns of a response, with the widest ranges. `at_rest`: gradient of
-    each sensor at rest [K]; `span_k`: lowest and highest board temperature in the data, less the
+    each sensor in a soak [K]; `span_k`: lowest and highest board temperature in the data, less the
     reference [K]; `parts`: lags of the part of each axis; if given, all lags are from `parts`.
     """
     fine, coarse, of_plays, of_bends = (
@@ -199,7 +199,7 @@ def bank(
     even = _family('gradient_even', ['gradient_even'], sensors, (0, 1, 2), widths=EVEN_WIDTHS)
     even += _family('gradient_even', ['size', 'square'], sensors, (0, 1, 2))
     # The load of a heat pump is an even function of the gradient; an effect that is equal in
-    # heating and cooling is an even function of the gradient less its value at rest.
+    # heating and cooling is an even function of the gradient less its value in a soak.
     rest = at_rest or {}
     about_rest = partial(replace, group='gradient_even_about_rest')
     columns += even
@@ -302,7 +302,7 @@ class ColumnTable:
         return hold(raw, *self._range)
 
     def excess(self, raw: Floats) -> Floats:
-        """Return the excess over the range [half ranges]; for a power, that of its base."""
+        """Return the excess of u over its range [half ranges]; of squares, cubes: of the root."""
         lower, upper = self._range
         excess = np.asarray(np.abs(raw - self.held(raw)) / ((upper - lower) / 2.0))
         for order in {*self._orders.tolist()} - {1}:

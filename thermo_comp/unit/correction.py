@@ -111,7 +111,7 @@ class Correction:
         self.n_slow = N_ROWS if self.of_force is None else N_ROWS + 15
 
     def _find_columns_of_pairs(self) -> None:
-        """Find the columns of each quantity of the state whose variance is propagated."""
+        """Find the columns that depend on each quantity of the state that has a variance."""
         self.layout = layout = StateLayout(self.memory)
         pair = np.array([layout.pairs.get(c.source, -1) for c in self.table.columns], np.int64)
         columns = np.argsort(pair, kind='stable')
@@ -191,9 +191,9 @@ class Correction:
 
         `slow` is the slowly varying error covariance, shape (n_slow, n), see
         `SlowUncertainty.at`. Returns (52,) or (52, n): by axis bias and its change over the
-        segment (1 s), scale and its change, then the coefficients of the covariance with the noise
-        of a sample, see `covariance.covariance_at`. A nonlinearity adds 15 rows to `slow` and 21
-        to the result: K2, Kq, K3 by axis, coefficients of x^3 to x^6 in the variance by axis.
+        segment (1 s), scale and its change, then the coefficients of the covariance, including the
+        noise of a sample, see `covariance.covariance_at`. A nonlinearity adds 15 rows to `slow`,
+        21 to the result: K2, Kq, K3 by axis, coefficients of x^3 to x^6 in the variance by axis.
         """
         ends = np.array((start, end), dtype=np.float64)
         n = ends[0, 0].size
@@ -244,7 +244,7 @@ class Correction:
     ) -> tuple[Floats, Floats]:
         """
         Evaluate a, b, c of each axis' error variance ``a + b x + c x^2``, (3, 3, n), without noise
-        of a sample, and the factor (3, n) of the variance of the parameters outside the ranges.
+        of a sample, and the factor (3, n) by which the variance grows outside the ranges.
 
         The difference of dynamic and static set (`gap`) is added as an error while the sets are
         blended, outside the calibrated ranges, and while the regime is unknown. While the regime
@@ -254,7 +254,7 @@ class Correction:
         static_weight, beyond_range = 1.0 - weight, raw - held
         excess, _, relative, by_rate = self.curves.excess(states)
         if not self._has_lags:
-            # Without lags the rate's excess adds variance; with lags, the lags' excess instead.
+            # With lags, those beyond their ranges count instead of the rate: see `columns_out`.
             relative = relative + by_rate
         outside = static_weight * relative[0] + weight * relative[1]
         shares = np.array([static_weight + unknown * weight, weight + unknown * static_weight])

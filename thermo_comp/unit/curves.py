@@ -51,7 +51,7 @@ class Curves:
         self._lacks = [np.array(points).reshape(-1, 4).T for points in lacks]
 
     def excess(self, states: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Return excess of temperature [K] and rate [K/s], then of both in half ranges, (2, n)."""
+        """Return T_board [K] and rate [K/s] beyond their ranges, then in half ranges, (2, n)."""
         t, rate = states[BOARD] - self._reference, states[RATE]
         over, too_fast = t - hold(t, *self._t_range), rate - hold(rate, *self._rate_range)
         span, rate_span = (edges[1] - edges[0] for edges in (self._t_range, self._rate_range))
@@ -72,7 +72,7 @@ class Curves:
         return result
 
     def _evaluate(self, t: Floats, what: str = 'value') -> Floats:
-        """Evaluate values or slopes of both sets at t [K from T_ref] of each set, (2, n)."""
+        """Evaluate curves or slopes of both sets at t [K from T_ref], one row per set, (2, n)."""
         pairs = zip(self._rows, t, strict=True)
         return np.array([[getattr(function, what)(at) for function in row] for row, at in pairs])
 

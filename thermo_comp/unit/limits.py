@@ -110,7 +110,7 @@ def _check_bias(key: str, level: float, reached: tuple[float, float], most: floa
 
 
 def _check_scale(key: str, reached: tuple[float, float], gain: float) -> None:
-    """Refuse a relative scale beyond its limits with `gain` or -`gain` from the columns."""
+    """Refuse a relative scale that breaks its limits if columns add `gain` or -`gain`."""
     for word, value, is_kept, limit in (
         ('above', reached[0] - gain, operator.gt, SMALLEST_RELATIVE_SCALE),
         ('below', reached[1] + gain, operator.lt, LARGEST_RELATIVE_SCALE),

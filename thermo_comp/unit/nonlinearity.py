@@ -35,7 +35,7 @@ POWERS: dict[Kind, int] = {'square': 1, 'odd_square': 1, 'cube': 2}
 #: Prior sd of K2 [g/g^2]: above the limits of K2 in data sheets of quartz pendulum
 #: accelerometers, 20 to 60 ug/g^2.
 K2_SD = 1e-4
-#: Largest |f| / gravity of a rest whose |f| counts as gravity.
+#: Largest |f| / gravity at which |f| counts as gravity.
 AT_REST = 1.01
 #: Largest slope of the nonlinear terms within full scale, for which one step of Halley's method is
 #: sufficient.
@@ -66,7 +66,7 @@ class NonlinearTerm:
     left_out_gain: Annotated[
         float,
         QUANTITIES['log evidence'],
-        'Log of the mean-square error on left-out data without the term / with the term.',
+        'Log of a ratio: mean-square error on left-out data without the term / with the term.',
     ] = 0.0
 
 
@@ -195,7 +195,7 @@ class BeyondForce(NamedTuple):
 
 
 def beyond_force(calibration: Calibration) -> BeyondForce:
-    """Return the variance of an unknown square term beyond the |f| of the fit, or at rest."""
+    """Return the variance of an unknown square term beyond the fit's |f|, by default 1.01 g."""
     known = calibration.nonlinearity
     edge = known.force_range_m_s2[1] if known else AT_REST * calibration.gravity_m_s2
     sd = (known.beyond_sd_g_g2 if known else K2_SD) / STANDARD_GRAVITY

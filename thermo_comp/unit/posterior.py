@@ -18,7 +18,7 @@ from ..typing import Floats
 from .functions import TemperatureFunction
 from .schema import broken
 
-#: Largest fraction of each variance that a `diagonal` may have.
+#: Largest share of a parameter's variance that may be in `diagonal` instead of `factor`.
 _TOLERANCE = 1e-5
 #: Most negative eigenvalue of a correlation matrix that rounding can cause.
 _MOST_NEGATIVE = -1e-6

@@ -7,9 +7,9 @@ initial lag states, and the thermal states of a soak and of a ramp.
 After s seconds of a ramp of rate q the sensors are ``board_lag_s q`` warmer than the board (these
 differences are the gradients), a part of time constant tau lags the board by ``tau q (1 - exp(-s /
 tau))``, and the output of a play lags its input by the play's half-width; in a soak (q = 0) all
-these are 0. In both, `soak_gradient_k` is added to the gradient of the first sensor and its lags.
-In a soak the static set applies, in a ramp the dynamic set. Predicted variances include neither
-noise nor thermometer errors.
+these are 0. `soak_gradient_k` is added to the gradient of the first sensor and its lags in soaks
+and ramps. In a soak the static set applies, in a ramp the dynamic set. Predicted variances include
+neither noise nor thermometer errors.
 """
 
 from collections.abc import Callable

@@ -44,7 +44,7 @@ class Source:
 @dataclass(frozen=True)
 class ResidualSummary:
     """
-    ``|f| - g`` of the fitted data in one regime, or of all; raw: corrected with constants alone.
+    ``|f| - g`` of the fitted data in one regime or both; raw: corrected with the constants alone.
     """
 
     section: str

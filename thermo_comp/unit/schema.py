@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
 from ..quantities import Bounds
 
-#: Number of characters at which names and values are cut in error messages; keys are shorter.
+#: Longest name or value in an error message [characters]; valid keys are shorter.
 _LONGEST_NAME = 60
 _NAMED_FIRST = re.compile(r'`(?P<key>[\w.\[\]]+)` (?P<rest>.*)', re.DOTALL)
 _WORDS: dict[Any, str] = {str: 'text', int: 'integer', float: 'number', bool: 'true or false'}

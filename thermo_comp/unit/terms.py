@@ -7,7 +7,7 @@ The value of a column is ``u = form.value(x)``, ``x = (n - centre) / width``. Th
 quantity of the thermal state, the `source`; if `is_temperature`, n is ``t - source``, the
 temperature of a part that lags the board. Notation: ``t = T_board - T_ref``,
 ``g_s = T_s - T_board`` of a sensor s, and ``q_s = g_s - rest``. The constant `rest` is 0, or the
-gradient at rest if self-heating makes the board warmer than the case. Even functions of q_s have
+gradient in a soak if self-heating warms the board above the case. Even functions of q_s have
 the same value for heating and for cooling at the same rate.
 """
 
@@ -126,20 +126,20 @@ def _play(column: Column) -> Quantity:
 
 
 _ALL: Final = (
-    # Effect of a heat flow: between a thermometer and the board; without case thermometer.
+    # Effect of the heat flow from a thermometer to the board; `rate`: without case thermometer.
     Term('gradient', 'g_s', _gradient),
     Term('rate', 'dT_board/dt [K/s]', lambda _: state.Rate()),
-    # Effect of the temperature of a part, and of parts between the thermometers.
+    # Effect of a part that lags the board; `gradient_lag`: of a part between thermometers.
     Term('board', 'T_board - lagged T_board', _part, positive=('tau_s',)),
     Term('gradient_lag', 'lagged g_s', _lagged_gradient, positive=('tau_s',)),
-    # Curve over the temperature of a part; without lag, even effect of a heat flow.
+    # Curve over the temperature of a part; without lag, effect of the square of a heat flow.
     Term(
         *('square', '(T_board - lagged T_board)^2, or q_s^2 without lag', _part_or_gradient),
         *(_SQUARE, 2, 'rest_k'),
     ),
     # Cubic curve over the temperature of a part.
     Term('cube', '(T_board - lagged T_board)^3', _part, _CUBE, 3, 'rest_k', positive=('tau_s',)),
-    # Effect of a heat load, such as the load of a heat pump; of a heat load that saturates.
+    # Effect of a heat load, as of a heat pump; `gradient_even`: of a load that saturates.
     Term('size', 'abs(q_s)', _gradient, _SIZE, centre_key='rest_k'),
     Term(
         *('gradient_even', 'tanh((q_s / width)^2)', _gradient, _EVEN),
