@@ -32,7 +32,6 @@ import numpy as np
 
 from thermo_comp.fitting import FitOptions
 from thermo_comp.fleet.run import fit_fleet
-from thermo_comp.fleet.table import Row
 from thermo_comp.fleet.units import FoundUnit, Storage, find_units
 from thermo_comp.fleet.work import FleetOptions, connected, run
 from thermo_comp.recording.writer import BagWriter
@@ -248,13 +247,15 @@ def kill(folder: Path, n_units: int, model: str) -> int:
     try:
         with connected(None, 2) as client:
 
-            def report(n: int, total: int, _row: Row | None) -> None:
+            def report(n: int, total: int) -> None:
                 if n in (total // 4, total // 2):
                     killed.append(max(client.run(os.getpid).values()))
                     os.kill(killed[-1], signal.SIGKILL)
 
             began = time.perf_counter()
-            result = fit_fleet(str(fleet), fleet / '.out', options, client=client, progress=report)
+            address = client.cluster.scheduler_address
+            out = fleet / '.out'
+            result = fit_fleet(str(fleet), out, options, scheduler=address, progress=report)
             seconds = time.perf_counter() - began
     finally:
         shutil.rmtree(fleet)

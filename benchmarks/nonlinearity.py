@@ -21,8 +21,8 @@ from itertools import pairwise
 import numpy as np
 
 from thermo_comp.fitting import FitOptions, FitSource, fit
-from thermo_comp.fitting.known_force import KnownForce, Section
 from thermo_comp.fitting.nonlinear import without_terms
+from thermo_comp.fitting.sources import KnownForce, Section
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.online.status import CompensatorConfig

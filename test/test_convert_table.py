@@ -12,6 +12,7 @@ from thermo_comp.convert import log as logs
 from thermo_comp.convert.bag import bag_log, find_topics
 from thermo_comp.convert.column_map import ColumnMap, table_log
 from thermo_comp.convert.log import NO_STAMP, contradiction, find_stillness, infer_unit, write_log
+from thermo_comp.convert.readers import read_log
 from thermo_comp.convert.table import Format, Stamp, exact_ns, read_parquet, read_text
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording.reader import read_recording
@@ -123,9 +124,10 @@ def test_bad_tables_are_refused(tmp_path, text, column, message):
     assert str(path) in str(caught.value)
 
 
-def test_a_missing_table_is_refused(tmp_path):
-    with pytest.raises(RecordingError, match='No such file'):
-        read_text(tmp_path / 'absent.csv', ['a'], ROWS_ALONE)
+@pytest.mark.parametrize('name', ['absent.csv', 'absent.ulg', 'absent.BIN'])
+def test_a_missing_file_is_refused(name, tmp_path):
+    with pytest.raises(RecordingError, match=f'{name}: No such file or directory$'):
+        read_log(tmp_path / name)
 
 
 class TestParquet:

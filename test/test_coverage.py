@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from thermo_comp.fitting.coverage import (
-    PRIOR_SD,
     constants_covariance,
     direction_text,
     farthest,
@@ -17,6 +16,7 @@ from thermo_comp.fitting.coverage import (
 )
 from thermo_comp.simulation.campaign import positions
 
+PRIOR_SD = np.repeat([1.0 / 9.80665, 0.05, 1e-3], 3)  # bias [g], scale, misalignment [rad]
 FACES = np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)], float)
 NOTHING = np.empty((0, 3))
 SD = 2e-5

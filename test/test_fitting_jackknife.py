@@ -3,6 +3,7 @@
 """The claimed sd covers effects that the model lacks, and agrees with a jackknife estimate."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from thermo_comp.fitting.claim import claim_of
 from thermo_comp.fitting.hyperparameters import white_noise
 from thermo_comp.fitting.reduction import reduce_source
 from thermo_comp.fitting.regression import Regression
+from thermo_comp.fitting.selection import Fit
 from thermo_comp.fitting.windows import FEWEST_WINDOWS, N_SECTIONS
 from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
@@ -45,7 +47,8 @@ def ratios_to_sd(seed, effect_sd):
     used = np.array(GROUPS) != 'idle'
     missed = fitted.state.weights[0] - truth.on_bias * regression.rms
     places = fitted.layout.weights[0][:, used]
-    covariances = fitted.covariance, claim_of(regression, fitted).covariance
+    chosen = SimpleNamespace(posterior=fitted, informative=(), lacks_effects=True)
+    covariances = fitted.covariance, claim_of(Fit(windows, regression, chosen)).covariance
     return [missed[:, used] / np.sqrt(np.diag(each)[places]) for each in covariances]
 
 

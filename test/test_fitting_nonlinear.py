@@ -15,7 +15,11 @@ from thermo_comp.errors import FitError, ThermoCompError
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.claim import claim_of
 from thermo_comp.fitting.equations import with_step
-from thermo_comp.fitting.known_force import (
+from thermo_comp.fitting.left_out import score_of
+from thermo_comp.fitting.nonlinear import Forces, choose, prior_sd, starting_sd
+from thermo_comp.fitting.population import population
+from thermo_comp.fitting.selection import Fit, Selected
+from thermo_comp.fitting.sources import (
     MAGNITUDE,
     ROTATION,
     ForceOptions,
@@ -25,10 +29,6 @@ from thermo_comp.fitting.known_force import (
     known_force,
     parse_sections,
 )
-from thermo_comp.fitting.left_out import score_of
-from thermo_comp.fitting.nonlinear import Forces, choose, prior_sd, starting_sd
-from thermo_comp.fitting.population import population
-from thermo_comp.fitting.selection import Selected
 from thermo_comp.judging.evaluation import judge_bags
 from thermo_comp.recording.reader import inspect_recording
 from thermo_comp.recording.stillness import CellAccumulator, still_intervals, without_rotation
@@ -293,7 +293,8 @@ def test_the_claimed_covariance_includes_nonlinear_terms_and_radius(rng):
     prior = prior_of(truth, (), nonlinear_sd=starting_sd(regression.forces, OPTIONS))
     posterior = regression.solve(state, prior, n_steps=12)
     typical = np.outer([1.0, 0.1], regression.windows.kelvins)
-    claim = claim_of(regression, posterior, typical)
+    chosen = Selected(posterior, score_of(regression, posterior), ())
+    claim = claim_of(Fit(regression.windows, regression, chosen, typical))
     for name in ('nonlinear', 'radius', 'misalignment'):
         before, after = (getattr(layout, name) for layout in (posterior.layout, claim.layout))
         used = before >= 0

@@ -28,7 +28,7 @@ from thermo_comp.fitting.hyperparameters import downweigh, settle
 from thermo_comp.fitting.initialisation import STEEPEST
 from thermo_comp.fitting.left_out import is_better
 from thermo_comp.fitting.regression import Regression
-from thermo_comp.fitting.selection import Selected, fit_all, select
+from thermo_comp.fitting.selection import Fit, Selected, fit_all, select
 from thermo_comp.fitting.series import Whitener
 from thermo_comp.fitting.unknowns import InformativePrior, Noise
 
@@ -399,7 +399,7 @@ def claimed(gravity_sd):
     candidates = candidates_of(windows, ('curve', 'board'))
     candidates = replace(candidates, typical=candidates.typical * ~IDLE)
     selection = select(regression, state, constants(truth), candidates)
-    return claim_of(regression, selection.posterior, None, gravity_sd).covariance
+    return claim_of(Fit(windows, regression, selection), gravity_sd).covariance
 
 
 def test_the_sd_of_gravity_adds_a_common_error_to_all_scale_factors():

@@ -39,6 +39,11 @@ def client():
         yield client
 
 
+@pytest.fixture(scope='module')
+def scheduler(client):
+    return client.cluster.scheduler_address
+
+
 def contents(folder):
     return {
         str(path.relative_to(folder)): (path.stat().st_mtime_ns, path.read_bytes())
@@ -59,19 +64,17 @@ def fleet(tmp_path_factory):
 
 @pytest.mark.slow
 def test_all_units_are_fitted_despite_a_killed_worker_and_only_once(client, fleet, tmp_path):
-    out = tmp_path / 'out'
+    out, scheduler = tmp_path / 'out', client.cluster.scheduler_address
     collected = []
 
-    def report(_n, _total, row):
-        if row is None:
-            return
+    def report(n, total):
         # When the first result arrives, two workers are at work.
-        if not collected:
+        if n == 1:
             os.kill(min(client.run(os.getpid).values()), signal.SIGKILL)
-        collected.append(str(row['name']))
+        collected.append((n, total))
 
-    result = fit_fleet(str(fleet), out, OPTIONS, client=client, progress=report)
-    assert sorted(collected) == ['A/good', 'A/torn', 'B/exchanged']
+    result = fit_fleet(str(fleet), out, OPTIONS, scheduler=scheduler, progress=report)
+    assert collected == [(n, 3) for n in range(4)]
     assert result.n_done == 3
     rows = {str(row['name']): row for row in result.rows}
     verdicts = {name: str(row['verdict']).split(',')[0] for name, row in rows.items()}
@@ -88,14 +91,14 @@ def test_all_units_are_fitted_despite_a_killed_worker_and_only_once(client, flee
     assert float(table[0]['bias_x_ug']) == rows['A/good']['bias_x_ug']
 
     before = contents(out / 'units')
-    again = fit_fleet(str(fleet), out, OPTIONS, client=None, scheduler='tcp://nobody:1')
+    again = fit_fleet(str(fleet), out, OPTIONS, scheduler='tcp://nobody:1')
     assert again.n_done == 0
     assert again.rows == result.rows
     assert contents(out / 'units') == before
 
     # A unit is fitted again if the modification time of a bag has changed.
     os.utime(fleet / 'A/good/01.mcap', ns=(0, 0))
-    touched = fit_fleet(str(fleet), out, OPTIONS, client=client)
+    touched = fit_fleet(str(fleet), out, OPTIONS, scheduler=scheduler)
     assert touched.n_done == 1
     after = contents(out / 'units')
     assert {Path(name).parts[1] for name in before if before[name] != after[name]} == {'good'}
@@ -108,11 +111,11 @@ def test_all_units_are_fitted_despite_a_killed_worker_and_only_once(client, flee
     assert {name for name, known in seen.items() if known} == {'A/good'}
 
 
-def test_unreadable_bags_leave_earlier_results_in_place(client, tmp_path):
+def test_unreadable_bags_leave_earlier_results_in_place(scheduler, tmp_path):
     # WHY: when bags could not be read, a second run deleted the results of the first run.
     bags = write_unit(tmp_path / 'bags' / 'unit', 1)
     options = replace(OPTIONS, certificates=True)
-    first = fit_fleet(str(tmp_path / 'bags'), tmp_path / 'out', options, client=client)
+    first = fit_fleet(str(tmp_path / 'bags'), tmp_path / 'out', options, scheduler=scheduler)
     before = contents(tmp_path / 'out' / 'units')
     expected = {'calibration.yaml', 'certificate.html', 'result.json'}
     assert {Path(name).name for name in before} == expected
@@ -120,7 +123,7 @@ def test_unreadable_bags_leave_earlier_results_in_place(client, tmp_path):
     for path in bags:
         path.write_bytes(b'')
     for changed in (options, replace(options, topics=Topics(input='counts'))):
-        second = fit_fleet(str(tmp_path / 'bags'), tmp_path / 'out', changed, client=client)
+        second = fit_fleet(str(tmp_path / 'bags'), tmp_path / 'out', changed, scheduler=scheduler)
         (row,) = second.rows
         assert row['verdict'] == 'failed'
         assert 'calibration.yaml of an earlier run stays' in str(row['problem'])
@@ -129,28 +132,28 @@ def test_unreadable_bags_leave_earlier_results_in_place(client, tmp_path):
     for path, stamp_ns, content in kept:
         path.write_bytes(content)
         os.utime(path, ns=(stamp_ns, stamp_ns))
-    third = fit_fleet(str(tmp_path / 'bags'), tmp_path / 'out', options, client=client)
+    third = fit_fleet(str(tmp_path / 'bags'), tmp_path / 'out', options, scheduler=scheduler)
     assert third.n_done == 0
     assert third.rows == first.rows
 
 
-def test_an_interrupted_fleet_run_continues(client, tmp_path):
+def test_an_interrupted_fleet_run_continues(scheduler, tmp_path):
     fleet, out = tmp_path / 'bags', tmp_path / 'out'
     for seed in range(3):
         write_unit(fleet / 'A' / f'u{seed}', seed, 1)
 
-    def stop(_n, _total, row):
-        if row is not None:
+    def stop(n, _total):
+        if n:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        fit_fleet(str(fleet), out, OPTIONS, client=client, progress=stop)
+        fit_fleet(str(fleet), out, OPTIONS, scheduler=scheduler, progress=stop)
     assert not (out / 'fleet.csv').exists()
     assert len(list(out.rglob('result.json'))) == 1
     # The result file of unit A/u0 is cut off, as after a power failure.
     (out / 'units/A/u0').mkdir(parents=True, exist_ok=True)
     (out / 'units/A/u0/result.json').write_text('{"format": 1,')
-    result = fit_fleet(str(fleet), out, OPTIONS, client=client)
+    result = fit_fleet(str(fleet), out, OPTIONS, scheduler=scheduler)
     assert len(result.rows) == 3
     assert result.n_done in (2, 3)
     assert json.loads((out / 'units/A/u0/result.json').read_text())['is_final']
@@ -268,10 +271,10 @@ def test_wrong_arguments_of_fleet_fit_give_a_message(tmp_path, capsys):
     assert len(printed.splitlines()) == 1
 
 
-def test_a_unit_without_a_calibration_gives_exit_code_1(client, tmp_path, capsys):
+def test_a_unit_without_a_calibration_gives_exit_code_1(scheduler, tmp_path, capsys):
     write_unit(tmp_path / 'bags' / 'u', 1, 3, is_exchanged=True)
     same = FleetOptions(FitOptions(gravity=9.81), Topics())
-    fit_fleet(str(tmp_path / 'bags'), tmp_path / 'out', same, client=client)
+    fit_fleet(str(tmp_path / 'bags'), tmp_path / 'out', same, scheduler=scheduler)
     arguments = (tmp_path / 'bags', tmp_path / 'out', '--gravity', '9.81')
     assert command(*arguments) == 1
     text = capsys.readouterr()
@@ -290,15 +293,15 @@ def test_a_unit_without_a_calibration_gives_exit_code_1(client, tmp_path, capsys
     assert (data['n_fitted'], data['n_done'], data['verdicts']) == (0, 0, {'refused': 1})
 
 
-def test_a_unit_is_fitted_again_with_other_options(client, fleet, tmp_path):
+def test_a_unit_is_fitted_again_with_other_options(scheduler, fleet, tmp_path):
     refused = fleet / 'B'
-    fit_fleet(str(refused), tmp_path / 'out', OPTIONS, client=client)
+    fit_fleet(str(refused), tmp_path / 'out', OPTIONS, scheduler=scheduler)
     other = replace(OPTIONS, fit=replace(OPTIONS.fit, min_rest_s=4.0))
-    assert fit_fleet(str(refused), tmp_path / 'out', other, client=client).n_done == 1
+    assert fit_fleet(str(refused), tmp_path / 'out', other, scheduler=scheduler).n_done == 1
 
 
 @pytest.mark.slow
-def test_the_prior_of_siblings_reduces_the_scale_error_of_a_unit_with_one_bag(client, tmp_path):
+def test_the_prior_of_siblings_reduces_the_scale_error_of_a_unit_with_one_bag(scheduler, tmp_path):
     # Unit 0 has a single position, which does not separate bias and scale; units 1 to 3 have nine.
     kind = unit_preset('mems', 1)
     siblings = [sibling(kind, number) for number in range(4)]
@@ -306,14 +309,14 @@ def test_the_prior_of_siblings_reduces_the_scale_error_of_a_unit_with_one_bag(cl
         folder, n_bags = tmp_path / 'bags' / f'u{number}', 9 if number else 1
         write_unit(folder, number, n_bags, unit=unit, serial=f's{number}')
     arguments = (str(tmp_path / 'bags'), tmp_path / 'out', OPTIONS)
-    alone = fit_fleet(*arguments, client=client)
+    alone = fit_fleet(*arguments, scheduler=scheduler)
     assert [row['is_whole'] for row in alone.rows] == [0, 1, 1, 1]
     assert alone.prior == tmp_path / 'out' / 'prior.yaml'
     of_type = load_calibration(alone.prior).provenance
     assert [source.name for source in of_type.sources] == ['s1', 's2', 's3']
     before = contents(tmp_path / 'out' / 'units')
 
-    helped = fit_fleet(*arguments, client=client, with_prior=True)
+    helped = fit_fleet(*arguments, scheduler=scheduler, with_prior=True)
     assert helped.n_done == 1
     assert contents(tmp_path / 'out' / 'units') == before
     assert [bool(row['prior']) for row in helped.rows] == [True, False, False, False]
@@ -331,7 +334,7 @@ def test_the_prior_of_siblings_reduces_the_scale_error_of_a_unit_with_one_bag(cl
     assert after < before_it
     assert (np.abs(errors[0] / scale - 1.0) < 3e-6 * sds[0]).all()
     assert (sds[0] < 0.5 * sds[1]).all()
-    assert fit_fleet(*arguments, client=client, with_prior=True).n_done == 0
+    assert fit_fleet(*arguments, scheduler=scheduler, with_prior=True).n_done == 0
 
 
 @pytest.mark.parametrize(

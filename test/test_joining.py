@@ -14,9 +14,8 @@ import thermo_comp
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, FitSource, fit
 from thermo_comp.fitting.joining import joined
-from thermo_comp.fitting.known_force import KnownForce, parse_sections
 from thermo_comp.fitting.reduction import reduce_source
-from thermo_comp.fitting.sources import digest
+from thermo_comp.fitting.sources import KnownForce, digest, parse_sections
 from thermo_comp.judging.evaluation import evaluate
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter

@@ -87,7 +87,7 @@ def test_evaluate_and_report_print_the_history(cli, tmp_path, monkeypatch):
     drawn = json.loads(cli('report', *given, '-o', page).stdout)
     assert drawn['history'] == content['history']
     assert '2020-01-01' in page.read_text(encoding='utf-8')
-    assert '<h2>History</h2>' not in render_report(evidence(), figures=[])
+    assert '<h2>History</h2>' not in render_report(evidence())
 
 
 FACTS = (

@@ -174,7 +174,7 @@ def test_help_imports_none_of_the_heavy_libraries():
 
 
 def test_the_command_info_does_not_import_the_fit():
-    heavy = ('scipy', 'matplotlib', 'pydantic', 'rosbags', 'rclpy', 'thermo_comp.fitting')
+    heavy = ('scipy', 'matplotlib', 'rosbags', 'rclpy', 'thermo_comp.fitting')
     assert loaded_after('import thermo_comp.recording.overview', *heavy) == []
 
 

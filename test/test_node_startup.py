@@ -112,7 +112,7 @@ def test_help_that_cannot_be_written_prints_no_traceback(sink, code):
 
 
 #: Libraries of the offline tools, which are not installed on a robot.
-ABSENT = ('pydantic', 'typer', 'rich', 'rosbags', 'mcap', 'zstandard', 'scipy', 'matplotlib')
+ABSENT = ('typer', 'rich', 'rosbags', 'mcap', 'zstandard', 'scipy', 'matplotlib')
 
 
 def test_the_node_needs_only_ros_numpy_and_yaml(unit, tmp_path, monkeypatch):

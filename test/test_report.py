@@ -19,7 +19,7 @@ from thermo_comp.fitting.reduction import Readings
 from thermo_comp.judging.evaluation import open_bags
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.report.evidence import LEFT_OUT, evidence_of_bags
-from thermo_comp.report.page import drawn_figures, figures_of, render_report, write_report
+from thermo_comp.report.page import figures_of, render_report, write_report
 from thermo_comp.report.style import spelt
 from thermo_comp.thermal.regime import Regime
 
@@ -62,10 +62,6 @@ def page_of(evidence, folder, **keys):
     path = folder / 'report.html'
     write_report(evidence, path, **keys)
     return Page(path.read_text(encoding='utf-8'))
-
-
-def words_of(evidence):
-    return Page(render_report(evidence, figures=[]))
 
 
 def bare():
@@ -133,15 +129,16 @@ def test_the_ids_of_the_page_are_unique_and_all_references_exist(page):
     assert set(re.findall(r'(?:url\(|href=")#([^)"]*)', page.source)) <= set(ids)
 
 
-def test_the_page_states_whether_a_bag_was_fitted(opened):
+@pytest.mark.usefixtures('no_figures')
+def test_the_page_states_whether_a_bag_was_fitted(opened, page):
     calibration = fitted().calibration
-    assert 'positions in bags of the fit' in Page(certificate()).text
+    assert 'positions in bags of the fit' in page.text
     unseen = evidence_of_bags(opened, calibration)
-    assert '1 position in bags that the fit did not use' in words_of(unseen).text
+    assert '1 position in bags that the fit did not use' in Page(render_report(unseen)).text
     sources = (replace(calibration.provenance.sources[0], sha256=unseen.bags[0].source.sha256),)
     provenance = replace(calibration.provenance, sources=sources)
     seen = evidence_of_bags(opened, replace(calibration, provenance=provenance))
-    assert '1 position in bags of the fit' in words_of(seen).text
+    assert '1 position in bags of the fit' in Page(render_report(seen)).text
 
 
 def test_a_page_without_calibration_shows_temperatures_derivatives_and_regime(opened, tmp_path):
@@ -170,7 +167,7 @@ def test_a_page_without_calibration_shows_temperatures_derivatives_and_regime(op
     assert all(figure.question in page.text for figure in figures_of(seen))
 
 
-def test_texts_of_a_bag_or_a_calibration_are_escaped_in_the_page(tmp_path):
+def test_texts_of_a_bag_or_a_calibration_are_escaped_in_the_page(tmp_path, monkeypatch):
     evil = '<script>alert("x")</script>'
     bag = write_bag(
         tmp_path / "a'b<img src=x onerror=alert(1)>$\\frac{.mcap", frame_id=evil, serial=evil
@@ -184,14 +181,16 @@ def test_texts_of_a_bag_or_a_calibration_are_escaped_in_the_page(tmp_path):
         calibration, unit=replace(calibration.unit, serial=evil), provenance=provenance
     )
     judged = evidence_of_bags(open_bags([bag]), calibration)
-    page = Page(render_report(judged, figures=[(figure, '') for figure in figures_of(judged)]))
+    undrawn = 'thermo_comp.report.page.drawn_figures'
+    monkeypatch.setattr(undrawn, lambda figures: [(figure, '') for figure in figures])
+    page = Page(render_report(judged))
     assert page.text.count(evil) >= 6
     assert '$\\frac{.mcap' in page.text
     assert not page.names() & {'script', 'img'}
     assert not any(name.startswith('on') for _, attributes in page.tags for name in attributes)
 
 
-def test_the_page_of_a_bag_of_a_day_is_small():
+def test_the_page_of_a_bag_of_a_day_is_small(monkeypatch):
     # Readings of a day at 2 Hz are hundreds of points per pixel.
     shown, windows = evidence().shown, evidence().windows
     time = np.arange(0.0, 86400.0, 0.5)
@@ -203,8 +202,9 @@ def test_the_page_of_a_bag_of_a_day_is_small():
     long = replace(evidence(), windows=windows)
     bag = replace(shown.bag, temperatures={'board': readings, 'case': readings})
     vars(long)['shown'] = replace(shown, bag=bag, duration_s=86400.0)
-    figures = [figure for figure in figures_of(long) if figure.name not in ('functions', 'step')]
-    assert len(render_report(long, figures=drawn_figures(figures)).encode()) < 1_900_000
+    figures = [figure for figure in figures_of(long) if figure.name != 'functions']
+    monkeypatch.setattr('thermo_comp.report.page.figures_of', lambda _: figures)
+    assert len(render_report(long).encode()) < 1_900_000
 
 
 def test_a_bag_is_read_for_a_page_in_limited_memory(tmp_path):
@@ -254,6 +254,7 @@ def test_the_page_is_written_atomically(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ['figures', 'page.html']
 
 
+@pytest.mark.usefixtures('no_figures')
 def test_each_verdict_has_a_colour_in_the_page(opened):
     assert evidence().level in ('good', 'reserved')
     calibration = fitted().calibration
@@ -266,6 +267,6 @@ def test_each_verdict_has_a_colour_in_the_page(opened):
     assert 'outside the calibrated ranges not judged' in judged.headline
     strict = evidence_of_bags(opened, calibration, tolerance=1e-9)
     assert (strict.level, strict.judgement.verdict) == ('poor', 'recalibrate')
-    page = words_of(strict)
+    page = Page(render_report(strict))
     assert '<section class="verdict poor"' in page.source
     assert spelt(strict.judgement.reason) in page.text

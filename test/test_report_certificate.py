@@ -29,7 +29,7 @@ from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.gravity import MICRO_G
 from thermo_comp.unit.prediction import in_a_soak
 
-pytestmark = pytest.mark.usefixtures('equal_fits_once')
+pytestmark = pytest.mark.usefixtures('equal_fits_once', 'no_figures')
 
 LAB = """
 number: 2026-017
@@ -78,7 +78,7 @@ def test_rounding_changes_a_value_by_at_most_half_a_digit(value, expanded):
 
 def test_statements_of_a_laboratory_are_printed_and_missing_statements_are_blank(tmp_path):
     info = load_certificate_info(lab(tmp_path), 'thermostatted-0001')
-    page = render_report(evidence(), figures=[], info=info)
+    page = render_report(evidence(), info)
     for text in (
         *('2026-017', 'Inertial Lab', '1 Street', 'L-1', 'A Customer', 'A. Person', 'ACME'),
         *('TRI-3', 'certificate 3 of 2025', '2e-05 m/s²', 'absolute gravimeter', '2026-03-01'),
@@ -102,7 +102,7 @@ def test_statements_of_a_laboratory_are_printed_and_missing_statements_are_blank
     ]
     places = [page.index(text) for text in order]
     assert places == sorted(places)
-    assert render_report(evidence(), figures=[]).count('class="blank"') == 21
+    assert render_report(evidence()).count('class="blank"') == 21
 
 
 @pytest.mark.parametrize(
@@ -188,14 +188,14 @@ def test_without_a_stated_uncertainty_of_gravity_that_of_scale_factors_is_withhe
     rows = {result.quantity: result for result in results(evidence(), CertificateInfo(), ())}
     assert rows['scale factor x'].expanded == '–'
     assert rows['bias x'].expanded != '–'
-    page = render_report(evidence(), figures=[])
+    page = render_report(evidence())
     assert 'U of the scale factors and of |f| − g is withheld' in page
     assert 'combined, without gravity' in page
     info = load_certificate_info(lab(tmp_path))
-    assert 'withheld' not in render_report(evidence(), figures=[], info=info)
+    assert 'withheld' not in render_report(evidence(), info)
     # An sd of gravity that the fit was given is in the covariance, so nothing is withheld.
     stated = replace(evidence(), gravity_sd=2e-5)
-    assert 'withheld' not in render_report(stated, figures=[])
+    assert 'withheld' not in render_report(stated)
     assert {source.name: source.standard for source in budget(stated, info)}['gravity'] == 0.0
 
 
@@ -295,7 +295,6 @@ def test_conformity_is_stated_only_with_a_tolerance():
         assert 'o statement of conformity is made' in rule
 
 
-@pytest.mark.usefixtures('no_figures')
 def test_fit_and_report_print_the_statements_of_a_laboratory(cli, tmp_path):
     save_calibration(fitted().calibration, tmp_path / 'unit.yaml')
     given = ('-c', tmp_path / 'unit.yaml', '-o', tmp_path / 'page.html', '--certificate-info')

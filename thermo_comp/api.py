@@ -242,8 +242,7 @@ def fit(
     from .convert.readers import as_bags
     from .fitting import FitOptions, FitSource
     from .fitting import fit as run
-    from .fitting.known_force import KnownForce, parse_sections
-    from .fitting.sources import fit_sources
+    from .fitting.sources import KnownForce, fit_sources, parse_sections
 
     items = [recordings] if isinstance(recordings, (str, Path, Columns)) else list(recordings)
     with as_bags([Path(item) for item in items if not isinstance(item, Columns)]) as paths:

@@ -64,7 +64,7 @@ def fleet_fit(
     state = 'no test has begun'
     with out.progress('fitting') as show:
 
-        def progress(n: int, total: int, _row: object) -> None:
+        def progress(n: int, total: int) -> None:
             nonlocal state
             state = f'{n} of {counted(total, "test")} done'
             show(n / total)

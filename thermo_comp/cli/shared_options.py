@@ -285,7 +285,7 @@ def force(
     ),
 ) -> Any:
     """Build `ForceOptions`: the user's statements about |f| in rests that are not at 1 g."""
-    from ..fitting.known_force import ForceOptions
+    from ..fitting.sources import ForceOptions
 
     with usage_of():
         return ForceOptions(specific_force, rotation, radius, radius_sd)

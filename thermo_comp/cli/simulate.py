@@ -142,7 +142,7 @@ def _metadata(
 ) -> dict[str, str]:
     """Return a bag's metadata: serial, true parameters, for a rotating unit the source of |f|."""
     from .. import __version__
-    from ..fitting import known_force
+    from ..fitting import sources
 
     of_unit = picked(unit, 'scale_factor bias_at_reference')
     truth |= {'up': station.up.tolist(), **of_unit, 'misalignment': unit.M.tolist()}
@@ -156,14 +156,14 @@ def _metadata(
         return metadata
     if not is_known:
         return metadata | {
-            known_force.ROTATION: _RATE_TOPIC,
-            known_force.RADIUS: f'{spin.radius:g}',
-            known_force.RADIUS_SD: f'{_RADIUS_SD_M:g}',
+            sources.ROTATION: _RATE_TOPIC,
+            sources.RADIUS: f'{spin.radius:g}',
+            sources.RADIUS_SD: f'{_RADIUS_SD_M:g}',
         }
     end_s = station.program.duration_s
     rows = [section for section in spin.sections(gravity) if section[0] < end_s]
     lines = [f'{begin:g} {min(end, end_s):g} {size:.9g}' for begin, end, size in rows]
-    return metadata | {known_force.MAGNITUDE: '; '.join(lines)}
+    return metadata | {sources.MAGNITUDE: '; '.join(lines)}
 
 
 def _write_rate(writer: 'BagWriter', spin: 'Spin', duration_s: float) -> None:

@@ -76,6 +76,8 @@ def read_autopilot(
         # Ignore overflows of integer conversions: `_stamps` finds impossible time stamps.
         with np.errstate(invalid='ignore', over='ignore'):
             imus, baros = read(path)
+    except OSError as failure:
+        raise RecordingError(failure.strerror or str(failure)) from failure
     except (ArithmeticError, LookupError, TypeError, ValueError) as failure:
         # The messages of a damaged file do not have the declared formats.
         raise RecordingError(f'damaged: {failure}') from failure

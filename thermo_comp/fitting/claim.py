@@ -35,7 +35,8 @@ from .hyperparameters import CLEAR_GAIN, log_density, log_student
 from .initial_triad import within_positions
 from .layout import Layout
 from .regression import PosteriorMode, Regression
-from .unknowns import InformativePrior, Prior, State
+from .selection import Fit
+from .unknowns import Prior, State
 from .windows import CURVE, LAGS, PART
 
 
@@ -54,27 +55,14 @@ class Claim:
     offset_sd: float
 
 
-def claim_of(
-    regression: Regression,
-    chosen: PosteriorMode,
-    candidates: Floats | None = None,
-    gravity_sd: float = 0.0,
-    known_offset_sd: float = 0.0,
-    informative: Sequence[InformativePrior] = (),
-    of_means: State | None = None,
-    *,
-    lacks_effects: bool = True,
-) -> Claim:
+def claim_of(fit: Fit, gravity_sd: float = 0.0, known_offset_sd: float = 0.0) -> Claim:
     """
-    Return the published covariance of the fit of the chosen model.
+    Return the published covariance of a fit.
 
-    `candidates`: prior sd of the columns that the selection could choose, shape (2, m); those that
-    the data do not determine are added to the covariance; `gravity_sd`: sd of local gravity
-    [m/s^2]; `known_offset_sd`: sd of mounting and turn-on offsets by a prior calibration, or 0
-    [m/s^2]; `informative`: priors from one calibration, for several amounts of ageing;
-    `of_means`: state of a fit to the positions' means, or None; `lacks_effects`: whether noise
-    does not explain the left-out drift, so that the jackknife adds variance
+    `gravity_sd`: sd of local gravity [m/s^2]; `known_offset_sd`: sd of mounting and turn-on
+    offsets by a prior calibration, or 0 [m/s^2]
     """
+    regression, chosen = fit.regression, fit.posterior
     # All rests of a mounting share an offset, but the regression has an offset for each rest: with
     # `n_rests` times the variance, the mean over a mounting's rests has the offset's variance.
     mounting = regression.windows.mounting
@@ -86,25 +74,25 @@ def claim_of(
     layout, offset_sd = posterior.layout, chosen.prior.offset_sd
     offsets = _over_offsets(regression, posterior, offset_sd, known_offset_sd)
     covariance, offset_sd, turn_on_variance = offsets
-    if informative:
+    if informative := fit.selected.informative:
         # Few rests do not show which constants have aged since the prior calibration: the mixture
         # is of fits that assume different amounts of ageing.
         priors = [replace(prior, informative=each) for each in informative]
         fits = _fits(regression, posterior, priors, n_steps=3)
-        mixture, _ = _mixture(posterior, fits, np.array([log_density(fit) for fit in fits]))
+        mixture, _ = _mixture(posterior, fits, np.array([log_density(each) for each in fits]))
         covariance = covariance + _excess(mixture, posterior.covariance)
-    if lacks_effects:
+    if fit.selected.lacks_effects:
         covariance = covariance + _excess(_jackknifed(regression, posterior), covariance)
     if turn_on_variance:
         # Derivatives of the unknowns by a bias offset on each axis that all positions share.
         point = regression.at(posterior.state, prior)
         by_offset = np.array([point.by_offset(axis) for axis in range(3)])
         covariance = covariance + turn_on_variance * (by_offset.T @ by_offset)
-    if candidates is not None:
+    if fit.typical is not None:
         # `_widened` computes the covariance for the sd of mounting offsets at the mode, so the
         # variance that mixtures, jackknife and turn-ons have added is added to its result.
         excess = covariance - posterior.covariance
-        layout, covariance = _widened(regression, posterior, candidates, of_means)
+        layout, covariance = _widened(regression, posterior, fit.typical, fit.of_means)
         at = _places(posterior.layout, layout)
         covariance[np.ix_(at, at)] += excess
     if gravity_sd and regression.gravity:

@@ -23,8 +23,6 @@ from ..unit.gravity import STANDARD_GRAVITY
 from .initial_triad import constant_calibration
 from .unknowns import BIAS_SD, MISALIGNMENT_SD, SCALE_SD
 
-#: Prior sd of a triad's nine constants: bias [g], relative scale, misalignment [rad].
-PRIOR_SD = np.repeat([BIAS_SD / STANDARD_GRAVITY, SCALE_SD, MISALIGNMENT_SD], 3)
 #: Largest angle between the directions of two rests that count as one position [deg].
 SAME_DIRECTION_DEG = 5.0
 
@@ -48,7 +46,7 @@ def constants_covariance(
 ) -> Floats:
     """Return the covariance of a triad's constants from attitudes `up` (n, 3), noise `sd` [g]."""
     rows = norm_columns(up) / sd[:, None]
-    prior_sd = np.append(PRIOR_SD[:6], [misalignment_sd] * 3)
+    prior_sd = np.repeat([BIAS_SD / STANDARD_GRAVITY, SCALE_SD, misalignment_sd], 3)
     return np.asarray(np.linalg.inv(np.diag(prior_sd**-2) + rows.T @ rows))
 
 

@@ -18,8 +18,7 @@ from scipy.linalg.blas import dtrmm
 from scipy.linalg.lapack import dpotrs, dtrtri
 
 from ..typing import Floats, Ints
-from .layout import Layout
-from .tangent import Normal
+from .layout import Layout, Normal
 
 
 def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:

@@ -23,9 +23,8 @@ from dataclasses import replace
 import numpy as np
 
 from ..typing import Bools, Floats, Ints
-from .layout import Layout, lay_out
+from .layout import Layout, Tangent, lay_out
 from .series import Base, Series
-from .tangent import Tangent
 from .unknowns import Prior, State, Windows
 
 

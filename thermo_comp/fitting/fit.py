@@ -253,11 +253,16 @@ def _refined(
     tilted = tried(pieces, has_pieces=True)
     if tilted is None or not refit_checks.is_better_with_tilts(result.fit, tilted.fit):
         return result
+    finding = advice(
+        'tilt',
+        'left-out |f| - g is smaller if the supports may tilt from hour to hour: in the fit each '
+        'hour of a rest has a separate attitude',
+    )
     return replace(
         tilted,
-        calibration=with_notes(tilted.calibration, [refit_checks.SLOW_TILTS]),
+        calibration=with_notes(tilted.calibration, [finding]),
         positions=refit_checks.of_whole_rests(tilted.positions, bags),
-        findings=(*tilted.findings, refit_checks.SLOW_TILTS),
+        findings=(*tilted.findings, finding),
         bags=tuple(bags),
     )
 
@@ -290,12 +295,7 @@ def _fit(
     selected, terms = choose(fit.regression, fit.selected, options)
     fit = fit._replace(selected=selected)
     offset_sd = 0.0 if known is None else offset_sd_of(known)
-    claim = claim_of(
-        *(fit.regression, fit.posterior, fit.typical, options.gravity_sd, offset_sd),
-        informative=fit.selected.informative,
-        of_means=fit.of_means,
-        lacks_effects=fit.selected.lacks_effects,
-    )
+    claim = claim_of(fit, options.gravity_sd, offset_sd)
     residuals, in_sample, left_out = residual_rows(fit)
     findings += enforce(data_checks.judge_constants(fit, residuals[-1].raw.rms, options), options)
     findings += data_checks.judge_result(fit, residuals[-1], in_sample, claim.offset_sd, options)

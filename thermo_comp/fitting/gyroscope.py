@@ -83,7 +83,7 @@ def add_gyroscope(
     fit = Fit(windows, regression, select(regression, state, prior, _candidates(data, options)))
     # The positions determine the sd of the offsets well: `claim_of` need not marginalise this sd.
     chosen = replace(fit.posterior, prior=replace(fit.posterior.prior, offset_scale=0.0))
-    claim = claim_of(regression, chosen, lacks_effects=fit.selected.lacks_effects)
+    claim = claim_of(fit._replace(selected=replace(fit.selected, posterior=chosen)))
     # The offsets contain the Earth's rate, no error of the gyroscope: subtract its variance.
     claim = replace(claim, offset_sd=math.sqrt(max(claim.offset_sd**2 - earth_sd**2, 0.0)))
     triad = build_calibration(fit, claim, bags, calibration.unit)

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..errors import FitError
 from ..typing import Bools, Floats
+from ..unit.calibration import Calibration
 from . import rests
 from .coverage import distinct_directions, norm_columns
 from .data_checks import POSITIONS_FOR_MISALIGNMENT, POSITIONS_NEEDED
@@ -30,7 +31,7 @@ from .priors import informative_priors, offset_sd_of, with_calibration
 from .reduction import ReducedBag
 from .regression import Regression
 from .selection import LARGE_OFFSETS, Fit, fit_all, select
-from .unknowns import BIAS_SD, SCALE_SD, Prior, State, misalignment_scale
+from .unknowns import BIAS_SD, SCALE_SD, InformativePrior, Prior, State, misalignment_scale
 from .windows import CURVE, PART, ThermalWindows
 
 #: Largest prior sd of a slope over temperature: of the bias [m/s^2 per K] (500 ug/K), and of the
@@ -122,25 +123,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     candidates = _candidates(windows, problem, steepness, is_bench=is_bench)
     if known is not None:
         state = with_terms(with_calibration(known, regression, state), known)
-        usual_ageing = LARGE_OFFSETS * _mounting_scale(_noise_in_1_hz(windows, start.scale))
-        *others, widest = informative_priors(
-            known, regression, state, windows.model, options, usual_ageing
-        )
-        # Few windows may be fitted exactly: assume at least half of the prior calibration's noise.
-        window_s = windows.typical_count * known.unit.cycle_time_s
-        least = 0.5 * float(np.min(known.noise_density_m_s2_sqrt_hz)) / window_s**0.5
-        prior = replace(
-            prior,
-            column_sd=data.parts.astype(np.float64),
-            informative=widest,
-            least_sigma=max(least, prior.least_sigma),
-        )
-        if prior.offset_scale and (known_sd := offset_sd_of(known)):
-            # The prior calibration states the sd of the bias over mountings and turn-ons, to a
-            # factor of two: larger changes of |f| count as ageing of the unit.
-            scale = min(prior.offset_scale, 2.0 * known_sd)
-            offset_sd = prior.offset_sd if data.has_turn_ons else known_sd
-            prior = replace(prior, offset_sd=offset_sd, turn_on_sd=known_sd, offset_scale=scale)
+        prior, others = _updating_priors(known, windows, options, regression, state, prior)
         fixed = replace(candidates, fixed=np.ones_like(candidates.fixed))
         return Fit(windows, regression, fit_all(regression, state, prior, fixed, others))
     if options.model == 'golovach':
@@ -161,6 +144,40 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     full, used = (_typical_slopes(steepness, limit, options.gravity) for limit in limits)
     claimed = candidates.typical * (full / used)[:, np.newaxis]
     return Fit(windows, regression, selected, claimed)
+
+
+def _updating_priors(
+    known: Calibration,
+    windows: ThermalWindows,
+    options: FitOptions,
+    regression: Regression,
+    state: State,
+    prior: Prior,
+) -> tuple[Prior, list[InformativePrior]]:
+    """
+    Return `prior` with the prior calibration's constants and weights, for the largest amount of
+    ageing; and the informative priors for smaller amounts of ageing.
+    """
+    data, noise = regression.windows, _noise_in_1_hz(windows, regression.nominal_scale)
+    *others, widest = informative_priors(
+        known, regression, state, windows.model, options, LARGE_OFFSETS * _mounting_scale(noise)
+    )
+    # Few windows may be fitted exactly: assume at least half of the prior calibration's noise.
+    window_s = windows.typical_count * known.unit.cycle_time_s
+    least = 0.5 * float(np.min(known.noise_density_m_s2_sqrt_hz)) / window_s**0.5
+    prior = replace(
+        prior,
+        column_sd=data.parts.astype(np.float64),
+        informative=widest,
+        least_sigma=max(least, prior.least_sigma),
+    )
+    if prior.offset_scale and (known_sd := offset_sd_of(known)):
+        # The prior calibration states the sd of the bias over mountings and turn-ons, to a factor
+        # of two: larger changes of |f| count as ageing of the unit.
+        scale = min(prior.offset_scale, 2.0 * known_sd)
+        offset_sd = prior.offset_sd if data.has_turn_ons else known_sd
+        prior = replace(prior, offset_sd=offset_sd, turn_on_sd=known_sd, offset_scale=scale)
+    return prior, others
 
 
 def initial_state(regression: Regression, start: ConstantCalibration, up: Floats) -> State:

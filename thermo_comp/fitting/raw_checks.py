@@ -86,14 +86,7 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
     yield from _judge_thermometers(bags)
     yield from _judge_units(bags, size, options)
     per_mg = 1e-3 * (STANDARD_GRAVITY if options.input == 'm/s^2' else size)
-    jumped = '; '.join(
-        f'{bag.source.name}: {describe(jump, per_mg, bag.since_s)}'
-        for bag in bags
-        for jump in find_jumps(bag)
-    )
-    if jumped:
-        text = f'{jumped}: leave out a bag with a jump, or end before the jump with --to'
-        yield Finding('jump', 'refusal', text)
+    yield from _judge_jumps(bags, per_mg)
     if not all(bag.angular_rate == bags[0].angular_rate != 'part' for bag in bags):
         names = ', '.join(bag.source.name for bag in bags if bag.angular_rate != 'whole')
         text = f'{names}: not every sample has an angular rate, so no gyroscope was fitted'
@@ -193,6 +186,18 @@ def constant_axes(bags: Sequence[ReducedBag], usual: Bools) -> Iterator[_DeadAxi
                 value = float(rest.mean[0, axis])
                 text = f'{"xyz"[axis]} reads exactly {value:g} for {hours:.2g} h'
                 yield _DeadAxis(bag.source.name, int(axis), value, text)
+
+
+def _judge_jumps(bags: Sequence[ReducedBag], per_mg: float) -> Iterator[Finding]:
+    """Refuse bags with jumps of the bias; `per_mg`: input units per mg."""
+    jumped = '; '.join(
+        f'{bag.source.name}: {describe(jump, per_mg, bag.since_s)}'
+        for bag in bags
+        for jump in find_jumps(bag)
+    )
+    if jumped:
+        text = f'{jumped}: leave out a bag with a jump, or end before the jump with --to'
+        yield Finding('jump', 'refusal', text)
 
 
 def describe(jump: Jump, per_mg: float, since_s: float = 0.0) -> str:

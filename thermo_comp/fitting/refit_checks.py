@@ -14,11 +14,10 @@ from itertools import pairwise
 import numpy as np
 
 from ..typing import Floats
-from .data_checks import advice
 from .evidence import PositionReport
+from .left_out import settled_error
 from .reduction import ReducedBag, StillInterval
 from .selection import Fit
-from .settled_bias import settled_error
 from .unknowns import Windows
 from .windows import CURVE
 
@@ -27,17 +26,12 @@ _PIECE_S = 3600.0
 # Smallest number of positions whose left-out |f| is scored, for a reliable standard error of
 # the gain by slow tilts.
 _FEWEST_NORMS = 6
-SLOW_TILTS = advice(
-    'tilt',
-    'left-out |f| - g is smaller if the supports may tilt from hour to hour: in the fit each hour '
-    'of a rest has a separate attitude',
-)
 
 
 def extrapolates(fit: Fit) -> bool:
     """
     Whether the left-out drift of the chosen model exceeds noise, and its bias at settled
-    temperatures is expected to be less accurate than that of a smaller model (`settled_bias`).
+    temperatures is expected to be less accurate than that of a smaller model (`settled_error`).
     """
     settled, trials = fit.windows.data.settled, fit.selected.trials
     chosen = next(trial for trial in trials if trial.is_chosen)

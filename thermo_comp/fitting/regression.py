@@ -26,8 +26,7 @@ from ..typing import Bools, Floats, Ints
 from .elimination import Reduced, eliminate, factored_with_prior, inverse_root, solved
 from .equations import Equations, with_step, without_inactive
 from .gains import Inactive
-from .layout import Layout
-from .tangent import Normal, Tangent
+from .layout import Layout, Normal, Tangent
 from .unknowns import Prior, State
 
 

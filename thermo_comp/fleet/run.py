@@ -73,22 +73,22 @@ def fit_fleet(
     with_prior: bool = False,
     scheduler: str | None = None,
     n_workers: int | None = None,
-    client: Any = None,
     earlier: Sequence[Row] = (),
-    progress: Callable[[int, int, Row | None], None] = lambda *_: None,
+    progress: Callable[[int, int], None] = lambda *_: None,
 ) -> FleetResult:
     """
     Fit all units without a stored result. Raises ThermoCompError if the folder has no bag, a
     package is missing or the Dask cluster cannot be used, OutputError if a file cannot be written.
 
-    `progress` is called with the numbers of finished and of all tests of a round (without a prior,
-    then with the prior), and the row of the last finished test, or None at the begin of a round.
+    `progress` is called with the numbers of finished and of all tests of a round: without a prior,
+    then with the prior.
     """
     _require_packages()
     storage = Storage(url)
     units = find_units(storage)
     results = Results(Path(output))
     done: set[str] = set()
+    client: Any = None
     with ExitStack() as stack:
 
         def fitted(some: Sequence[FoundUnit], how: FleetOptions) -> dict[str, Row]:
@@ -98,11 +98,11 @@ def fit_fleet(
             if missing and client is None:
                 most = min(n_workers or os.cpu_count() or 1, len(some))
                 client = stack.enter_context(connected(scheduler, most))
-            progress(len(rows), len(some), None)
+            progress(len(rows), len(some))
             for unit, outcome in run(client, storage.address, missing, how) if missing else ():
                 rows[unit.name] = results.store(unit, how, outcome)
                 done.add(unit.name)
-                progress(len(rows), len(some), rows[unit.name])
+                progress(len(rows), len(some))
             return rows
 
         rows = fitted(units, options)

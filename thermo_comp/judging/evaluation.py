@@ -12,11 +12,10 @@ import numpy as np
 
 from ..errors import RecordingError
 from ..fitting.joining import joined
-from ..fitting.known_force import USUAL_FORCE, ForceOptions
 from ..fitting.options import COUNTS_FULL_SCALE
 from ..fitting.raw_checks import constant_axes
 from ..fitting.reduction import ReducedBag, reduce_source
-from ..fitting.sources import digest, recording_source
+from ..fitting.sources import ForceOptions, digest, recording_source
 from ..recording.blocks import Role
 from ..recording.stillness import STILL_SD
 from ..recording.topics import Topics
@@ -51,7 +50,7 @@ def open_bags(
     *,
     topics: Topics | None = None,
     window_s: float = WINDOW_S,
-    force: ForceOptions = USUAL_FORCE,
+    force: ForceOptions | None = None,
     progress: Callable[[float], None] = lambda _: None,
 ) -> list[ReducedBag]:
     """
@@ -132,7 +131,7 @@ def evaluate(
     tolerance: float | None = None,
     topics: Topics | None = None,
     serial: str | None = None,
-    force: ForceOptions = USUAL_FORCE,
+    force: ForceOptions | None = None,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Evaluation:
     """

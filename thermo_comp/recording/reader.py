@@ -232,9 +232,9 @@ def read_recording(
         return Recording(reader.info, joined(blocks))
 
 
-def inspect_recording(path: str | Path, topics: Topics | None = None) -> RecordingInfo:
+def inspect_recording(path: str | Path) -> RecordingInfo:
     """Describe a bag without reading its messages; raises as `open_recording` does."""
-    with open_recording(path, topics, require=()) as reader:
+    with open_recording(path, require=()) as reader:
         return reader.info
 
 

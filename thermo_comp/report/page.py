@@ -55,15 +55,8 @@ def write_report(
     write_atomically(path, page.encode(), PAGE, overwrite=overwrite)
 
 
-def render_report(
-    evidence: Evidence,
-    info: CertificateInfo | None = None,
-    *,
-    figures: Sequence[tuple[ReportFigure, str]] | None = None,
-) -> str:
-    """Return the page with the given figures, by default all for which `evidence` has data."""
-    if figures is None:
-        figures = drawn_figures(figures_of(evidence))
+def render_report(evidence: Evidence, info: CertificateInfo | None = None) -> str:
+    """Return the page, with all figures for which `evidence` has data."""
     info = info or CertificateInfo()
     title = 'Thermal calibration certificate' if evidence.calibration else 'Thermal test record'
     contributions = certificate.budget(evidence, info)
@@ -88,7 +81,7 @@ def render_report(
         is_gravity_known=certificate.unclaimed_gravity_sd(evidence, info) is not None,
         error=position_error,
         schuler=schuler_peak,
-        figures=figures,
+        figures=drawn_figures(figures_of(evidence)),
         drifts=drifts_of(evidence.history),
         corrections=corrections,
         correction_headings=[f'{name}, µg RMS' for name in corrections],
