@@ -96,8 +96,8 @@ BOUNDS = """\
 Each number in a calibration is one of the quantities in the table. The bounds are wider than any instrument needs; a
 calibration within them gives finite results and a positive definite covariance. Further bounds depend on the full scale of
 the unit. The bias at the reference temperature, and its change over temperature, must each be within twice the full scale.
-The largest effects of a column on the bias, and of a parameter's sd on bias or scale, must be within a million times the
-limit of bias or scale. The relative scale including the largest contributions of all columns must stay between 0.1 and 10.
+No column of the thermal response may change the bias, nor a parameter's sd the bias or scale, by more than a million times
+the limit of bias or scale. The relative scale with the largest contributions of all columns must be between 0.1 and 10.
 """
 
 INTERFACE = """\

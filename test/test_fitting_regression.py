@@ -119,7 +119,7 @@ class Dense:
         return np.concatenate(parts)
 
     def jacobian(self, x):
-        """Return the Jacobian by central differences over 0.1 sd, with an error of 1e-9."""
+        """Return the Jacobian by central differences over 0.1 sd; relative error 1e-9."""
         sd = np.sqrt(self.at.variance)
         columns = []
         for k in range(self.n):

@@ -30,7 +30,7 @@ class Start:
     """
     A start of the node, or a later change of the node's calibration, which keeps `start_ns`.
 
-    `start_ns` identifies a start; it is no date, as the computer may set its clock later.
+    `start_ns` identifies a start of the node; it is no date, as the clock may be set later.
     """
 
     start_ns: int

@@ -123,7 +123,7 @@ def update(
     is_gravity_certain: bool = False,
 ) -> Update:
     """
-    Update a calibration by rests.
+    Update a calibration from rests.
 
     `source`, `created`: source and date for the new file's provenance; `ahead`: time of use after
     the last rest, for which the covariance includes ageing [days]; `is_gravity_certain`: whether

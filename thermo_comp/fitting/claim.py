@@ -154,7 +154,7 @@ def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Fl
         ratio = 10.0 ** np.arange(-1.5, 1.51, 0.125)
         return known_sd * ratio, log_student(np.log(ratio) / np.log(1.5))
     # `least`: smallest usual sd, relative to `scale`. By data sheets, the bias of navigation-grade
-    # triads repeats to 10 ug over turn-ons at best; over mountings within one turn-on, to less.
+    # triads repeats to 10 ug between turn-ons at best, better between mountings in one turn-on.
     least = 0.01 if kind == 'mounting' else min(1e-4 / scale, 1.0)
     # Largest usual sd, relative to `scale`: of mountings within a turn-on, of a single turn-on,
     # and ('both') of several turn-ons, or of mountings that each begin with a turn-on. By data

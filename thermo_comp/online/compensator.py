@@ -103,7 +103,7 @@ class Compensator:
         self.reading_ns = EVER_NS  # the latest stamp of a reading
         #: The present segment: start [ns], result of `Correction.line`, and misalignment.
         self._segment: tuple[int, list[float], tuple[float, ...]] = (0, [], ())
-        #: Rate correction of the present segment (`Correction.line`); empty without a gyroscope.
+        #: `Correction.line` of the angular rate, present segment; empty without a gyroscope.
         self.rate_line: list[float] = []
 
     def _use(self, calibration: Calibration) -> None:

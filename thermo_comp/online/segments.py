@@ -92,8 +92,8 @@ class Model:
         self, start: npt.ArrayLike, end: npt.ArrayLike, slow: Floats, noise_excess: npt.ArrayLike
     ) -> tuple[Floats, Floats, Bools]:
         """
-        Evaluate `Correction.line` of force and angular rate (without a gyroscope: no rows), and
-        whether both are sound; `slow`: result of `slow_rows` for these segments.
+        Return `Correction.line` of force and of angular rate (no rows without a gyroscope), and
+        whether both pass `is_sound`; `slow`: result of `slow_rows` for these segments.
         """
         n = self.correction.n_slow
         line = self.correction.line(start, end, slow[:n], noise_excess)
@@ -252,7 +252,7 @@ class ThermalSide:
         return tuple(sqrt(max(0.0, whole - excess * noise)) for whole, noise in pairs)
 
     def slow_rows(self, slow: SlowState) -> Floats:
-        """Evaluate the slowly varying variance of a segment, once for each `SlowState`."""
+        """Return the slowly varying error covariance, evaluated once per `SlowState`."""
         if slow is not self._slow_evaluated:
             self._slow_evaluated = slow
             self._slow_rows = self.model.slow_rows([slow])[:, 0]

@@ -24,7 +24,7 @@ from .reader import open_recording
 from .topics import Topics
 from .writer import BagWriter
 
-_CHUNK_BYTES = 1 << 17  # chunk size [bytes]: 17 s of counts at 100 Hz, lost by a killed process
+_CHUNK_BYTES = 1 << 17  # chunk size [bytes]: 17 s of counts at 100 Hz, which a kill loses
 _PERIOD_S = 1.0  # shortest pause between two passes over the growing bag [s]
 _NEVER_NS = 2**63 - 1
 #: Hidden name of an unfinished bag: number of the bag, and id of the process that writes the bag.

@@ -248,7 +248,7 @@ class McapFile(BagFile):
 
 
 def _in_order(pieces: Iterable[tuple[int, Messages, int | None]]) -> Iterator[Messages]:
-    """Merge pieces, given as number, messages, first log time of the next piece, by log time."""
+    """Merge pieces by log time; a piece: number, messages, first log time of the next one."""
     # Messages before the first log time of the next piece are final; later messages are held.
     held: dict[int, Messages] = {}
     for row, piece, next_ns in pieces:

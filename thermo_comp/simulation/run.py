@@ -157,7 +157,7 @@ def _blocks(
     seed: int,
     start_ns: int,
 ) -> Iterator[SimulatedRun]:
-    """Yield a run in blocks; `cycles`: number of all cycles, cycles per block, and per second."""
+    """Yield a run in blocks; `cycles`: total number, number per block, rate [Hz]."""
     unit, (n_cycles, block_size, rate_hz) = truth.unit, cycles
     K = np.array(unit.scale_factor)
     to_axes = np.asarray(np.linalg.inv(unit.M), np.float64)

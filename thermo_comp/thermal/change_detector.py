@@ -82,7 +82,7 @@ class ChangeDetector:
         """Begin a soak: the rate becomes the baseline, with at least the error `least_error`."""
         self._baseline = self.rate
         self._baseline_error = max(self.swing, least_error, 2.0 * sqrt(sensor.var_rate))
-        self._edge = nan  # a cell edge crossed before the soak would give the ramp's rate
+        self._edge = nan  # a mean rate since an edge crossed in the ramp is not the soak's
 
     def is_following(self, stamp_ns: int) -> bool:
         """Whether the filter of `rate` has used the reading with the stamp `stamp_ns`."""

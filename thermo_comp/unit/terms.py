@@ -3,12 +3,12 @@
 """
 Owns the table of the kinds of regressors of the thermal response.
 
-The value of a column is ``u = form.value(x)``, ``x = (n - centre) / width``. The number n is a
-quantity of the thermal state, the `source`; if `is_temperature`, n is ``t - source``, the
-temperature of a part that lags the board. Notation: ``t = T_board - T_ref``,
-``g_s = T_s - T_board`` of a sensor s, and ``q_s = g_s - rest``. The constant `rest` is 0, or the
-gradient in a soak if self-heating warms the board above the case. Even functions of q_s have
-the same value for heating and for cooling at the same rate.
+The value of a column is ``u = form.value(x)``, ``x = (n - centre) / width``; n is a quantity of
+the thermal state (`source`) or, if `is_temperature`, ``t - source``, the temperature less T_ref of
+a part that lags the board. Notation: ``t = T_board - T_ref``, ``g_s = T_s - T_board`` of a sensor
+s, and ``q_s = g_s - rest``. The constant `rest` is 0, or the gradient in a soak if self-heating
+warms the board above the case. Even functions of q_s have the same value for heating and for
+cooling at the same rate.
 """
 
 from __future__ import annotations
