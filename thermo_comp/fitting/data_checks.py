@@ -253,7 +253,7 @@ def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator
             f'{n} rests in {counted(fit.regression.n_bags, "recording")} have '
             f'{counted(n_turn_ons, "turn-on")}, too few to show how well the bias repeats after '
             f'the unit is switched on again; {assumed}, or make {needed} recordings or more and '
-            'switch the unit off between them',
+            'switch the unit off for a minute or longer between them',
         )
     elif n < POSITIONS_FOR_MOUNTINGS and prior.offset_sd < prior.offset_scale:
         yield advice(
