@@ -172,6 +172,8 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | a temperature that changes faster than that of any part can | the readings are not used until they are plausible again or the thermometer counts as lost |
 | a temperature that is constant while that of the second thermometer changes | the constant readings are not used: the last used value is held, then the thermometer counts as lost |
 | both temperatures constant over at least 20 readings and 5 s | the temperatures are used with a growing covariance, WARN |
+| case readings that repeat those of the board (one topic for both), ten changed readings in a row | the readings are used; the gradient expected of the case adds to the covariance, WARN |
+| a sample whose stamp goes back by a second or more, after the force at rest has refuted the calibration | nothing is published until the force at rest agrees with gravity in two windows, ERROR |
 | a board temperature that leads the case temperature in ramps (swapped topics) | the covariance is increased, ERROR |
 | counts constant for `stuck_timeout`, on all axes or on one axis while the others change or show their noise; three zeros | dropped, counted, ERROR |
 | counts that come faster than their conversion cycle | dropped, counted, ERROR |
