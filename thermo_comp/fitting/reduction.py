@@ -196,10 +196,10 @@ def reduce_source(
 
     `still_sd` is the largest sd of samples at rest [g]. Without `min_rest_s` a rest lasts at least
     3 s, or at least 1 or 2 s if these shorter rests determine bias and scale better. The largest
-    variance of a rest is also chosen so that the rests determine bias and scale best. If the
-    user or the bag states |f|, the variance is not chosen, and a rest lasts 3 s or more. At a low
-    sample rate a cell of the usual number of samples is so long that a drift within it looks like
-    a motion, and that short rests are lost: cells of 10 or 5 samples are then tried.
+    variance of a rest is also chosen so that the rests determine bias and scale best. If the user
+    or the bag states |f|, the largest variance is fixed, and `min_rest_s` is by default 3 s. At a
+    low sample rate a cell of the usual number of samples is so long that a drift within it looks
+    like a motion, and that short rests are lost: cells of 10 or 5 samples are then tried.
     """
 
     def reduced(least: int) -> tuple[ReducedBag, float]:
@@ -289,8 +289,8 @@ def _cycle_s(cells: Cells) -> float:
     """Return the typical interval between samples [s]; NaN without samples."""
     if not len(cells.count):
         return np.nan
-    # Complete cells have the median number of samples, or one more or less. If most cells deviate
-    # more, as with bursts of samples, cells with more than half of the median number are used.
+    # Complete cells have the median number of samples, or one more or less. If most cells are not
+    # complete, as with bursts of samples, cells with over half of the median number are used.
     median = float(np.median(cells.count))
     use = np.abs(cells.count - median) <= 1.0
     if np.mean(use) < 0.5:
@@ -320,7 +320,7 @@ def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
 def is_spike(value: Floats) -> Bools:
     """Return which readings are over 10 K from the median of five readings about them, (n,)."""
     # A thermometer with a loose contact reads -127 or 85 degC for a moment. Thermometer noise is
-    # estimated without such spikes, so that the tracker rejects them as outliers.
+    # estimated without readings of a loose contact, which the tracker then rejects as outliers.
     far = np.zeros(len(value), dtype=bool)
     if len(value) > 4:
         middle = np.median(sliding_window_view(value, 5), axis=1)
