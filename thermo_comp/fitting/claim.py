@@ -239,7 +239,7 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
         typical = np.minimum(typical, of_curve)
         # A curve column that the data do not determine changes the curve's slope by up to a half.
         sd = np.where(groups == CURVE, np.minimum(sd, 0.5 * of_curve), sd)
-    # The variance of n lags is limited to that of one lag, so each lag gets 1 / n of the variance.
+    # n lags must not have more variance than one lag: each lag gets 1 / n of the variance.
     is_lag = is_of_lags & (sd > 0.0)
     share = np.sqrt(np.maximum(is_lag.sum(axis=1, keepdims=True), 1))
     sd = np.where(is_lag, np.minimum(sd, typical / share), sd)
@@ -267,7 +267,7 @@ def _over_mountings(
 
     fits = fits_with(tried)
     # With a large sd of mounting offsets attitudes absorb errors of the model, which raises the
-    # log evidence; at most the rise of the log evidence of |f| plus `CLEAR_GAIN` counts.
+    # log evidence: count at most the rise of the log evidence of |f|, plus `CLEAR_GAIN`.
     of_data = np.array([fit.log_evidence for fit in fits])
     of_norms = _norm_evidence(regression, posterior, tried, fits[-1].root)
     nearest = int(np.argmin(np.abs(np.log(tried * n_rests**0.5 / prior.offset_sd))))

@@ -144,7 +144,7 @@ def with_excluded_error(
     Add to the lack of fit of both regimes the drift, and the error of |f|, that remain in `bags`
     after the correction.
 
-    `others`: text that names what these bags contradict, other bags or the prior; `is_updated`:
+    `others`: text that names what `bags` contradict, other bags or the prior; `is_updated`:
     whether `bags` were used in the fit
     """
     windows = thermal_windows(bags, prior_model(calibration))

@@ -66,7 +66,7 @@ def fit(
     """
     Fit a calibration to bags of a thermal test.
 
-    Raises FitError if the data do not allow a fit, as if a recording has no still interval.
+    Raises FitError if the data do not allow a fit, such as a recording without still interval.
     """
     check_serial(sources, options)
     if not sources:

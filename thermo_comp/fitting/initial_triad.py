@@ -137,8 +137,8 @@ def white_noise_of(windows: Windows, scale: Floats) -> Floats:
     Return the white noise of a window on each axis [m/s^2], shape (3,), from second differences,
     which do not depend on a linear drift; 0 if no position has three windows.
 
-    In fast ramps second differences contain a part of the drift. If fourth or sixth differences
-    then give a noise below 70 % of that by second differences, the smallest value is used.
+    In fast ramps second differences contain a part of the drift. If the noise from fourth or sixth
+    differences is below 70 % of the noise from second differences, the smallest is used.
     """
     position, noises = windows.position, []
     for order in (2, 4, 6):

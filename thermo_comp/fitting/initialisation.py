@@ -68,9 +68,9 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     """
     Fit the windows, with or without a prior calibration.
 
-    Without a prior, if the positions are whole rests, and temperature changes more between than
-    within positions, the curve is fitted to the means of the positions, unless a fit that also
-    uses the drifts is better on left-out data.
+    Without a prior, if the positions are whole rests and temperature changes more between than
+    within positions, two fits are made: of the curve to the means of the positions, and with the
+    drifts. The fit to the means is used unless the fit with the drifts is better on left-out data.
     """
     if problem.options.prior is not None:
         return _regress(windows, problem)
@@ -85,7 +85,7 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     # similar amounts, so only the differences of |f| between positions determine the curve.
     everywhere = np.ones(windows.data.n_positions, dtype=bool)
     at_rest = replace(windows, data=rests.constant_in(windows.data, everywhere, everywhere))
-    # Each of the two regressions reports progress from 0.7 to 0.95: map it to half of this range.
+    # Both regressions report progress from 0.7 to 0.95: map each to its half of this range.
     first = replace(problem, progress=lambda part: problem.progress(0.35 + 0.5 * part))
     second = replace(problem, progress=lambda part: problem.progress(0.475 + 0.5 * part))
     fit, of_drifts = _regress(at_rest, first, is_at_rest=True), _regress(windows, second)
@@ -310,8 +310,8 @@ def _candidates(
 
 def _steepest(n_directions: int) -> Floats:
     """Return the largest prior sd of slopes of bias and scale, given the number of attitudes."""
-    # For two to eight attitudes the prior sd of the scale factor's slope is halved: a drift of a
-    # nearly level axis is more often a tilt of the support than a slope of its scale factor, which
+    # For two to eight attitudes the prior sd of the scale factor's slope is halved. A drift of a
+    # nearly level axis is more often a tilt of the support than a slope of the scale factor, which
     # would have to be several hundred ppm/K.
     is_few = 1 < n_directions < POSITIONS_FOR_MISALIGNMENT
     return STEEPEST * (1.0, 0.5 if is_few else 1.0)

@@ -46,8 +46,8 @@ def _continues(part: ReducedBag, bag: ReducedBag) -> bool:
     is_of_unit = bag.source.serial == part.source.serial
     # Parts overlap by at most 3 s and a tenth of a part; recordings whose stamps all begin at 0
     # overlap more. The gap between parts is at most 60 s, to turn the unit and restart the
-    # recorder, or two sample intervals if longer. If the unit is nevertheless switched off and on
-    # in the gap, the offsets of its turn-ons count as those of mountings.
+    # recorder, or two sample intervals if longer. If the unit is switched off and on in the gap,
+    # the fit takes the offset of each turn-on for an offset of a mounting.
     overlap_s = min(3.0, 1e-10 * (part.end_ns - part.start_ns))
     is_next = -overlap_s < gap_s < max(60.0, 2.0 * bag.cycle_s)
     return bool(is_next and is_alike and is_at_1g and is_of_unit)

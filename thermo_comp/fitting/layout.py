@@ -232,8 +232,8 @@ class Tangent:
         place = self.place[first:]
         n, bias = len(place), slice(1, 1 + self.n_bias)
         scale = slice(bias.stop, bias.stop + self.n_scale)
-        # Sums over the positions of the products of the base series, times the powers 0, 1 and 2
-        # of the factor of the scale's weights.
+        # Sums, over the positions, of products of two base series; each product is multiplied by
+        # the power 0, 1 or 2 of the factor of the scale's weights.
         powers = np.stack([self.scale**k for k in range(3)])
         sums = np.tensordot(powers.transpose(2, 0, 1), products, 1)
         unit = np.empty((3, n, n))

@@ -59,7 +59,7 @@ class Folds:
 
     @classmethod
     def of(cls, square: Floats, windows: Floats, fold: Ints) -> Folds:
-        """Average mean squares of positions, (p,), over the positions of each fold; skip NaN."""
+        """Average mean square errors of positions, (p,), over each fold's positions; skip NaN."""
         known = np.isfinite(square)
         count = np.bincount(fold, np.where(known, windows, 0.0))
         total = np.bincount(fold, np.where(known, square * windows, 0.0))

@@ -107,9 +107,9 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> list[Part
         subset = _PartCurves(windows, start, shape, 3000)
         lags = [subset.refined(lag, axis) for axis, lag in enumerate(searched)]
         parts, ratio = _PartCurves(windows, start, shape, len(data.time)).parts(lags, noise)
-        # A residual above `most_noise` times the white noise has a cause besides white noise and
-        # lags, such as slow noise: the lags are then accepted only if the RMS residual of each
-        # axis is at most a quarter of its RMS residual without a lag.
+        # If the residual is above `most_noise` times the white noise, it has a further cause, such
+        # as slow noise: lags are then accepted only if the RMS residual of each axis is at most a
+        # quarter of its RMS residual without a lag.
         is_explained = ratio <= shape.most_noise
         if not is_explained and min(map(subset.reduction, lags, range(3))) < 4.0:
             continue

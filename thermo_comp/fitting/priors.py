@@ -106,8 +106,8 @@ def informative_priors(
             'the prior has no covariance: use a calibration that was fitted to bags; an imported '
             'calibration cannot be a prior'
         )
-    # Pairs to try: the ageing, sd of biases [g] and of scale factors (0: as the user states); and
-    # `share`, the ratio of uncorrelated variances to add to the variances of the prior.
+    # Pairs to try: sd of the ageing of biases [g] and of scale factors (0: as the user states);
+    # and `share`, the uncorrelated variances to add over the variances of the prior.
     tried = [(0.0, share) for share in (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)]
     # The fit begins with the last, widest prior: in a first fit with a narrow prior, the noise
     # would absorb changes of the unit.

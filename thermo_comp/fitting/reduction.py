@@ -198,8 +198,8 @@ def reduce_source(
     3 s, or at least 1 or 2 s if these shorter rests determine bias and scale better. The largest
     variance of a rest is also chosen so that the rests determine bias and scale best. If the user
     or the bag states |f|, the largest variance is fixed, and `min_rest_s` is by default 3 s. At a
-    low sample rate a cell of the usual number of samples is so long that a drift within it looks
-    like a motion, and that short rests are lost: cells of 10 or 5 samples are then tried.
+    low sample rate, cells of the usual number of samples are so long that drifts look like motions
+    and short rests are lost: cells of 10 or 5 samples are tried.
     """
 
     def reduced(least: int) -> tuple[ReducedBag, float]:
@@ -306,7 +306,7 @@ def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
     use &= stamp_ns > np.maximum.accumulate(before[: len(stamp_ns)])
     stamp_ns, value = stamp_ns[use], value[use]
     span_s = np.ptp(stamp_ns) * 1e-9 if len(stamp_ns) else 0.0
-    # No thermometer responds within 0.2 s, and the tracker's loop over readings is slow in Python.
+    # Average over 0.2 s, as no thermometer responds faster and the tracker's Python loop is slow.
     size = int(0.2 * (len(stamp_ns) - 1) / span_s) if span_s else 1
     n = len(stamp_ns) // size * size if size > 1 else 0
     if n:
@@ -426,7 +426,7 @@ def rounding_sd(variance: Floats, drift: Floats, quantum: Floats) -> Floats:
 
     `variance`: median variance of the rounded samples in a cell; above 0, the noise of the
     samples averages the rounding error to 0.
-    `drift`: range of the means; a drift over n steps averages the rounding errors of n + 1 steps.
+    `drift`: range of the means; over n steps of the converter, n + 1 rounding errors average.
     """
     steps = np.divide(drift, quantum, where=quantum > 0.0, out=np.zeros(3))
     return np.asarray(np.where(variance > 0.0, 0.0, quantum / 12.0**0.5 / (1.0 + steps)))

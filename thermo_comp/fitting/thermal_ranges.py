@@ -189,7 +189,7 @@ def _seen(fit: Fit, known: Calibration | None) -> Floats:
     axis, and of a prior calibration, shape (2, 3) [degC]; (inf, -inf) if there are none.
     """
     temperature = fit.windows.temperature[:, np.newaxis]
-    # At 0.5 g along an axis, the relative error of |f| is a quarter of that of its scale factor.
+    # At 0.5 g along an axis, |f| has a quarter of the relative error of the axis' scale factor.
     is_along = np.abs(fit.posterior.state.up) >= 0.5
     is_seen = is_along[fit.windows.data.position]
     lower = np.where(is_seen, temperature, np.inf).min(axis=0)
