@@ -356,8 +356,8 @@ def judge_result(
     else:
         yield Finding('residual', 'good', text)
     alone = overall.two_sets.rms
-    # A new turn-on may shift the bias by 2 sd (2 `slow`) without contradicting the prior; so may
-    # initial lag states explain the residual, which leaves `sigma` near the noise.
+    # Without contradicting the prior, a new turn-on may shift the bias by 2 sd (2 `slow`), and
+    # initial lag states may explain the residual, which leaves `sigma` near the noise.
     contradiction, sigma = '', float(np.mean(prior.sigma))
     is_above = overall.fitted.rms > np.hypot(1.5 * alone, 2.0 * slow) and sigma > 1.5 * alone
     if options.prior is not None and is_above:

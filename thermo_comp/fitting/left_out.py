@@ -11,9 +11,9 @@ parameters alone, initial lag states at their prior mean, no mounting offsets an
 support. The errors are the drift (the force along each axis less its mean over the position, which
 does not depend on the attitude) and, if the other positions determine |f|, ``|f| - g``.
 
-Model A is better than B if the error of A is smaller by more than the standard error over the
-folds, both for positions and for sections of the program; `gain` lists exceptions. A model that
-describes only one recording fails for positions, a model of only one program fails for sections.
+Model A is better than B if the error of A is smaller by more than the standard error over folds,
+both for positions and for sections of the program; `gain` lists exceptions. A model that describes
+only one recording fails on left-out positions, a model of one program on sections.
 
 References
 ----------

@@ -4,8 +4,8 @@
 Owns the estimation of thermometer and detector settings from bags.
 
 Rates of temperature are central differences over two minutes, which are not causal and so need a
-recording. The lag and the ramps of the test follow from these rates. Lag, ramps and the noise of
-the readings become settings of the causal thermal tracker and regime detector.
+recording. The rates show the lag and the ramps of the test. Lag, ramps and noise of the readings
+become settings of the thermal tracker and of the regime detector, which are causal.
 """
 
 from __future__ import annotations
