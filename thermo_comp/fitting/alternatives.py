@@ -69,8 +69,8 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     fit = _with_lags(windows, problem)
     has_case = all(len(bag.case.value) for bag in bags)
     has_choice = has_case and options.prior is None and options.detector is None
-    # The regime detector matters if a model with a set of curves per regime is chosen, or is at
-    # most one standard error worse and, on each axis, has under 80 % of the chosen model's noise.
+    # Compare detectors if the chosen model has a curve for each regime, or if such a model has a
+    # score near the best (`is_near`) and on each axis under 80 % of the chosen model's noise.
     trials = fit.selected.trials
     chosen = next(trial for trial in trials if trial.is_chosen)
     limit = 0.8 * chosen.posterior.prior.sigma
@@ -87,7 +87,7 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     closed = replace(model, detector=replace(model.detector, end_condition='case'))
     undisturbed = fit.windows.data.undisturbed
     early = regress(windows_of(bags, closed, options, undisturbed=undisturbed), problem)
-    # Errors of left-out halves of the program limit the columns; they do not compare detectors.
+    # Left-out halves of the program show too many columns, not which of two detectors is better.
     return early if is_better(fit.selected.score, early.selected.score, by_halves=False) else fit
 
 
@@ -105,9 +105,9 @@ def windows_of(
 
 def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
     """
-    Fit the windows with one lag per axis (`find_parts`); or with the columns of `windows`, if no
-    lags are found (with a prior, and for Golovach's model, none are sought), or if all lags found
-    leave a left-out drift above `Parts.most_drift` and the fit without these lags is better.
+    Fit the windows with one lag per axis (`find_parts`) or, if no lags are found, with the columns
+    of `windows`. Neither a fit with a prior nor Golovach's model searches for lags. If all lags
+    leave a left-out drift above `Parts.most_drift`, the better of both fits is returned.
     """
     bags, options = problem.bags, problem.options
     is_free = options.prior is None and options.model != 'golovach'

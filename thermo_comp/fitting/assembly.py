@@ -166,7 +166,7 @@ def _provenance(
     residuals: Sequence[ResidualRow],
     findings: Sequence[Finding],
 ) -> Provenance:
-    # The left-out RMS of ``|f| - g`` is stated only if left-out fits determine |f| everywhere.
+    # State the left-out RMS of ``|f| - g`` only if left-out |f| is scored in all positions.
     is_norm = bool(np.isfinite(fit.selected.score.norms.square).all())
     now = datetime.now(timezone.utc)
     end_s = 1e-9 * max(bag.end_ns for bag in bags)

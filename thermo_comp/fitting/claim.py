@@ -6,9 +6,9 @@ not determine, and for effects that the model lacks.
 
 The standard deviation of mounting and turn-on offsets, unless the user states it, is marginalised:
 the covariance is that of a mixture of fits on a grid of this standard deviation. The weight of a
-fit is the fit's evidence, limited by the evidence of |f| in the positions, times a prior of the
-offset sd (half-Student [1]_ without a prior calibration). An error of local gravity, included in
-the covariance, changes all scale factors by the same ratio.
+fit in the mixture is its evidence, at most the evidence of |f| in the positions, times a prior of
+the offset sd (half-Student [1]_ without a prior calibration). An error of local gravity, included
+in the covariance, changes all scale factors by the same ratio.
 
 If the model lacks an effect, the best weights differ between sections of the chamber program, and
 the error in another program is as large as these differences: a jackknife [2]_ estimates them.
@@ -89,8 +89,8 @@ def claim_of(fit: Fit, gravity_sd: float = 0.0, known_offset_sd: float = 0.0) ->
         by_offset = np.array([point.by_offset(axis) for axis in range(3)])
         covariance = covariance + turn_on_variance * (by_offset.T @ by_offset)
     if fit.typical is not None:
-        # `_widened` computes the covariance for the sd of mounting offsets at the mode, so the
-        # variance that mixtures, jackknife and turn-ons have added is added to its result.
+        # `_widened` computes a covariance at one sd of mounting offsets, the mode: add the
+        # variance of the mixtures, of the jackknife and of the turn-ons to this covariance.
         excess = covariance - posterior.covariance
         layout, covariance = _widened(regression, posterior, fit.typical, fit.of_means)
         at = _places(posterior.layout, layout)
@@ -106,10 +106,10 @@ def _over_offsets(
     regression: Regression, posterior: PosteriorMode, offset_sd: float, known_sd: float
 ) -> tuple[Floats, float, float]:
     """
-    Return the covariance of the unit's unknowns by the mixtures over the sd of the offsets of
-    mountings and turn-ons, the sd of the offset of a new mounting after a new turn-on [m/s^2], and
-    the variance to add for the bias offset of a turn-on that all bags share, else 0: the
-    regression has no unknown for this offset.
+    Return three results: the covariance of the unit's unknowns, by mixtures over the sds of
+    offsets; the sd of the bias offset of a new mounting after a new turn-on [m/s^2]; and the
+    variance of the bias offset that all bags share if they have one turn-on (the regression has no
+    unknown for this offset), or 0 if they have several turn-ons.
 
     `offset_sd`: sd of a mounting's offset; `known_sd`: offset sd of a prior calibration [m/s^2]
     """
@@ -117,8 +117,8 @@ def _over_offsets(
     n_mountings = int(windows.mounting[-1]) + 1
     is_single = windows.n_turn_ons == 1 < n_mountings
     if scale <= 0.0:
-        # A stated offset sd also holds for a turn-on. The mean of the regression's m mounting
-        # offsets has 1 / m of the variance; the remaining 1 - 1 / m of the variance is added.
+        # A stated offset sd also holds for a turn-on. The mean of m mounting offsets has the
+        # variance sd^2 / m in the regression: add the remaining (1 - 1 / m) sd^2.
         variance = offset_sd**2 * (1.0 - 1.0 / n_mountings) if is_single else 0.0
         return posterior.covariance, offset_sd, variance
     kind = 'mounting' if is_single or windows.has_turn_ons else 'both'
@@ -153,14 +153,14 @@ def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Fl
         # A test of 12 positions determines the sd of mounting offsets within a factor of 1.5.
         ratio = 10.0 ** np.arange(-1.5, 1.51, 0.125)
         return known_sd * ratio, log_student(np.log(ratio) / np.log(1.5))
-    # `least`: smallest usual sd, relative to `scale`. By data sheets, the bias of navigation-grade
-    # triads repeats to 10 ug between turn-ons at best, better between mountings in one turn-on.
+    # `least`: smallest usual offset sd over `scale`. By data sheets, the bias of navigation-grade
+    # triads repeats to 10 ug at best between turn-ons, better between mountings of a turn-on.
     least = 0.01 if kind == 'mounting' else min(1e-4 / scale, 1.0)
-    # Largest usual sd, relative to `scale`: of mountings within a turn-on, of a single turn-on,
-    # and ('both') of several turn-ons, or of mountings that each begin with a turn-on. By data
-    # sheets, the bias repeats to 0.3 .. 1 mg over turn-ons of tactical triads and to some mg over
-    # those of MEMS, 10 to 20 times `scale`. The values for turn-ons are a compromise between data
-    # sheets and units whose bias repeats perfectly.
+    # `largest`: largest usual offset sd over `scale`, for mountings within a turn-on, for a single
+    # turn-on, and ('both') for several turn-ons or mountings that each begin with a turn-on. By
+    # data sheets, the bias repeats to 0.3 .. 1 mg over turn-ons of tactical triads and to some mg
+    # over turn-ons of MEMS, 10 to 20 times `scale`. The values of `largest` for turn-ons are
+    # between those of data sheets and of units whose bias repeats perfectly.
     largest = {'mounting': 1.0, 'turn-on': 2.0, 'both': 5.0}[kind]
     # The log evidence is smooth over the grid's step, a third of a decade of the sd.
     ratio = 10.0 ** np.linspace(-3.45, 2.25, 19)
@@ -180,15 +180,15 @@ def _places(layout: Layout, widened: Layout) -> Ints:
 def _widened(
     regression: Regression, posterior: PosteriorMode, candidates: Floats, of_means: State | None
 ) -> tuple[Layout, Floats]:
-    """Return layout and covariance with the columns that the data do not determine."""
+    """Return layout and covariance, extended by the columns that the data do not determine."""
     prior, state = _with_unseen(regression, posterior, candidates), posterior.state
     if of_means is None:
         with_unseen = regression.solve(state, prior, n_steps=0)
         return with_unseen.layout, with_unseen.covariance.copy()
-    # The chosen curve follows from drifts of warm-ups within the positions. A warm-up heats the
-    # board in another way than a chamber does, so the curve of the positions' means is an
-    # alternative: half of the squared difference of the two curves is added to the variance.
-    # Columns that change more within the positions than between them keep their weights.
+    # The drifts of warm-ups within the positions determine the chosen curve. A warm-up heats the
+    # board in another way than a chamber does, so the curve fitted to the positions' means is an
+    # alternative: half of the squared difference of the curves is added to the covariance. Columns
+    # that change more within the positions than between them keep their weights.
     within = within_positions(regression.columns, regression.windows.position)
     is_of_means = np.mean(within**2, axis=0) < np.mean((regression.columns - within) ** 2, axis=0)
     weights = np.where(is_of_means, of_means.weights, state.weights)
@@ -207,10 +207,10 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
     Add columns that the data do not determine to the prior, so that their variance is not 0.
 
     The weight of an inactive column is consistent with 0, but the data bound it only to ``1 /
-    sqrt(S)``, S being the information about the weight given the active columns. A column whose
-    bound exceeds two sd of a window's noise enters the covariance with zero weight, and with
-    the bound, or its prior sd if smaller, as sd. In this comparison the bound of a nearly constant
-    column is scaled to the RMS of the board temperature t [K].
+    sqrt(S)``, S being the information about the weight given the active columns. If the bound
+    exceeds two sd of a window's noise, the column enters the covariance with zero weight, and the
+    smaller of bound and prior sd as sd. For the comparison with the noise, the bound of a nearly
+    constant column is scaled to the RMS of the board temperature t [K].
     """
     groups, prior = np.array(regression.windows.groups), posterior.prior
     kelvins = regression.windows.kelvins
@@ -226,12 +226,12 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
     sd[inactive.part, inactive.column] = 1.0 / np.sqrt(np.maximum(information, 1e-300))
     is_of_lags = np.isin(groups, LAGS)
     if not regression.windows.has_drifts:
-        # At constant temperatures only thermometer errors change lags, and do not bound weights.
+        # At constant temperatures only thermometer errors change lags: do not bound their weights.
         sd = np.where((sd > 0.0) & (regression.windows.lag >= 0), np.inf, sd)
     sd = np.where(is_of_lags, sd, np.minimum(sd, typical))
     if CURVE in active:
-        # A lag delays the curve, so the prior sd of a lag's weight is at most the slope of the
-        # curve (RMS of the axes), including the bounds of columns that the data do not exclude.
+        # A lag only delays the curve: limit the prior sd of its weight to the slope of the curve
+        # (RMS of the axes), plus the bounds of curve columns that the data do not exclude.
         is_curve = (groups == CURVE) & (kelvins > 0.0)
         square = np.mean(posterior.state.weights**2, axis=1) + sd**2
         slopes = np.sqrt(np.sum(square[:, is_curve] / kelvins[is_curve] ** 2, axis=1))
@@ -239,7 +239,7 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
         typical = np.minimum(typical, of_curve)
         # A curve column that the data do not determine changes the curve's slope by up to a half.
         sd = np.where(groups == CURVE, np.minimum(sd, 0.5 * of_curve), sd)
-    # The variance of n lags is limited to that of one lag, so each lag gets 1 / n of the variance.
+    # n lags must not have more variance than one lag: each lag gets 1 / n of the variance.
     is_lag = is_of_lags & (sd > 0.0)
     share = np.sqrt(np.maximum(is_lag.sum(axis=1, keepdims=True), 1))
     sd = np.where(is_lag, np.minimum(sd, typical / share), sd)
@@ -267,7 +267,7 @@ def _over_mountings(
 
     fits = fits_with(tried)
     # With a large sd of mounting offsets attitudes absorb errors of the model, which raises the
-    # log evidence; at most the rise of the log evidence of |f| plus `CLEAR_GAIN` counts.
+    # log evidence: count at most the rise of the log evidence of |f|, plus `CLEAR_GAIN`.
     of_data = np.array([fit.log_evidence for fit in fits])
     of_norms = _norm_evidence(regression, posterior, tried, fits[-1].root)
     nearest = int(np.argmin(np.abs(np.log(tried * n_rests**0.5 / prior.offset_sd))))
@@ -289,7 +289,7 @@ def _fits(
 def _mixture(
     posterior: PosteriorMode, fits: Sequence[PosteriorMode], log_weight: Floats
 ) -> tuple[Floats, Floats]:
-    """Return the unit's covariance by a mixture of fits, about the mode, and the weights."""
+    """Return the unit's covariance about the mode by a mixture of fits, and the fits' weights."""
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
     n = posterior.layout.n_unit
@@ -324,7 +324,7 @@ def _norm_evidence(
     weight = np.add.reduceat(regression.weight, first)
     residual = regression.weight[:, None] * regression.residual(state, layout)
     residual = np.add.reduceat(residual, first) / weight[:, None]
-    # Derivatives and errors of |f|, averaged over each mounting; the errors contain its offset.
+    # Average derivatives and errors of |f| over each mounting; the errors include its offset.
     errors = np.sum(point.norm_by_axes * (residual + state.offset), axis=1)
     first = np.flatnonzero(np.diff(regression.windows.mounting, prepend=-1))
     rows = np.column_stack((along, errors, np.ones(len(along))))

@@ -131,20 +131,20 @@ def rough_centre(means: Floats) -> Floats:
     columns = np.column_stack((2.0 * arms, np.ones(len(arms))))
     centre = np.linalg.lstsq(columns, np.sum(arms**2, axis=1), rcond=None)[0][:3]
     radii = np.linalg.norm(arms - centre, axis=1)
-    # The sphere is accepted if the distances from its centre vary (sd) by less than 10 %, and if
-    # the RMS distance of the readings from their mean is at least half of the radius (it is 1
-    # radius for six faces, and 0.1 radius for readings within 6 degrees).
+    # Accept the sphere if the sd of the distances from its centre is below 10 % of the radius, and
+    # the RMS distance of the readings from their mean exceeds half of the radius (six faces give 1
+    # radius, readings within 6 degrees 0.1 radius).
     is_sphere = np.std(radii) < 0.1 * np.mean(radii) < 0.2 * spread
-    # A sphere exists through any four readings, so the coordinates of the centre must also be
-    # similar: the outputs at zero force of the axes of an analog sensor are within 20 % of their
-    # mean (ADXL335 data sheet, 1.2 to 1.8 V).
+    # A sphere exists through any four readings, so the coordinates of its centre must agree: the
+    # three zero-g outputs of an analog triad are within 20 % of their mean (ADXL335 data sheet,
+    # 1.2 to 1.8 V).
     centre = means.mean(axis=0) + centre
     is_common = np.ptp(centre) < 0.4 * abs(centre.mean())
     return np.asarray(centre) if is_sphere and is_common else zero
 
 
 def geometry(up: Floats, with_misalignment: bool) -> float:
-    """Return the largest sd of a constant over the noise sd of |f|, inf if not determined."""
+    """Return the ratio of the largest sd of a constant to the noise sd of |f|; inf if unknown."""
     jacobian = norm_columns(up)[:, : 9 if with_misalignment else 6]
     values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
     if values[0] < 1e-9 * values[-1]:
@@ -204,7 +204,7 @@ class LeastKnown:
 
 
 def least_known(calibration: Calibration, up: Floats) -> LeastKnown | None:
-    """Find the attitude of largest sd of |f|; None without covariance; `up`: of the positions."""
+    """Find the attitude of largest sd of |f|, if known; `up`: attitudes of positions, (n, 3)."""
     if calibration.posterior is None:
         return None
     layout = parameter_layout(calibration)

@@ -146,7 +146,7 @@ def _has_drift(windows: ThermalWindows) -> bool:
 
 
 def _ramp_rates(windows: ThermalWindows) -> Floats:
-    """Return the rate of T_board [K/min], (n,); 0 if over twice the slope between windows."""
+    """Return T_board's rate [K/min], (n,), or 0 where T_board changes at under half this rate."""
     rate, edges = windows.rate * 60.0, windows.data.edges
     for rows in map(slice, edges[:-1], edges[1:]):
         if rows.stop - rows.start > 1:
@@ -356,8 +356,8 @@ def judge_result(
     else:
         yield Finding('residual', 'good', text)
     alone = overall.two_sets.rms
-    # A bias offset of up to 2 sd (2 `slow`) after a new turn-on does not contradict the prior, nor
-    # does a residual that the initial lag states explain, which leaves `sigma` near the noise.
+    # Without contradicting the prior, a new turn-on may shift the bias by 2 sd (2 `slow`), and
+    # initial lag states may explain the residual, which leaves `sigma` near the noise.
     contradiction, sigma = '', float(np.mean(prior.sigma))
     is_above = overall.fitted.rms > np.hypot(1.5 * alone, 2.0 * slow) and sigma > 1.5 * alone
     if options.prior is not None and is_above:

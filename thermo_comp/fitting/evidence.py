@@ -10,9 +10,9 @@ without this position, which estimates the error in a new attitude.
 
 The lack of fit in a regime, near a temperature, is the mean square of the left-out drift less the
 noise and the published variance of this drift. The lack of fit covers effects that no column
-describes, such as a kink of the curve, a tilt of the support or a drift of the bias. For models
-whose score is at most one standard error worse than that of the chosen model, half of the largest
-squared difference of such a model's drift from the chosen model's is added to the lack of fit.
+describes, such as a kink of the curve, a tilt of the support or a drift of the bias. The lack of
+fit includes half of the largest squared difference in drift between the chosen model and any other
+model whose score is at most one standard error worse.
 """
 
 from __future__ import annotations

@@ -66,7 +66,7 @@ def fit(
     """
     Fit a calibration to bags of a thermal test.
 
-    Raises FitError if the data do not allow a fit, as if a recording has no still interval.
+    Raises FitError if the data do not allow a fit, such as a recording without still interval.
     """
     check_serial(sources, options)
     if not sources:
@@ -349,7 +349,7 @@ def _judged(
 
 def _unusable(error: ValueError, up: Floats) -> FitError:
     if 'misalignment' in str(error):
-        # If the positions determine the misalignment, these samples are not those of a triad.
+        # An angle of 60 degrees between axes is a data error if the positions determine M.
         kind = FitError if data_checks.determines_misalignment(up) else UndeterminedError
         return kind(
             'in the fit the angle between two of the axes is some 60 degrees or less, which no '
@@ -382,7 +382,7 @@ def _unit(bags: Sequence[ReducedBag], options: FitOptions) -> Unit:
     if full_scale == COUNTS_FULL_SCALE:
         full_scale = widened(full_scale, np.array([[largest]]))
     if full_scale is None:
-        # The smallest usual full scale 10 % above the largest sample, else twice this sample.
+        # Take the smallest usual full scale 10 % above all samples, else twice the largest sample.
         ranges = (STANDARD_GRAVITY * g for g in (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0))
         full_scale = next((top for top in ranges if top > 1.1 * largest), 2.0 * largest)
     cycle = float(np.median([bag.cycle_s for bag in bags]))

@@ -50,8 +50,8 @@ def add_gyroscope(
     options: FitOptions,
 ) -> tuple[Calibration, tuple[RateRow, ...]]:
     """
-    Add a gyroscope to a calibration: that of the prior calibration or, without a prior, a
-    gyroscope fitted to the bags, if the bags have angular rates and temperatures.
+    Add to a calibration the gyroscope of the prior calibration or, without a prior, a gyroscope
+    fitted to the bags, if the bags have angular rates and temperatures.
     """
     if options.prior is not None:
         known = options.prior.gyroscope

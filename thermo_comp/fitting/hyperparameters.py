@@ -4,8 +4,8 @@
 Owns the estimation of prior sd and noises, and the removal of columns of small log Bayes factor.
 
 Each column has one prior standard deviation of its weights in the bias of all axes and one in the
-scale. If not fixed, both follow from MacKay's fixed point [1]_ with a log-normal hyperprior of the
-sd, of centre sd0 and variance tau^2 of log sd. The mode of log evidence plus log hyperprior
+scale. If not fixed, both sds follow from MacKay's fixed point [1]_ with a log-normal hyperprior of
+the sd, of centre sd0 and variance tau^2 of log sd. The mode of log evidence plus log hyperprior
 satisfies ``effective parameters + log(sd / sd0) / tau^2 = sum w^2 / sd^2``, w being the weights of
 the column on the three axes. If the data do not inform about a column, the sd stays at sd0.
 
@@ -110,7 +110,7 @@ def _updated(
 
     return moved, max(
         change('column_sd', moves & (effective > 0.3)),
-        # A change of the sd of offsets that the data do not determine does not count.
+        # Ignore a change of the sd of offsets unless the data determine more than one offset.
         change('offset_sd') * bool(determined[layout.offset].sum() > 1.0),
         change('turn_on_sd') * bool(determined[layout.turn_on].sum() > 1.0),
         # An error of 15 % of the sd of tilts hardly changes the fit.
@@ -179,7 +179,7 @@ def _toward(
     slope: Floats | float,
     bend: Floats | float,
 ) -> Floats:
-    """Return Newton's step of log sd towards ``power / sd^2 = effective + slope``, at most +-2."""
+    """Return Newton's step, within +-2, of log sd to ``power / sd^2 = effective + slope``."""
     ratio = power / (sd * sd)
     gradient = ratio - effective - slope
     curvature = 2.0 * np.minimum(ratio, 2.0 * effective + 1.0) + 0.5 * effective + bend
@@ -234,8 +234,8 @@ def white_noise(regression: Regression, posterior: PosteriorMode) -> Floats:
     # hundredth of the noise of the noisiest axis.
     least = np.full(3, max(posterior.prior.least_sigma, 0.01 * float(sigma.max())))
     if not regression.windows.has_drifts:
-        # If no column changes within a position, slow noise may explain the whole residual. The
-        # white noise is then at least that of differences of windows, in which a drift cancels.
+        # If no column changes within a position, slow noise may explain the whole residual: the
+        # white noise is at least the noise of differences of windows, which contain no drift.
         least = np.maximum(least, white_noise_of(regression.windows, regression.nominal_scale))
     return np.asarray(np.maximum(sigma, least))
 
@@ -330,9 +330,9 @@ def _pruned(regression: Regression, posterior: PosteriorMode, candidates: Candid
 
 def downweigh(regression: Regression, posterior: PosteriorMode) -> None:
     """
-    Reduce the weight of windows whose residual is more than 3 sd from the local median (in a
-    position of up to 6 windows: from 0), so that the weighted distance becomes 3 sd; keep the
-    weights if `windows.undisturbed` is given.
+    If the residual of a window is more than 3 sd from the local median (in a position of up to 6
+    windows: from 0), reduce the window's weight so that the weighted distance becomes 3 sd. Keep
+    all weights if `windows.undisturbed` is given.
     """
     windows = regression.windows
     if windows.undisturbed is None:

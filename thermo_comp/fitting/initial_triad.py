@@ -69,7 +69,7 @@ def constant_calibration(
             f'an axis ({axes}) reads the same in all positions: the axis is dead, or the unit was '
             'never turned about another axis'
         )
-    # The largest half range is |f| if two positions are near its axis, else less: try |f| / 1.3.
+    # If no axis has positions near both ends, half ranges are below |f|: try also |f| / 1.3.
     scales = (float(np.max(half)) * spread / gravity for spread in (1.0, 1.3))
     starts = (np.where(half * 4.0 > np.max(half), scale, half / gravity) for scale in scales)
     tried = (_refine(means, gravity, bias, scale, misalignment_sd) for scale in starts)
@@ -137,8 +137,8 @@ def white_noise_of(windows: Windows, scale: Floats) -> Floats:
     Return the white noise of a window on each axis [m/s^2], shape (3,), from second differences,
     which do not depend on a linear drift; 0 if no position has three windows.
 
-    In fast ramps second differences contain a part of the drift. If fourth or sixth differences
-    then give a noise below 70 % of that by second differences, the smallest value is used.
+    In fast ramps second differences contain a part of the drift. If the noise from fourth or sixth
+    differences is below 70 % of the noise from second differences, the smallest is used.
     """
     position, noises = windows.position, []
     for order in (2, 4, 6):

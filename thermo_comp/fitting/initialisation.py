@@ -68,9 +68,9 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     """
     Fit the windows, with or without a prior calibration.
 
-    Without a prior, if the positions are whole rests, and temperature changes more between than
-    within positions, the curve is fitted to the means of the positions, unless a fit that also
-    uses the drifts is better on left-out data.
+    Without a prior, if the positions are whole rests and temperature changes more between than
+    within positions, two fits are made: of the curve to the means of the positions, and with the
+    drifts. The fit to the means is used unless the fit with the drifts is better on left-out data.
     """
     if problem.options.prior is not None:
         return _regress(windows, problem)
@@ -85,7 +85,7 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     # similar amounts, so only the differences of |f| between positions determine the curve.
     everywhere = np.ones(windows.data.n_positions, dtype=bool)
     at_rest = replace(windows, data=rests.constant_in(windows.data, everywhere, everywhere))
-    # Each of the two regressions reports progress from 0.7 to 0.95: map it to half of this range.
+    # Both regressions report progress from 0.7 to 0.95: map each to its half of this range.
     first = replace(problem, progress=lambda part: problem.progress(0.35 + 0.5 * part))
     second = replace(problem, progress=lambda part: problem.progress(0.475 + 0.5 * part))
     fit, of_drifts = _regress(at_rest, first, is_at_rest=True), _regress(windows, second)
@@ -107,8 +107,8 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     if (has_poses or n_directions == 1) and known is None and data.forces is None:
         data = replace(data, pose=rests.poses_of(windows, problem.up))
     if options.model == 'golovach' or is_bench or n_directions == 1 or data.n_poses:
-        # No tilts are fitted: in one attitude a tilt of the support is not separable from a drift
-        # of the unit, in a pose not from a change of the attitude, and in Golovach's model tilts
+        # No tilts are fitted: a tilt of the support is not separable from a drift of the unit in
+        # one attitude, nor from a change of the attitude in a pose. In Golovach's model tilts
         # would absorb errors of the two sets.
         data = replace(data, tilt=data.tilt[:, :0])
     settled = data.settled if problem.is_by_settled else None
@@ -139,7 +139,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     chosen = selected.posterior
     full_prior = replace(chosen.prior, bias_sd=prior.bias_sd, scale_sd=prior.scale_sd)
     selected = replace(selected, posterior=replace(chosen, prior=full_prior))
-    # The covariance has the full prior sd of slopes of the scale, not that halved by `_steepest`.
+    # The covariance has the full prior sd of slopes of the scale, not halved by `_steepest`.
     limits = STEEPEST, _steepest(n_directions)
     full, used = (_typical_slopes(steepness, limit, options.gravity) for limit in limits)
     claimed = candidates.typical * (full / used)[:, np.newaxis]
@@ -271,10 +271,10 @@ def _noise_in_1_hz(windows: ThermalWindows, scale: Floats) -> float:
 
 def _mounting_scale(noise: float) -> float:
     """Return the prior scale of mounting offsets [m/s^2], from the noise in a 1 Hz bandwidth."""
-    # Bounds of the scale: 30 ug, typical of navigation grade, and 0.5 mg, of consumer MEMS; the
-    # tail of the Student prior allows for larger offsets. With almost no noise the lower bound is
-    # 100 times this noise, because an offset 1e6 times as large as the noise cannot be
-    # estimated in double precision.
+    # The prior scale of offsets is at least 30 ug, typical of navigation grade, and at most 0.5
+    # mg, of consumer MEMS; the tail of the Student prior allows for larger offsets. With almost no
+    # noise the lower bound is 100 times this noise, because an offset 1e6 times as large as the
+    # noise cannot be estimated in double precision.
     least, most = max(min(3e-4, 100.0 * noise), 1e-7), 5e-3
     return float(np.clip(3.0 * noise, least, most))
 
@@ -310,8 +310,8 @@ def _candidates(
 
 def _steepest(n_directions: int) -> Floats:
     """Return the largest prior sd of slopes of bias and scale, given the number of attitudes."""
-    # For two to eight attitudes the prior sd of the scale factor's slope is halved: a drift of a
-    # nearly level axis is more often a tilt of the support than a slope of its scale factor, which
+    # For two to eight attitudes the prior sd of the scale factor's slope is halved. A drift of a
+    # nearly level axis is more often a tilt of the support than a slope of the scale factor, which
     # would have to be several hundred ppm/K.
     is_few = 1 < n_directions < POSITIONS_FOR_MISALIGNMENT
     return STEEPEST * (1.0, 0.5 if is_few else 1.0)
@@ -333,7 +333,7 @@ def _steepness(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool) -
         change = within_positions(windows.temperature[:, None], data.position)
         return drift / (float(np.sqrt(np.mean(change**2))) or 1.0)
     kelvins = float(np.std(windows.temperature)) or 1.0
-    # If only rests differ in temperature, the drift appears in differences of |f| between rests.
+    # If the temperature differs only between rests, the drift appears in differences of |f|.
     force = (position_means(data) - start.bias) / start.scale
     sizes, norms = sizes_of(windows, problem.options), np.linalg.norm(force, axis=1)
     errors = norms - sizes
@@ -342,8 +342,8 @@ def _steepness(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool) -
         powers = np.vander(sizes / sizes.max(), 4)
         errors -= powers @ np.linalg.lstsq(powers, errors, rcond=None)[0]
     if is_at_rest:
-        # Bias and scale explain a part of the differences of |f|. Divide the RMS error of |f| by
-        # the RMS change of |f|, per unit of each slope, that bias and scale do not explain.
+        # Constant bias and scale explain a part of the differences of |f|: divide the RMS error of
+        # |f| by the RMS change of |f| for unit slopes of bias and scale, less the explained part.
         constants = norm_columns(force / norms[:, None])[:, :6]
         celsius = windows.temperature[data.edges[:-1]]
         of_slopes = (celsius - celsius.mean())[:, None] * constants
@@ -360,7 +360,7 @@ def sizes_of(windows: ThermalWindows, options: FitOptions) -> Floats:
 
 
 def initial_triad(windows: ThermalWindows, options: FitOptions) -> ConstantCalibration:
-    """Fit constant bias, scale and M; few attitudes give the scale only (1 for m/s^2 input)."""
+    """Fit constant bias, scale and M or, in few attitudes, the scale only (1 for m/s^2 input)."""
     means, gravity = position_means(windows.data), sizes_of(windows, options)
     norms = np.linalg.norm(means, axis=1)
     if not norms.all() or (len(means) > 1 and not means.any(axis=0).all()):

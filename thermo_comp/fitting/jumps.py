@@ -104,7 +104,7 @@ def _beside_gaps(
 
 
 def _margin(samples: Floats, quiet_sd: Floats) -> float:
-    """Return the time [s] to use beside a gap: 60 time constants of the noise, 10 to 100 s."""
+    """Return the time [s] to average beside a gap: 60 time constants of the noise, 10 to 100 s."""
     time, accel = samples[:, 0], samples[:, 1:4]
     if len(time) < 2 * _FEWEST_SAMPLES:
         return _MARGIN_S
@@ -164,7 +164,7 @@ def _examine(
 
 
 def _correlation(residual: Floats, sd: Floats) -> Floats:
-    """Return sd of the mean of residuals, divided by that for white noise `sd`, >= 1, (3,)."""
+    """Return the ratio, >= 1, of the sd of residuals' mean to its sd by white noise `sd`, (3,)."""
     # A lag-1 correlation r of the means of 40 pieces multiplies the variance of the mean of all
     # pieces by (1 + r) / (1 - r).
     size = max(len(residual) // 40, 1)
@@ -215,9 +215,9 @@ def _place_of_step(time: Floats, accel: Floats, quiet_sd: Floats, r: float) -> i
     residual = whitened(accel, r)
     residual = residual - trend @ (trend.T @ residual)
     candidates = np.arange(_FEWEST_SAMPLES, n - _FEWEST_SAMPLES + 1)
-    # A unit step at sample k, whitened for the lag-1 correlation r, is 1 at k and 1 - r after k.
-    # The step's product with a residual is a sum over the samples from k on. The square of this
-    # whitened step, after removal of the trend, follows from such sums of the trend.
+    # A unit step at sample k, whitened for the lag-1 correlation r, is 1 at k and 1 - r after k:
+    # its product with a residual is a sum over the residuals from sample k on. The square of a
+    # whitened step without trend contains sums over the trend from sample k on.
     tail = _sums_behind(residual, r)[candidates]
     trend_tail = _sums_behind(trend, r)[candidates]
     square = 1.0 + (1.0 - r) ** 2 * (n - candidates - 1) - (trend_tail**2).sum(axis=1)

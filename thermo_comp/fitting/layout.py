@@ -203,10 +203,10 @@ class Tangent:
 
     The derivative of the readings w.r.t. an unknown is a factor times a base series, or times one
     of the combinations `combined` of base series. For axis i, position p and unknown u the
-    derivative is ``factor[p, i, u]`` times the series of index ``place[u]``; combinations are
-    counted after the base series. The unknowns of an axis are those of the position (2 of the
-    attitude, stretch, offset, tilts), then those of the bag (initial lag states, turn-on offset),
-    then those of the unit (kappa, bias, weights, nonlinear coefficients, radius, 3 of the
+    derivative is ``factor[p, i, u]`` times the series of index ``place[u]``; the indices of
+    combinations follow those of the base series. The unknowns of an axis are those of the position
+    (2 of the attitude, stretch, offset, tilts), then those of the bag (initial lag states, turn-on
+    offset), then those of the unit (kappa, bias, weights, nonlinear coefficients, radius, 3 of the
     misalignment, 2 of each pose). The last place is for the residual, measured minus predicted.
 
     combined: the combinations of base series, shape (n_positions, 3, n_base, n_combined)
@@ -232,8 +232,8 @@ class Tangent:
         place = self.place[first:]
         n, bias = len(place), slice(1, 1 + self.n_bias)
         scale = slice(bias.stop, bias.stop + self.n_scale)
-        # Sums over the positions of the products of the base series, times the powers 0, 1 and 2
-        # of the factor of the scale's weights.
+        # Sums, over the positions, of products of two base series; each product is multiplied by
+        # the power 0, 1 or 2 of the factor of the scale's weights.
         powers = np.stack([self.scale**k for k in range(3)])
         sums = np.tensordot(powers.transpose(2, 0, 1), products, 1)
         unit = np.empty((3, n, n))
@@ -271,7 +271,7 @@ class Tangent:
     def of(self, rows: Floats) -> Floats:
         """
         Return the derivatives of m linear functions of the readings, such as the mean, shape
-        (n_positions, 3, m, k + 1). `rows`: these functions of the base series, shape
+        (n_positions, 3, m, k + 1). `rows`: values of the functions for each base series, shape
         (n_positions, m, n_base)
         """
         combined = rows[:, None] @ self.combined

@@ -6,11 +6,11 @@ Owns the search for the thermal lag of each axis.
 The bias and the scale factor of an axis are modelled as functions of ``x = t - m``, the
 temperature of one part of the unit less the reference temperature. t is the board temperature T
 less the reference temperature, and m = T - L(T + v G) is T less the temperature of the part, with
-L the lag operator and G = T_case - T_board the gradient. The part lags T + v G, a temperature
-between board and case. The lag has one first-order stage or, for a part that is heated through
-another part, two stages in series. Without a case thermometer, the temperature that the part lags
-may lead the board thermometer by a time, the lead. The time constants, the share v of the gradient
-and the lead minimise the RMS residual of a spline of the bias and a cubic of the scale over x.
+L the lag operator and G = T_case - T_board the gradient. The part follows T + v G, a temperature
+between board and case, with a lag of one first-order stage or, for a part that is heated through
+another part, two stages in series. Without a case thermometer, the part may follow a temperature
+that leads T by a time, the lead. The time constants, the share v of the gradient and the lead
+minimise the RMS residual of a spline of the bias and a cubic of the scale over x.
 """
 
 from __future__ import annotations
@@ -88,9 +88,9 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> list[Part
     Find the lag of each axis, and reduce the weights of windows that deviate from the model.
 
     Returns [] if the model with one lag per axis does not explain the drift of all axes, or if the
-    data do not determine a time constant. If the residual of every shape exceeds the noise, lags
-    of one stage are also fitted, and come first in the list if on every axis they halve the RMS
-    residual without a lag: a second stage may only describe slow noise or a tilt of the support.
+    data do not determine a time constant. If the residual of every shape exceeds the noise, a
+    second stage may only describe slow noise or a tilt of the support: lags of one stage then come
+    first in the list, if on every axis they halve the RMS residual without a lag.
     """
     data, columns = windows.data, windows.model.columns
     if not windows.has_temperature or not any(column.group == 'board' for column in columns):
@@ -107,9 +107,9 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> list[Part
         subset = _PartCurves(windows, start, shape, 3000)
         lags = [subset.refined(lag, axis) for axis, lag in enumerate(searched)]
         parts, ratio = _PartCurves(windows, start, shape, len(data.time)).parts(lags, noise)
-        # A residual above `most_noise` times the white noise has a cause besides white noise and
-        # lags, such as slow noise: the lags are then accepted only if the RMS residual of each
-        # axis is at most a quarter of its RMS residual without a lag.
+        # If the residual is above `most_noise` times the white noise, it has a further cause, such
+        # as slow noise: lags are then accepted only if the RMS residual of each axis is at most a
+        # quarter of its RMS residual without a lag.
         is_explained = ratio <= shape.most_noise
         if not is_explained and min(map(subset.reduction, lags, range(3))) < 4.0:
             continue
@@ -185,7 +185,7 @@ class _PartCurves:
     def _is_of_use(
         self, lag: Part, axis: int, noise: float, most_noise: float = 3.0, reduction: float = 4.0
     ) -> bool:
-        """Whether residual / noise <= `most_noise`, or `self.reduction` is >= `reduction`."""
+        """Whether the residual with `lag` is near the noise, or far below that without a lag."""
         typical = 1.4826 * np.median(np.abs(self._weighted(lag, axis) / self._root_weight[:, 0]))
         return bool(typical <= most_noise * noise or self.reduction(lag, axis) >= reduction)
 
@@ -206,7 +206,7 @@ class _PartCurves:
                 along = [self.one_stage(axis, share) for share in (0.3, 0.6, 0.9)]
                 starts.append(min(along, key=lambda lag: self._square(lag, axis)))
             if not any(self._is_of_use(near, axis, noise, 8.0, 1.5) for near in (best, *starts)):
-                # Neither a second stage nor another share would reduce this residual enough.
+                # A second stage or another share would not reduce the residual enough.
                 return best
             lags = [self._searched(axis, _in_two_stages(one_stage), (0.2, 0.4, 0.0, 0.0))]
             if best.lead_s:
@@ -228,7 +228,7 @@ class _PartCurves:
         Add a share of the gradient to a lag or, without a case thermometer, a positive lead time,
         if the residual then is significantly smaller.
 
-        The residual is linearised in time constant and in share or lead. The sum of squared
+        The residual is linearised w.r.t. time constant and share (or lead). The sum of squared
         residuals must decrease by a factor that white residuals reach with a probability of 1e-5.
         """
         tau = lag.tau_s
@@ -311,8 +311,8 @@ class _PartCurves:
 
     def _is_determined(self, lag: Part, axis: int) -> bool:
         """
-        Whether time constants longer or shorter by `_TAU_RATIO` (21 s for a lag of 0 s) increase
-        the RMS residual by more than 5 %, and the lag decays to 10 % within the longest bag.
+        Whether a time constant `_TAU_RATIO` times longer or shorter (21 s for a lag of 0 s)
+        increases the RMS residual by over 5 %, and the lag decays to 10 % within the longest bag.
         """
         tau, second, share, lead = lag
         if tau > float(self._age.max()) / np.log(10.0):
@@ -341,9 +341,9 @@ class _PartCurves:
         square /= max(1.0 - n_unknowns / len(residual), 0.05)
         ratio = float(np.sqrt((square / noise**2).max()))
         x, y, z = (Part(*map(round, lag, (1, 1, 4, 1))) for lag in lags)
-        # Largest left-out drift at which the lags are kept without trial of other models: 10 sd of
-        # the noise if noise explains the residual of a shape without stress (its curves
-        # extrapolate badly to left-out data), else 2 sd.
+        # Other models are tried if the left-out drift is above `most_drift`: 2 sd of the noise, or
+        # 10 sd for a shape without stress whose residual noise explains, because the curves of
+        # this shape extrapolate badly to left-out data.
         is_curve = ratio <= self._shape.most_noise and not self._shape.has_stress
         most_drift = (10.0 if is_curve else 2.0) * float(noise.mean())
         return Parts((x, y, z), factors, most_drift), ratio

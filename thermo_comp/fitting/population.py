@@ -106,9 +106,9 @@ def _scatter(deviations: Floats, layout: ParameterLayout, K: Floats) -> Floats:
 
     The correlations of bias, scale and misalignment with each other and with the curves are set to
     0: with chance correlations from few units, one position would determine all constants of a new
-    unit. The correlations between curves are reduced by a ratio estimated from their scatter [1]_,
-    after a dynamic curve is replaced by its difference from the static curve: in most units both
-    curves are equal, and a reduced correlation of equal curves would make the curves differ.
+    unit. The correlations between curves are reduced by a ratio estimated from their scatter [1]_.
+    A dynamic curve is first replaced by its difference from the static curve: in most units both
+    curves are equal, and reduced correlations would make them differ.
     """
     to_differences = np.eye(deviations.shape[1])
     for block in (*layout.bias, *layout.scale):
@@ -176,7 +176,7 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
     Parts of two units of a type have different time constants, so a lag is interpolated between
     the lags of the bank, which is common to all units; a lag of 0 s has the value 0. A lag of two
     stages, a lag behind a temperature between board and sensor, and a lag with a lead are sums of
-    first-order lags. A power of such a sum is approximated by the power of one lag of the board
+    first-order lags. A power of a sum of lags is approximated by the power of one lag of the board
     that has the same delay in a long ramp as the sum.
     """
     tau, second, lag = column.tau_s, column.second_tau_s, column.source
@@ -262,7 +262,7 @@ def _shape(calibration: Calibration) -> list[tuple[str, int]]:
 
 
 def _template(calibrations: Sequence[Calibration], columns: Sequence[Column]) -> Calibration:
-    """Return a calibration with the union of the units' ranges, and the columns with weight 0."""
+    """Return a calibration with the union of the units' ranges, and with columns of weight 0."""
     first = calibrations[0]
     slow = [[axis.residual_sd_m_s2 for axis in each.static.axes()] for each in calibrations]
     usual = np.median(slow, axis=0).tolist()

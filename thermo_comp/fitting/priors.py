@@ -3,9 +3,9 @@
 """
 Owns the informative prior of a fit, from a calibration of the unit or its type (`population`).
 
-Values and covariance of all parameters of the calibration are mean and covariance of the Gaussian
-prior of the regression, which has the calibration's columns. The covariance is increased by the
-ageing of the unit since the calibration.
+The mean and the covariance of the Gaussian prior of the regression are the parameters of the
+calibration and their covariance, increased by the ageing of the unit since the calibration. The
+regression has the calibration's columns.
 """
 
 from __future__ import annotations
@@ -106,8 +106,8 @@ def informative_priors(
             'the prior has no covariance: use a calibration that was fitted to bags; an imported '
             'calibration cannot be a prior'
         )
-    # Pairs to try: the ageing, sd of biases [g] and of scale factors (0: as the user states); and
-    # `share`, the ratio of uncorrelated variances to add to the variances of the prior.
+    # Pairs to try: sd of the ageing of biases [g] and of scale factors (0: as the user states);
+    # and `share`, the uncorrelated variances to add over the variances of the prior.
     tried = [(0.0, share) for share in (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)]
     # The fit begins with the last, widest prior: in a first fit with a narrow prior, the noise
     # would absorb changes of the unit.
@@ -119,8 +119,8 @@ def informative_priors(
         tried += [(ageing, 0.0) for ageing in (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)]
         # Priors for a unit whose effects of temperature have changed, too: `share` multiplies the
         # sd of the prior by 1.4, 30 and 1000, because the sd of an effect of temperature may be a
-        # thousandth of the effect. The sd is at most the effect itself: a few rests would
-        # otherwise leave the effects at other temperatures unknown.
+        # thousandth of the effect. The sd of an effect is at most the effect: with a larger sd few
+        # rests would leave the effects at other temperatures unknown.
         tried += [(ageing, share) for share in (1.0, 1e3, 1e6) for ageing in (3e-5, 3e-4, 3e-3)]
     K, places = constants_of(calibration).scale, parameter_layout(calibration)
     layout = regression.layout(regression.windows.parts)
@@ -138,7 +138,7 @@ def informative_priors(
                 levels = [block.static, block.dynamic]
                 covariance[np.ix_(levels, levels)] += sd * sd
         density = float(log_student(np.array(ageing * options.gravity / usual_ageing)))
-        # Changed effects of temperature are rare: the rests must show them clearly.
+        # The effects of temperature rarely change: log evidence must justify a change.
         density -= CLEAR_GAIN * (share >= 1.0)
         root = _root(covariance, share, sizes, to_file)
         yield InformativePrior(mean, root, density, is_changed=share > 1.0)
@@ -160,8 +160,8 @@ def _root(covariance: Floats, share: float, sizes: Floats, to_file: Floats) -> F
     """
     Return the upper triangular root of the inverse covariance of the unit's unknowns.
 
-    `covariance`: of the file's parameters; `share` times each variance is added to its diagonal,
-    at most the variance or, if larger, the square of the parameter in `sizes`;
+    `covariance`: of the file's parameters; each parameter's variance is increased by `share` times
+    this variance, at most by the variance or, if larger, by the square of its size in `sizes`;
     `to_file`: derivatives of the file's parameters w.r.t. the unknowns
     """
     diagonal = np.diag(covariance)

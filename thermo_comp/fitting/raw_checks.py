@@ -153,7 +153,7 @@ def _why_dead(bags: Sequence[ReducedBag], dead: Sequence[_DeadAxis]) -> str:
     ends = {(axis.axis, axis.value > 0.0) for axis in dead}
     if not largest or not is_at_top.all() or len(ends) == 1:
         return 'the axis is dead; leave out each bag with a dead axis'
-    # The advised full scale is just below the clipped reading, which counts as saturated.
+    # Advise a full scale just below the clipped reading, so that this reading is saturated.
     limit = f'--full-scale {largest * (1.0 - 1e-4):.5g}'
     return (
         'the same largest magnitude, with both signs or on several axes, is the full scale: leave '
@@ -245,8 +245,8 @@ def judge_missing(bags: Sequence[ReducedBag], windows: ThermalWindows) -> Iterat
 
 def _missing(bag: ReducedBag, track: Track) -> tuple[float, float, float]:
     """
-    Count a bag's samples at rest: all; those before the estimate of the board temperature is
-    accurate; later samples without a temperature, but between readings of each thermometer.
+    Count three sets of a bag's samples at rest: all; those before the board temperature is
+    accurate; and later samples without a temperature, but between readings of each thermometer.
     """
     read = [readings.stamp_ns for readings in bag.temperatures.values() if len(readings.stamp_ns)]
     begin_s = 1e-9 * (max(stamp_ns[0] for stamp_ns in read) - bag.start_ns)

@@ -196,10 +196,10 @@ def reduce_source(
 
     `still_sd` is the largest sd of samples at rest [g]. Without `min_rest_s` a rest lasts at least
     3 s, or at least 1 or 2 s if these shorter rests determine bias and scale better. The largest
-    variance of a rest is also chosen so that the rests determine bias and scale best. If the
-    user or the bag states |f|, the variance is not chosen, and a rest lasts 3 s or more. At a low
-    sample rate a cell of the usual number of samples is so long that a drift within it looks like
-    a motion, and that short rests are lost: cells of 10 or 5 samples are then tried.
+    variance of a rest is also chosen so that the rests determine bias and scale best. If the user
+    or the bag states |f|, the largest variance is fixed, and `min_rest_s` is by default 3 s. At a
+    low sample rate, cells of the usual number of samples are so long that drifts look like motions
+    and short rests are lost: cells of 10 or 5 samples are tried.
     """
 
     def reduced(least: int) -> tuple[ReducedBag, float]:
@@ -289,8 +289,8 @@ def _cycle_s(cells: Cells) -> float:
     """Return the typical interval between samples [s]; NaN without samples."""
     if not len(cells.count):
         return np.nan
-    # Complete cells have the median number of samples, or one more or less. If most cells deviate
-    # more, as with bursts of samples, cells with more than half of the median number are used.
+    # Complete cells have the median number of samples, or one more or less. If most cells are not
+    # complete, as with bursts of samples, cells with over half of the median number are used.
     median = float(np.median(cells.count))
     use = np.abs(cells.count - median) <= 1.0
     if np.mean(use) < 0.5:
@@ -306,7 +306,7 @@ def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
     use &= stamp_ns > np.maximum.accumulate(before[: len(stamp_ns)])
     stamp_ns, value = stamp_ns[use], value[use]
     span_s = np.ptp(stamp_ns) * 1e-9 if len(stamp_ns) else 0.0
-    # No thermometer responds within 0.2 s, and the tracker's loop over readings is slow in Python.
+    # Average over 0.2 s, as no thermometer responds faster and the tracker's Python loop is slow.
     size = int(0.2 * (len(stamp_ns) - 1) / span_s) if span_s else 1
     n = len(stamp_ns) // size * size if size > 1 else 0
     if n:
@@ -320,7 +320,7 @@ def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
 def is_spike(value: Floats) -> Bools:
     """Return which readings are over 10 K from the median of five readings about them, (n,)."""
     # A thermometer with a loose contact reads -127 or 85 degC for a moment. Thermometer noise is
-    # estimated without such spikes, so that the tracker rejects them as outliers.
+    # estimated without readings of a loose contact, which the tracker then rejects as outliers.
     far = np.zeros(len(value), dtype=bool)
     if len(value) > 4:
         middle = np.median(sliding_window_view(value, 5), axis=1)
@@ -426,7 +426,7 @@ def rounding_sd(variance: Floats, drift: Floats, quantum: Floats) -> Floats:
 
     `variance`: median variance of the rounded samples in a cell; above 0, the noise of the
     samples averages the rounding error to 0.
-    `drift`: range of the means; a drift over n steps averages the rounding errors of n + 1 steps.
+    `drift`: range of the means; over n steps of the converter, n + 1 rounding errors average.
     """
     steps = np.divide(drift, quantum, where=quantum > 0.0, out=np.zeros(3))
     return np.asarray(np.where(variance > 0.0, 0.0, quantum / 12.0**0.5 / (1.0 + steps)))

@@ -111,7 +111,7 @@ class Point:
         of_data = float((each + self.regression.noise_determinant).sum())
         of_prior = float(self.precision @ self.deviation**2)
         if self.prior.informative is not None:
-            # `precision` is 0 for unknowns with an informative prior, so add their term.
+            # `precision` is 0 for unknowns with an informative prior: add the term of this prior.
             root = self.prior.informative.root
             of_prior += float(np.sum((root @ self.deviation[: self.layout.n_unit]) ** 2))
         if self._common_variance:
@@ -180,7 +180,7 @@ class Point:
         return step - self.solution[0][: self.layout.n_unit]
 
     def unit_step(self, matrix: Floats) -> tuple[Floats, Floats]:
-        """Return the unit unknowns' step and Hessian's Cholesky factor; see `Reduced.matrix`."""
+        """Return the step of the unit's unknowns, and the Cholesky factor of their Hessian."""
         n = self.layout.n_unit
         information, gradient, deviation = matrix[:n, :n], matrix[:n, n], self.deviation[:n]
         if not np.isfinite(information).all():
@@ -230,8 +230,8 @@ class Point:
         """
         Take Gauss-Newton's step.
 
-        If the step increases the energy, fractions of the step of the nonlinear unknowns (factors
-        of other unknowns) are tried, and the linear unknowns are solved again for each fraction.
+        If the step increases the energy, fractions of the step are tried for the nonlinear
+        unknowns, which multiply others; for each fraction the linear unknowns are solved again.
         """
         # Compute the energy and the step here before the energy after the step, because the
         # regression keeps only the last linearisation.
@@ -251,7 +251,7 @@ class Point:
         return result
 
     def posterior(self, end: Point) -> PosteriorMode:
-        """Return the posterior at the mode `end`, with the covariance of the point `self`."""
+        """Return the posterior at the mode `end`, with the covariance computed at this point."""
         layout, prior, precision, reduced = self.layout, self.prior, self.precision, self.reduced
         _, factor = self.solution
         n, unit_root = layout.n_unit, inverse_root(factor)

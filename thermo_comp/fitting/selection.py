@@ -155,8 +155,8 @@ class Growth:
             kelvins, state = regression.windows.kelvins, posterior.state
             square = float(np.mean(regression.residual(state, posterior.layout) ** 2))
             if state.pose.size:
-                # Attitudes and offsets of rests in a pose absorb errors of the model: add the mean
-                # squares of both to that of the residual.
+                # Attitudes and offsets of rests in a pose absorb errors of the model: add their
+                # mean squares to the mean square of the residual.
                 by_attitude = regression.gravity * state.from_pose
                 square += float(np.mean(state.offset**2) + np.mean(by_attitude**2))
             # The typical weight of a new column explains the RMS residual.
@@ -189,7 +189,7 @@ class Growth:
         return [smooth, *self.trials(smooth, [BEND])]
 
     def lowest_degree(self, constants: Trial) -> Trial:
-        """Fit the curve's first column, and further ones if the log density clearly rises."""
+        """Fit curves of all degrees; take a higher degree if the log density clearly rises."""
         prior, state = constants.posterior.prior, constants.posterior.state
         prior = replace(prior, offset_sd=prior.offset_scale or prior.offset_sd)
         number = np.cumsum(self._names == CURVE)
@@ -205,7 +205,7 @@ class Growth:
         return chosen
 
     def trials(self, chosen: Trial, groups: Sequence[str]) -> list[Trial]:
-        """Fit the chosen model plus one set of groups, for up to 4 sets of large gains."""
+        """Fit the chosen model plus one set of groups, for up to 4 sets with large gains."""
         absent = [group for group in groups if group in self.free and group not in chosen.groups]
         if not absent:
             return []
@@ -213,12 +213,12 @@ class Growth:
         columns = np.isin(self._names, absent) & typical.any(axis=0)
         inactive = self.regression.inactive(chosen.posterior, columns)
         if BEND in absent:
-            # Forward selection of up to 60 bend columns: a bump in an axis' bias needs 20 columns.
+            # Select up to 60 bends (changes of slope): a bump in an axis' bias needs 20 bends.
             is_bend = self._names == BEND
             knees = inactive.chosen(typical, is_bend, CLEAR_GAIN, 60)
             typical = np.where(is_bend & ~knees, 0.0, typical)
-        # Groups in which one effect has columns are tried together: the square of the temperature
-        # of a part with the lag m is (t - m)^2 = t^2 - 2 t m + m^2, with products and squares.
+        # Try groups together that describe one effect: the squared temperature of a part of lag m,
+        # (t - m)^2 = t^2 - 2 t m + m^2, needs the product t m and the square m^2.
         together = PRODUCTS, (*LAGS, 'product', 'gradient_x_temperature', 'square')
         sets = [tuple(group for group in groups if group in absent) for groups in together]
         sets = [*((group,) for group in absent), *(groups for groups in sets if len(groups) > 1)]
@@ -237,9 +237,9 @@ class Growth:
 def better_start(fits: Sequence[Trial]) -> Trial:
     """
     Choose by left-out data between fits begun with a small and with a large prior sd of mounting
-    offsets. If left-out data do not decide, the fit begun with the large sd is chosen only if its
-    log density is larger by `CLEAR_GAIN`. Mounting offsets and misalignments explain |f|
-    in few positions equally well, but only misalignments predict |f| in a new position.
+    offsets. If left-out data do not decide, the fit begun with the large prior sd is chosen only
+    if its log density is larger by `CLEAR_GAIN`. Mounting offsets and misalignments explain |f| in
+    few positions equally well, but only misalignments predict |f| in a new position.
     """
     small, large = fits[0], fits[-1]
     evidence_gain = log_density(large.posterior) - log_density(small.posterior)
@@ -267,7 +267,7 @@ def select(
     constants = first = better_start(fits)
     growth.tried.append(constants)
     if CURVE in growth.free:
-        # The curve is added without a test: it may improve the score only with further groups.
+        # Add the curve without a test: a curve may improve the score only with further groups.
         if regression.windows.has_drifts:
             curve = better_start([growth.extended(fit, (CURVE,)) for fit in fits])
             downweigh(regression, curve.posterior)
@@ -298,7 +298,7 @@ def select(
 def _grown(
     growth: Growth, first: Trial, parts: Trial | None, progress: Callable[[float], None]
 ) -> Trial:
-    """Add groups to `first` or, if better, to `parts`; return the best model."""
+    """Add groups to `first`, or to `parts` if this model is better; return the best model."""
     chosen = first
     if parts is not None:
         trials = [parts, *growth.trials(parts, [BEND])]
@@ -313,8 +313,8 @@ def _grown(
     chosen = growth.added(chosen, progress)
     may_bend = BEND in growth.free and {*PRODUCTS} & {*chosen.groups}
     if may_bend and BEND not in chosen.groups and not chosen.is_complete:
-        # A bend of the curve of a part is found only in a model with the lag of this part, not in
-        # a model whose products and squares approximate the lag. Further groups are added to the
+        # A bend of the curve over a part's temperature is found only in a model with the part's
+        # lag, not in one that approximates the lag by products and squares. Add groups to the
         # model with bends if its left-out error is below three times that of the chosen model.
         _, *with_bends = growth.with_bends(first, LAGS)
         if with_bends and with_bends[0].score.rms < 3.0 * chosen.score.rms:

@@ -4,8 +4,8 @@
 Owns the estimation of thermometer and detector settings from bags.
 
 Rates of temperature are central differences over two minutes, which are not causal and so need a
-recording. The lag and the ramps of the test that the rates show, and the noise of the
-readings, become settings of the thermometers and of the regime detector, which are causal.
+recording. The rates show the lag and the ramps of the test. Lag, ramps and noise of the readings
+become settings of the thermal tracker and of the regime detector, which are causal.
 """
 
 from __future__ import annotations
@@ -114,8 +114,8 @@ def _noise_of(recorded: Sequence[Readings], quantum: float) -> float:
     second = np.concatenate([np.diff(readings.value, 2) for readings in recorded])
     if not quantum:
         return 1.4826 * float(np.median(np.abs(second))) / float(np.sqrt(6.0))
-    # Most rounded readings are equal to their neighbours, so the median difference is 0. The mean
-    # square without the largest 1 % is used instead, less the variance of rounding.
+    # Most rounded readings equal their neighbours, so the median difference is 0: use the mean
+    # square of differences, without the largest 1 %, less the variance of rounding.
     square = np.sort(second**2)[: int(0.99 * len(second))]
     noise = float(np.sqrt(max(float(square.mean()) / 6.0 - quantum**2 / 12.0, 0.0)))
     limit = 0.1 * quantum
@@ -136,7 +136,7 @@ def _flicker(recorded: Sequence[Readings]) -> float:
         first = np.flatnonzero(np.diff(edges, prepend=np.nan))
         count = np.diff(np.append(first, len(edges)))
         edge, at_s = edges[first], time[changed[first]]
-        # Leave out edges where the temperature turns back, because it passes such an edge twice.
+        # Leave out an edge where the temperature turns back, because it passes this edge twice.
         step, apart_s = edge[2:] - edge[:-2], at_s[2:] - at_s[:-2]
         passes = np.abs(step) > 1e-9
         moves += float(np.sum(count[1:-1][passes] ** 2 - 1)) * float(np.median(np.diff(time))) ** 2

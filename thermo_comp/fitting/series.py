@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the base series of the windows (1, columns, their derivatives, readings), the filter that
+Owns the base series of the windows (a constant, columns, derivatives, readings), the filter that
 whitens these series for slow noise, and the sums of products of whitened series.
 
 All terms of the measurement equation (`equations`) are linear combinations of the base series, so
@@ -13,8 +13,8 @@ stationary Gauss-Markov process of variance ``ratio sigma^2`` and correlation ti
 Annex B.4.3); a random walk is the limit for a long T. Flicker noise, the bias instability of a
 sensor, is the sum of Gauss-Markov processes of equal variance, with the correlation times T, 10 T,
 100 T and so on [2]_. The innovations of a Kalman filter for white plus Gauss-Markov noise, divided
-by their standard deviations, are white and have all information of the series. If means and
-columns are filtered in this way, ordinary least squares is the optimal estimator [1]_.
+by their standard deviations, are white and have all information of the series. For means and
+columns replaced by innovations, ordinary least squares is the optimal estimator [1]_.
 
 References
 ----------
@@ -151,7 +151,7 @@ class Whitener:
 
 
 def _vertex(values: Floats, at: int) -> float:
-    """Return the vertex, relative to `at`, of the parabola through three values; 0 at an end."""
+    """Return the distance from `at` to the minimum of a parabola through three values, or 0."""
     if not 0 < at < len(values) - 1:
         return 0.0
     before, here, after = values[at - 1 : at + 2].tolist()
@@ -315,8 +315,8 @@ class Series:
 
     def at_starts(self, rows: Floats, state: State, base: Base) -> Floats:
         """
-        Convert linear functions of the base series, (n_positions, k, n_base): the columns, which
-        have initial lag states at the prior mean, get the initial lag states of `state`.
+        Convert linear functions of the base series, (n_positions, k, n_base), from columns with
+        initial lag states at the prior mean to columns with the initial lag states of `state`.
         """
         if not len(base.lagged):
             return rows  # not a copy, whose memory layout would change the last bits of products
@@ -326,6 +326,6 @@ class Series:
         return result
 
     def products_at(self, products: Floats, state: State, base: Base) -> Floats:
-        """Convert sums of products as `at_starts` does, shape (n_positions, n_base, n_base)."""
+        """Convert sums of products, (n_positions, n_base, n_base), to initial lags of `state`."""
         half = self.at_starts(products, state, base)
         return self.at_starts(np.swapaxes(half, 1, 2), state, base)
