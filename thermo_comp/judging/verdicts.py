@@ -23,7 +23,7 @@ LARGEST_RATIO = 2.0
 WIDE_PART = 0.5
 # Smallest number of windows of a regime that is judged separately.
 _FEWEST_WINDOWS = 6
-# Largest ratio of successive known |f|, in ascending order, whose windows share a section.
+# Windows share a section if their sorted known |f| increase by at most this ratio in each step.
 _LEVEL_RATIO = 1.02
 
 SECTIONS = ('static', 'dynamic', 'all', 'outside')
@@ -152,8 +152,8 @@ def judge_rates(windows: JudgedWindows, calibration: Calibration) -> RateJudgeme
     if not windows.gyro.size:
         return None
     raw, corrected, variance = (windows.gyro[:, k : k + 3] for k in (0, 3, 6))
-    # The rate of a window is compared with the mean over the rest's windows that are inside the
-    # calibrated ranges, or over all windows of the rest if none is inside.
+    # The rate of a window is compared with the mean rate in the same rest: over the windows inside
+    # the calibrated ranges or, if none is inside, over all windows.
     _, place = np.unique(windows.position, return_inverse=True)
     has_inside = np.bincount(place, windows.is_inside) > 0.0
     weight = np.where(has_inside[place], windows.is_inside, 1.0)
@@ -176,7 +176,7 @@ def judge_rates(windows: JudgedWindows, calibration: Calibration) -> RateJudgeme
         white = np.square(triad.noise_density_m_s2_sqrt_hz) / windows.window_s
         noise = white * (1.0 - 1.0 / np.maximum(counts, 1.0))[:, None]
         hours = counts[:, None] * windows.window_s / 3600.0
-        # The variance of a random walk about its mean is 1/6 of the variance gained in the time.
+        # The variance of a random walk about its mean is 1/6 of the variance at its end.
         walk = np.square(triad.slow_noise_m_s2_sqrt_h) * hours / 6.0
         claimed = np.sqrt(of_thermometers + change + noise + walk)
     changes = np.stack((raw - mean_of(raw), corrected - mean_of(corrected), claimed))

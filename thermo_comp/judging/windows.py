@@ -49,8 +49,8 @@ class JudgedWindows:
     entirely inside the calibrated ranges; `is_swapped`: the board temperature leads that of the
     case. `raw` is the specific force with the constants at the reference temperature, `force` with
     the calibration, shapes (n, 3). `size`: the known |f|, which is gravity unless the bag states
-    another value. `claimed_sd` of the norm of `force`: error of the calibration, error of `size`,
-    and white noise of the mean; `noise_sd`: the white noise alone. Rows of `gyro`: angular rate
+    another value. `claimed_sd`: sd of ``|force| - size`` due to the calibration, `size` and white
+    noise of the mean; `noise_sd`: sd due to the white noise alone. Rows of `gyro`: angular rate
     raw and corrected, its claimed variances, the thermal state; empty without a gyroscope.
     """
 
@@ -179,8 +179,8 @@ def columns_of(windows: JudgedWindows, bags: Sequence[str]) -> dict[str, npt.NDA
 
 # A structured array of partial sums of samples, or of windows.
 _Table: TypeAlias = npt.NDArray[Any]
-# Integer fields of a window: `count` is summed over its partial sums, the others: of its first.
-# Then fields that are averages over the partial sums; only `excess` is a maximum.
+# Integer fields of a window: `count` is the total of its partial sums, the others are those of its
+# first partial sum. The fields of `_AVERAGED` and `_TRIPLES` are averages over the partial sums.
 _ONCE = ('bag', 'position', 'start_ns', 'count')
 _AVERAGED = ('time', 'board', 'rate', 'weight', 'variance', 'swapped', 'size', 'size_sd')
 _TRIPLES = ('mean', 'force')
@@ -246,7 +246,7 @@ def _table(
 
 
 def _joined(sums: _Table) -> _Table:
-    """Join the partial sums of each row to a window; drop windows with uncorrected sums."""
+    """Combine each row of partial sums into a window; drop windows with an unusable sum."""
     result = sums[:, 0].copy()
     result['count'] = sums['count'].sum(axis=1)
     result['excess'] = sums['excess'].max(axis=1)

@@ -127,13 +127,13 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
         Contribution('gravity', 'B', gravity, info.gravity.source or in_fit),
         Contribution('attitude', 'A', attitude, 'uncertainty of the misalignment of the axes'),
         Contribution('thermometers', 'B', drift, slope),
-        Contribution('model', 'A', model, 'posterior at the judged windows, without misalignment'),
+        Contribution('model', 'A', model, 'claimed error of the calibration without misalignment'),
         Contribution('repeatability', 'A', excess, beyond),
     )
 
 
 def unclaimed_gravity_sd(evidence: Evidence, info: CertificateInfo) -> float | None:
-    """Return the uncertainty of gravity that the covariance lacks [m/s^2]; None if not stated."""
+    """Return gravity's uncertainty beyond that in the covariance [m/s^2]; None if not stated."""
     stated = info.gravity.standard_uncertainty_m_s2
     if stated is None:
         return 0.0 if evidence.gravity_sd else None
@@ -206,7 +206,7 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
         value, sd = evaluate(calibration, program, at)[2:]
         off = value - np.outer(at - calibration.reference_temperature_c, slope)
         value[:, :3] += bias_0 / MICRO_G
-        # If U is withheld, its part without gravity sets the digits of value and deviation; if the
+        # U without gravity's part sets the digits of value and deviation if U is unknown; if the
         # calibration states no uncertainty, the largest values are printed with 4 digits.
         largest = np.maximum(np.abs(value).max(axis=0), 1e-3)
         four_digits = 10.0 ** (np.floor(np.log10(largest)) - 2.0)
@@ -248,9 +248,9 @@ def conformity(evidence: Evidence) -> tuple[str, str]:
     return (
         f'The unit {does} to the limit of {limit} µg.',
         'Rule: simple acceptance. Within the calibrated ranges the RMS of |f| − g of each regime '
-        'and, if known, on positions left out of the fit is at most the limit, and the overall '
-        'RMS of |f| − g is below that without correction, if the correction depends on '
-        'temperature; the uncertainty is not subtracted from the limit (guard band 0).',
+        'and, if known, on positions left out of the fit is at most the limit. If the correction '
+        'depends on temperature, the overall RMS of |f| − g is below that without correction. '
+        'The uncertainty is not subtracted from the limit (guard band 0).',
     )
 
 

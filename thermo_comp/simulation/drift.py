@@ -69,8 +69,8 @@ class Effect(ABC):
 @dataclass(frozen=True)
 class PartEffect(Effect):
     """
-    Tempco of a part, or stress or thermo-EMF between two parts. The first signal is the deviation
-    of `part` less that of `cold`, if any [K], the second signal the difference of the squares.
+    Tempco of a part, or stress or thermo-EMF between two parts. With d the deviation of a part
+    from the reference state [K], the signals are d and d^2 of `part`, less those of `cold` if any.
     """
 
     part: str
@@ -116,7 +116,7 @@ class FlowEffect(Effect):
 
 @dataclass(frozen=True)
 class CreepEffect(Effect):
-    """Creep in a part: the signal is its temperature less a lag of `time_constant` [s] of it."""
+    """Creep in a part: its temperature less that temperature lagged by `time_constant` [s]."""
 
     part: str
     time_constant: float

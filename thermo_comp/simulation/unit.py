@@ -30,9 +30,9 @@ _ROWS = 1 << 20
 
 class Stream(IntEnum):
     """
-    Sources of random numbers. Each source has a separate stream, so that a source does not change
-    the numbers of another source. The values of the sources must never change or be reused,
-    because they determine the random numbers of a seed.
+    Sources of random numbers, such as a noise. Each source has a separate stream, so that numbers
+    drawn from one source do not change those of another. The values of the sources must never
+    change or be reused, because they determine the random numbers of a seed.
     """
 
     ACCEL_NOISE = 0

@@ -46,7 +46,7 @@ class Quantity:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """The thermometers of the quantity; of a gradient, the sensor without the board."""
+        """Names of the input thermometers; a gradient names its sensor, not the board."""
         return (self.input,)
 
     @property
@@ -69,8 +69,8 @@ class Lag(_Lag, Quantity):
     The board temperature less that of a part which lags the board, or the lagged gradient of a
     sensor (`input`) [K]. `tau_s` and `second_tau_s` are the time constants of two stages [s]; the
     second is shorter, or 0 for a lag of one stage. A part may lag a temperature between board and
-    sensor: that of the board plus `sensor_share` of the gradient of `sensor`. `lead_s`: time by
-    which the temperature that the part lags leads the board thermometer [s].
+    sensor: that of the board plus `sensor_share` of the gradient of `sensor`. `lead_s`: lag of the
+    board thermometer behind the temperature that drives the part [s].
     """
 
     @property
@@ -129,8 +129,8 @@ class _Play(NamedTuple):
 class Play(_Play, Quantity):
     """
     Output of a play of half-width `width_k` less its input [K]. The input is the lagged board
-    temperature, or the board temperature if `tau_s` is 0. The difference has no variance, because
-    an error of the input shifts input and output equally.
+    temperature, or the board temperature if `tau_s` is 0. Output less input has no variance,
+    because an error of the input shifts input and output equally.
     """
 
     input = BOARD_INPUT
@@ -151,7 +151,7 @@ class MemorySpec:
     """
     Contents of the thermal state of a tracker. `sensors`: names of the thermometers other than the
     board's; the regime detector uses the first as the leading sensor.
-    `lags`: sorted by input as in `inputs`. `rates`: sensors whose rate of change is in the state.
+    `lags`: in the order of `inputs`. `rates`: sensors whose rate of change is in the state.
     """
 
     sensors: tuple[str, ...] = ('case',)
@@ -188,7 +188,7 @@ def start_root(lags: Sequence[tuple[Any, ...]]) -> Floats:
     The factor exists even if the covariance is singular, as with two nearly equal lags. The
     input before the first reading is modelled as a random walk with ``D = 2 sd^2 / START_TAU_S``
     [K^2/s], so that ``P_kl = D tau_k tau_l / (tau_k + tau_l)`` for two lags of one input, and 0
-    for lags of different inputs. Then P_kl decays as ``exp(-dt / tau_k) exp(-dt / tau_l)``.
+    for lags of different inputs. Afterwards P_kl decays as ``exp(-dt / tau_k - dt / tau_l)``.
     """
     all_lags = [Lag(*lag) for lag in lags]
     terms = first_order_lags(all_lags)

@@ -42,7 +42,7 @@ class LagBank:
         self.stamp_ns: int | None = None
         self.start_ns: int | None = None
         self.input = 0.0
-        #: Input less each lag [K]; its variance in addition to that of the initial state [K^2].
+        #: Input less each lag [K], and its variance without that due to the initial state [K^2].
         self.lagging = self.extra = [0.0] * len(self.taus)
 
     def step(self, stamp_ns: int, value: float, sd: float = 0.0) -> None:
@@ -77,11 +77,11 @@ class LagBank:
         self.extra = result
 
     def note_jump(self, change: float) -> None:
-        """Add to the variances the effect of a change of the input that was a sensor's error."""
+        """Add the square of a wrong step of the input [K] to the variance of each lag."""
         self.extra = [variance + change * change for variance in self.extra]
 
     def at(self, stamp_ns: int, value: float) -> tuple[list[float], list[float]]:
-        """Return ``u - L`` [K], u = `value`, and its variance without that of the first state."""
+        """Return ``u - L`` [K], u = `value`; its variance without that of the initial state."""
         seen_ns = self.stamp_ns
         if seen_ns is None or stamp_ns <= seen_ns or not self.taus:
             return self.lagging, self.extra
@@ -95,7 +95,7 @@ class LagBank:
 
 @lru_cache(maxsize=1024)
 def _coefficients(taus: tuple[float, ...], dt_ns: int) -> tuple[list[float], list[float]]:
-    """Return for each lag the factors of its state and of the input's change in a step [ns]."""
+    """Return ``e`` and ``(1 - e) tau / dt`` of each lag, ``e = exp(-dt / tau)``, dt in ns."""
     dt = dt_ns * 1e-9
     lost = [-math.expm1(-dt / tau) for tau in taus]
     return [1.0 - part for part in lost], [
@@ -172,7 +172,7 @@ class ThermalMemory:
         ]
 
     def note_jump(self, change: float) -> None:
-        """Add to all variances the effect of a change of the board reading that was an error."""
+        """Add the square of a wrong step of a board reading [K] to the variance of each lag."""
         for bank in self.banks.values():
             bank.note_jump(change)
 
@@ -184,9 +184,9 @@ class ThermalMemory:
         still: Sequence[tuple[float, float]] = (),
     ) -> list[float]:
         """
-        Return each lag [K] and its variance without that of its initial state [K^2], then each
-        play less its input [K]; `still`: for each input the possible error of constant readings
-        [K], and the time since their last change [s], or empty without constant readings.
+        Return each lag [K] and its variance without that due to the initial state [K^2], then
+        each play less its input [K]. `still`: for each input the possible error of constant
+        readings [K], and their duration [s]; empty if no input has constant readings.
         """
         behind, extra = self._first_order(stamp_ns, board, gradients)
         if still:
@@ -243,7 +243,7 @@ def memory_on_grid(
     """
     Compute `ThermalMemory.at` for series on a uniform grid, equal except for rounding.
 
-    Returns (n, 2 * n_lags + n_plays): (lag [K], 0) per lag, then each play less its input [K].
+    Returns (n, 2 * n_lags + n_plays): each lag [K] and a 0, then each play less its input [K].
     """
     inputs = dict(zip(spec.inputs, (board, *gradients), strict=True))
     first_order: dict[tuple[str, float], Floats] = {}

@@ -25,8 +25,8 @@ LARGEST_RATE: Final = 0.2
 #: may be wrong.
 SETTLED_READINGS: Final = 5
 
-#: A sensor's first reading is wrong if its step to the second is impossible, and the change from
-#: second to third is below this share of the step, and of the change expected at the step's rate.
+#: A sensor's first reading is wrong if the change to the second is impossible, and the change from
+#: the second to the third, in K and in K/s, is below this share of the first change.
 CONTINUED_SHARE: Final = 0.25
 
 #: Smallest number of equal readings, and shortest time [s], after which a sensor counts as
@@ -37,9 +37,8 @@ STILL_S: Final = 5.0
 STILL_PROBABILITY: Final = 1e-9
 #: Number of equal readings in a row from which, without cells, the temperature's variance grows.
 DOUBTFUL_READINGS: Final = 4
-#: Change of the other sensor's temperature, beyond noise and quanta [K], from which a sensor with
-#: constant readings counts as frozen: for a sensor whose readings vary with the noise, and for a
-#: sensor whose quantum exceeds the noise.
+#: A sensor with constant readings counts as frozen if the other sensor's temperature changes by
+#: more than this, beyond noise and quanta [K]; larger value: for a quantum that exceeds the noise.
 OTHER_MOVED: Final = 0.3
 OTHER_MOVED_BEYOND_CELL: Final = 0.7
 #: Largest assumed error of a sensor with constant readings [K].
@@ -50,8 +49,8 @@ LARGEST_ERROR: Final = 60.0
 LEAD_K: Final = 0.5
 LEAD_SHARE: Final = 0.15
 #: A sensor leads after `LEAD_READINGS` readings in a row at which the ratio of the slower to the
-#: faster rate exceeds `LEAD_RATE_SHARE`. If the ratio exceeds `DOUBTFUL_RATE_SHARE`, a lead of
-#: the board adds variance.
+#: faster rate exceeds `LEAD_RATE_SHARE`. From a ratio of `DOUBTFUL_RATE_SHARE` on, a lead of the
+#: board increases the variance of the board temperature.
 LEAD_READINGS: Final = 5
 LEAD_RATE_SHARE: Final = 0.3
 DOUBTFUL_RATE_SHARE: Final = 0.03
@@ -78,15 +77,15 @@ class Fault(Enum):
     #: A board temperature that differs from the case's by more than ramp and self-heating explain,
     #: as with a loose thermometer: its readings are used, with a larger variance.
     LOOSE = 'apart'
-    #: Readings equal to the board's, as if both inputs had one topic: they are used, and the
-    #: gradient that a lost sensor would have adds to the variance.
+    #: Readings equal to the board's, as if both inputs had one topic: they are used, but the
+    #: variance of the gradient includes the square of the gradient expected without the sensor.
     COPY = 'copy of the board'
 
 
 class SensorCheck:
     """
-    Judges a sensor's readings by its earlier readings and by the other sensor, which the board
-    lags by `lag_s` [s] (else 0). `is_revived`: after a fault the estimate must start again.
+    Judges readings of `sensor` by its earlier readings and by those of `other`; `lag_s`: lag of
+    the board behind `other` [s], 0 if `other` is the board; `is_revived`: restart the estimate.
     """
 
     def __init__(self, sensor: Thermometer, other: Thermometer, lag_s: float) -> None:
@@ -117,7 +116,7 @@ class SensorCheck:
         self._first: list[tuple[int, float]] | None = []
 
     def forget_other(self) -> None:
-        """Measure the other sensor's change from now on, as readings of a sensor were wrong."""
+        """Forget the other sensor's past change; measure its change from its next reading on."""
         self._other_then = nan
 
     def has_wrong_start(self, stamp_ns: int, celsius: float) -> bool:
@@ -151,7 +150,7 @@ class SensorCheck:
         change = celsius - sensor.reading
         is_doubtful = self._n_same >= self._n_doubtful and not self._has_cells
         if is_doubtful and abs(change) > self._largest_noise:
-            # The equal readings before this reading were wrong, and so is the estimate.
+            # A large change after equal readings: those readings and the estimate were wrong.
             self.note_jump(stamp_ns, change)
         self._n_same = 0
         self._other_then = nan
@@ -196,7 +195,7 @@ class SensorCheck:
                 # Expect the judged sensor to follow the other sensor with a first-order lag.
                 self._expected += dt / (dt + self.lag_s) * (moved - self._expected)
         else:
-            # The board may approach this sensor's temperature, but not pass it by itself.
+            # While this sensor is constant, the board may approach but not pass its temperature.
             ahead = self.sensor.temperature - self._other_then
             self._expected = moved - min(max(moved, min(ahead, 0.0)), max(ahead, 0.0))
         self._seen_ns = now_ns
@@ -233,7 +232,7 @@ class SensorCheck:
     def still(self, stamp_ns: int) -> tuple[float, float]:
         """
         Return the possible error of constant readings [K], and the time since their last change
-        [s]; zeros if the readings change or a cell explains why they do not.
+        [s]; zeros if the readings change, or stay equal only because of a wide quantum.
         """
         changed_ns = self.sensor.changed_ns
         is_explained = self._has_cells and self.fault is not Fault.FROZEN
@@ -255,7 +254,7 @@ def still_readings(settings: ThermometerSettings) -> int:
 class CopyCheck:
     """
     Finds out whether a sensor repeats the readings of the board, as when one topic is given for
-    both. The gradients of such a sensor would be 0 in each ramp.
+    both. The gradient of such a sensor would be 0 even in a ramp.
     """
 
     def __init__(self) -> None:
@@ -287,8 +286,8 @@ class LeadCheck:
     The temperature changes since the last constant temperature are compared while both sensors
     change in the same direction. Heat from outside changes the case temperature first. If the
     board leads, the topics of case and board are swapped or the heat comes from inside; either
-    way the gradient terms are wrong. `extra_variance` is the square of the difference by which the
-    board may lead in the present ramp [K^2].
+    way the gradient terms are wrong. `extra_variance` [K^2]: square of the temperature change of
+    board less case in a ramp in which the board may lead, else 0.
     """
 
     def __init__(self, case: Thermometer, board: Thermometer, calm_k_min: float) -> None:

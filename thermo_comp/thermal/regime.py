@@ -25,8 +25,8 @@ from .settings import OBVIOUS_SHARE, DetectorSettings, ThermometerSettings
 from .thermometer import Thermometer
 
 HOLD_LAGS: Final = 0.75  # shortest duration of the dynamic state / lag of the leading sensor
-# Margin for "the rate is below a limit", in sd of the rate. Half a sd suffices, because in a soak
-# most of the variance of the rate is an allowance for a ramp that may begin at any time.
+# Margin for "the rate is below a limit", in sd of the rate: half a sd, because in a soak most of
+# the variance of the rate is an allowance for a ramp that may begin at any time.
 SURE_SIGMAS: Final = 0.5
 OBVIOUS_SIGMAS: Final = 5.0  # margin for "the rate is above a limit", in sd of the rate
 FIRST_READINGS: Final = 20  # number of readings from which the noise estimate is reliable
@@ -119,7 +119,7 @@ class RegimeDetector:
         return self.regime
 
     def _turn(self, stamp_ns: int, direction: int) -> None:
-        """Use a direction after half a dwell time: coarse quanta may change the rate's sign."""
+        """Reverse the direction after half a dwell time: coarse quanta may flip a rate's sign."""
         if direction == self.direction or not direction:
             self._turning_ns = None
         elif self._turning_ns is None:
@@ -153,9 +153,9 @@ class _Watch:
         self._relaxed = settings.relaxed_rate_k_min / 60.0
         self._memory_s = 0.25 * sensor.lag_s
         self._stale_ns = round(0.5e9 * sensor.lag_s)
-        # An unchanged reading proves a low rate after the longer of two times: the time in which
-        # the relaxed rate crosses a cell, and the time for which the temperature stays in a cell
-        # while the smallest ramp reverses.
+        # An unchanged reading proves a low rate if it lasts longer than the relaxed rate takes to
+        # cross a cell (one quantum), and longer than the temperature stays in one cell while the
+        # smallest ramp reverses.
         quantum, bend = sensor.quantum_c, settings.smallest_ramp_k_min / 60.0 / sensor.lag_s
         still_s = max(quantum / self._relaxed, 2.0 * sqrt(2.0 * quantum / bend))
         self._still_ns = round(1e9 * still_s)

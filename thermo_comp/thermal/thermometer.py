@@ -175,8 +175,8 @@ class Thermometer:
                 reading_c, expected, variance, rate * dt, bent[6] * dt * dt
             )
 
-        # Update the filter of each mode, and the probability of the bending mode by both
-        # innovations.
+        # Update the filter of each mode, and the probability of the bending mode from the
+        # likelihoods of the innovations of both filters.
         if noise < inf:
             quiet, innovation, s = correct(quiet, measured, noise)
             bent, bent_innovation, bent_s = correct(bent, measured, noise)
@@ -225,8 +225,8 @@ class Thermometer:
         rate = self.rate
         unknown = 0.0
         if not -horizon <= ahead <= horizon:
-            # After the extrapolation horizon the temperature is held constant. Add the variance of
-            # a change at the present rate, or in a ramp that has begun after the last reading.
+            # After the extrapolation horizon the temperature is held constant. Its variance grows
+            # by the square of the change that the present rate, or an unseen ramp, would cause.
             dt = horizon if ahead > 0.0 else -horizon
             beyond = ahead - dt
             unseen = min(0.5 * self._bend * abs(beyond), self._rate_sd)
@@ -295,8 +295,8 @@ class Thermometer:
         box = half * half / 3.0
         if variance > box:
             return reading, variance * box / (variance - box)
-        # If the estimate is outside the cell, count the edge of the cell as one measurement in the
-        # time in which the predicted temperature changes by one sd of the estimate.
+        # If the estimate is outside the cell, all readings during a predicted change by one sd of
+        # the estimate weigh together as one measurement of the edge of the cell.
         if abs(expected - reading) > half:
             edge = reading + (half if expected > reading else -half)
             return edge, variance * max(1.0, sqrt(variance) / (abs(move) + 1e-30))

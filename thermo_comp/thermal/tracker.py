@@ -95,7 +95,7 @@ class ThermalTracker:
         self.checks[BOARD_INPUT].lag_s = board_lag_s
 
     def is_live(self, stamp_ns: int, sensor: Thermometer) -> bool:
-        """Whether the last reading of a sensor is at most the case time-out before a stamp."""
+        """Whether the age of a sensor's last reading at a stamp is at most the case time-out."""
         seen_ns = sensor.stamp_ns
         return seen_ns is not None and (stamp_ns - seen_ns) * 1e-9 <= self.config.case_timeout_s
 
@@ -159,7 +159,7 @@ class ThermalTracker:
         n_before = sensor.n_in_row
         is_anew = not check.admits(stamp_ns, celsius)
         if is_anew:
-            # A sensor starts again if all readings within the time-out were rejected as a step.
+            # Restart the estimate if all readings within the time-out were rejected as steps.
             age_s = 0.0 if before_ns is None else (stamp_ns - before_ns) * 1e-9
             config, is_board = self.config, sensor is self.board
             patience_s = config.temperature_timeout_s if is_board else config.case_timeout_s
@@ -177,7 +177,7 @@ class ThermalTracker:
         if before_ns is not None and (is_new or has_restarted):
             is_gap = has_restarted and (stamp_ns - before_ns) * 1e-9 > sensor.settings.lag_s
             if has_restarted and not is_gap and n_before < 2 * RESTART_READINGS:
-                # The few readings before the restart were wrong: begin at the present reading.
+                # The few readings before the restart were wrong: restart at the present reading.
                 self._begin_again(name, sensor)
                 sensor.update(stamp_ns, celsius)
                 return True
@@ -292,15 +292,15 @@ class ThermalTracker:
 
     def _lost_gradient(self, name: str, stamp_ns: int, rate: float) -> tuple[float, float]:
         """
-        Estimate a gradient while its sensor is lost: the gradient of self-heating, from the last
-        static reading, the fit, or else 0, plus the board's lag times the board's rate.
+        Estimate a gradient while its sensor is lost: lag times rate of the board, plus the
+        gradient due to self-heating in the last static regime, else that of the fit, else 0.
         """
         lag = self._board_lag_s
         lower, upper = self._rest_gradient_range
         is_known = name == self.spec.sensors[0] and upper < inf
         usual = 0.5 * (lower + upper) if is_known else 0.0
         gradient = self._rest_gradients.get(name, usual) + lag * rate
-        # Largest change of the case temperature after the board's extrapolation horizon [K].
+        # Largest change of the case temperature since the board is no longer extrapolated [K].
         unseen = self.settings.case.fastest_ramp_k_min / 60.0 * self.board.beyond(stamp_ns)
         variance = (
             (LOST_GRADIENT_RELATIVE_SD * gradient) ** 2

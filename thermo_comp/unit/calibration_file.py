@@ -35,7 +35,7 @@ _FORMER = {
     'even': 'gradient_even',
     'change': 'gradient_even_about_rest',
 }
-#: Former keys of sections of a calibration file of version 0.2.0, and the present keys.
+#: By section of a calibration file: name of a key in version 0.2.0, and its present name.
 _FORMER_KEYS = {'detector': ('closes', 'end_condition'), 'posterior': ('rest', 'diagonal')}
 
 

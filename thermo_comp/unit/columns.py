@@ -6,12 +6,12 @@ Owns the columns of the thermal response: the regressors of bias and scale.
 A column is ``phi = u t^power r``. The value u is computed by the column's kind (`unit.terms`), t
 is the board temperature less the reference, and r is 1, 1 - w or w, with w the weight of the
 dynamic regime. u is limited to the column's range, and t to the calibrated temperatures. Outside
-the calibrated temperatures the curves of the sets first continue along tangents, but t^power is
-constant, because no recording determines the weights of columns at these temperatures.
+the calibrated temperatures t^power is constant, although the curves of the sets first continue
+along tangents: no recording determines the weights of columns at these temperatures.
 
-The function `bank` makes the columns in groups of one kind or more. The fit makes group *part* of
-the kinds board, square and cube: with a curve over the board temperature, the sum of such columns
-is a curve over a part's temperature.
+The function `bank` makes the columns in groups of one kind or more. The fit makes the group *part*
+from the kinds board, square and cube: the sum of these columns and of a curve over the board
+temperature is a curve over the temperature of a part.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -33,7 +33,7 @@ from .terms import GROUPS, LINE, TERMS, Term
 UNBOUNDED: Final = (-1e9, 1e9)
 #: Time constants of the columns of `bank` [s], in steps of a factor sqrt(2), from a few reading
 #: intervals to the longest lag that bags determine. Columns linear in a lag have all 15 time
-#: constants: sums of columns approximate any time constant in between. Products and powers of lags
+#: constants: their sums approximate a lag of any time constant. Products and powers of lags
 #: have smaller effects than the lags, so every second time constant suffices for them.
 FINE_TAUS: Final = tuple(np.geomspace(60.0, 7680.0, 15).round(9).tolist())
 BANK_TAUS: Final = FINE_TAUS[::2]
@@ -43,7 +43,7 @@ EVEN_WIDTHS: Final = (0.375, 0.75, 1.5, 3.0, 6.0)
 PLAY_WIDTHS: Final = (0.4, 0.8, 1.6, 3.2, 6.4)
 PLAY_TAUS: Final[tuple[float, ...]] = (0.0, 450.0, 900.0, 1800.0)
 #: Kind bend: time constants [s]; least span of board temperatures per knee (change of slope) [K];
-#: most knees per lag, and most per lag given to `bank`, whose knees are three times as dense.
+#: most knees per lag; most knees per lag in the `parts` of `bank`, with a third of the least span.
 BEND_TAUS: Final = (0.0, *FINE_TAUS[4:11])
 LEAST_KNEE_K, MOST_KNEES, MOST_PART_KNEES = 1.0, 20, 60
 
@@ -75,7 +75,7 @@ class Part(NamedTuple):
 
     @property
     def of_gradient(self) -> 'Part':
-        """The part without `sensor_share` and `lead_s`, which a lag of a gradient cannot have."""
+        """The part's time constants alone: a lag of a gradient has no share and no lead."""
         return Part(self.tau_s, self.second_tau_s)
 
 
@@ -172,8 +172,8 @@ def bank(
     parts: Sequence[Part] | None = None,
 ) -> tuple[Column, ...]:
     """
-    Return the candidate columns of a response, with the widest ranges. `at_rest`: gradient of
-    each sensor in a soak [K]; `span_k`: lowest and highest board temperature in the data, less the
+    Return all candidate columns, with ranges that contain every value. `at_rest`: gradient of each
+    sensor in a soak [K]; `span_k`: lowest and highest board temperature in the data, less the
     reference [K]; `parts`: lags of the part of each axis; if given, all lags are from `parts`.
     """
     fine, coarse, of_plays, of_bends = (
@@ -301,7 +301,7 @@ class ColumnTable:
         return hold(raw, *self._range)
 
     def excess(self, raw: Floats) -> Floats:
-        """Return the excess of u over its range [half ranges]; of squares, cubes: of the root."""
+        """Return (1 + e)^(1 / order) - 1, with e the excess of u over its range [half ranges]."""
         lower, upper = self._range
         excess = np.asarray(np.abs(raw - self.held(raw)) / ((upper - lower) / 2.0))
         for order in {*self._orders.tolist()} - {1}:
@@ -325,8 +325,8 @@ class ColumnTable:
 
     def slopes(self, states: Floats) -> tuple[Floats, Floats | None]:
         """
-        Differentiate u, without limits of range: w.r.t. the quantity that u is computed from, and
-        w.r.t. the board temperature at constant lag (None if no column has a function of t - lag).
+        Return two derivatives of u, not limited to its range: w.r.t. the quantity that u is
+        computed from, and w.r.t. T_board at constant lag (None without functions of t - lag).
         """
         slopes, scaled = np.ones((len(self._places), states.shape[1])), self._scaled(states)
         for rows, term in self._terms:

@@ -28,8 +28,8 @@ from .functions import hold, in_order
 from .gravity import MICRO_G
 from .nonlinearity import ForceCorrection, beyond_force
 
-#: Rate of change of the force while static and dynamic set are blended [m/s^3], above which the
-#: transition time is lengthened: 1 ug per second; largest factor of this lengthening.
+#: Largest rate of change of the force in a transition between the sets [m/s^3]: 1 ug per second; a
+#: faster transition is lengthened, by a factor of at most `LONGEST_TRANSITION`.
 GENTLE_RATE = MICRO_G
 LONGEST_TRANSITION = 10.0
 #: Number of board temperatures at which slopes, and dynamic - static differences, are evaluated.
@@ -129,7 +129,7 @@ class Correction:
 
     def _blended(self, sets: Floats, weight: Floats, phi: Floats) -> Floats:
         result = self._weigh(phi, (1.0 - weight) * sets[0] + weight * sets[1])
-        # Equation 8 of the paper gives the scale factor at the board temperature.
+        # Scale factor = K times relative scale (equation 8 of the paper).
         result[3:] *= self.K
         return result
 
@@ -187,13 +187,13 @@ class Correction:
         noise_excess: npt.ArrayLike,
     ) -> Floats:
         """
-        Evaluate the correction of segments, linear in time between two states 1 s apart.
+        Evaluate the correction in segments of 1 s, linear in time between the states at the ends.
 
         `slow` is the slowly varying error covariance, shape (n_slow, n), see
         `SlowUncertainty.at`. Returns (52,) or (52, n): by axis bias and its change over the
         segment (1 s), scale and its change, then the coefficients of the covariance, including the
         noise of a sample, see `covariance.covariance_at`. A nonlinearity adds 15 rows to `slow`,
-        21 to the result: K2, Kq, K3 by axis, coefficients of x^3 to x^6 in the variance by axis.
+        and to the result K2, Kq, K3 by axis, then coefficients of x^3 to x^6 of each variance.
         """
         ends = np.array((start, end), dtype=np.float64)
         n = ends[0, 0].size
@@ -254,7 +254,7 @@ class Correction:
         static_weight, beyond_range = 1.0 - weight, raw - held
         excess, _, relative, by_rate = self.curves.excess(states)
         if not self._has_lags:
-            # With lags, those beyond their ranges count instead of the rate: see `columns_out`.
+            # With lags in columns their excess (`columns_out`) counts instead of the rate's.
             relative = relative + by_rate
         outside = static_weight * relative[0] + weight * relative[1]
         shares = np.array([static_weight + unknown * weight, weight + unknown * static_weight])
@@ -279,8 +279,8 @@ class Correction:
             columns_out = np.where(self._is_present, self.table.excess(raw), 0.0)
             columns_out = columns_out.max(axis=1, initial=0.0)
             # Outside the calibrated range the curves are extrapolated. Add two errors: the slope
-            # at the edge of the range times the board's distance from the edge, and the sd of the
-            # slopes within the range times the larger distance: the board's or that of a part.
+            # at the edge of the range times the board's distance from the edge; the sd of the
+            # slopes within the range times the largest distance of the board or of a part.
             v += self._spread(shares * excess * excess, slopes)
             bent = shares * np.maximum(excess * excess, parts_out * parts_out)
             bends = np.broadcast_to(self._bends, (4, *slopes.shape[1:]))
@@ -302,8 +302,8 @@ class Correction:
 
     def _spread(self, variances: Floats, moved: Floats) -> Floats:
         """
-        Propagate p independent errors with variances (p, n) to the coefficients a, b, c of each
-        axis' variance, (3, 3, n); `moved`: derivatives of bias and relative scale, (p, 6, n).
+        Return a, b, c of each axis' variance, (3, 3, n), due to p independent errors of variances
+        (p, n); `moved`, (p, 6, n): derivatives of bias and relative scale w.r.t. the errors.
         """
         variance, bias, scale = variances[:, np.newaxis], moved[:, :3] / self.K, moved[:, 3:]
         parts = np.empty((*bias.shape[:2], 3, bias.shape[2]))

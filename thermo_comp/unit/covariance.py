@@ -74,7 +74,7 @@ class CovarianceMap:
         self._factors = np.take_along_axis(factors, self._places, axis=1)[:, :, np.newaxis]
 
     def coefficients(self, rows: Floats) -> Floats:
-        """Return the coefficients of xx, xy, ..., zz, (40, n), for rows of shape (45, n)."""
+        """Return coefficients of xx, xy, ..., zz, (40, n), for the covariance of u, (45, n)."""
         return in_order(self._factors * rows[self._places], 1)
 
 
@@ -87,8 +87,8 @@ def grown(between: Floats, growth: Floats) -> Floats:
 
 def rows_between(errors: Floats, misalignment_variances: Floats) -> Floats:
     """
-    Return the rows `BETWEEN`, (36, n), of errors that are linear in p independent unit variances,
-    (9, p, n), with variances, (3,), added to those of the elements of the misalignment.
+    Return the rows `BETWEEN`, (36, n), of the covariance of u. `errors`, (9, p, n): u due to each
+    of p independent causes; `misalignment_variances`, (3,): added to those of the misalignment.
     """
     # Products and sums are explicit, because results of BLAS depend on the arrays' alignment.
     result = in_order(errors[_FIRST] * errors[_SECOND], 1)

@@ -19,10 +19,9 @@ class Curves:
     Bias and scale of both sets as functions of the board temperature; the static set is row 0 of a
     result.
 
-    Where the range of only one set ends, the difference of the two sets is held constant. Beyond
-    both ranges the curves continue along their tangent at the edge for `TANGENT_SPANS` times the
-    width of the range, and are constant from there on; the set with the narrower range on that
-    side follows the tangent of the other set.
+    Where only one set is within its range, the difference of the two sets is constant. Beyond both
+    ranges the set whose range extends farther continues along its tangents for `TANGENT_SPANS`
+    times the width of its range, and is constant from there on; the other set changes equally.
     """
 
     def __init__(self, calibration: Calibration) -> None:
@@ -51,7 +50,7 @@ class Curves:
         self._lacks = [np.array(points).reshape(-1, 4).T for points in lacks]
 
     def excess(self, states: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Return T_board [K] and rate [K/s] beyond their ranges, then in half ranges, (2, n)."""
+        """Return by set T_board [K] and rate [K/s] beyond the range, then both in half ranges."""
         t, rate = states[BOARD] - self._reference, states[RATE]
         over, too_fast = t - hold(t, *self._t_range), rate - hold(rate, *self._rate_range)
         span, rate_span = (edges[1] - edges[0] for edges in (self._t_range, self._rate_range))
@@ -77,7 +76,7 @@ class Curves:
         return np.array([[getattr(function, what)(at) for function in row] for row, at in pairs])
 
     def _beyond(self, t: Floats) -> tuple[Floats, Floats]:
-        """Return how far each set follows its lower and its upper tangent [K], (2, n)."""
+        """Return the distances of t along each set's lower and upper tangents [K], (2, n) each."""
         (lower, upper), (below, above) = self._ends, self._reaches
         return hold(t - lower, -below, 0.0), hold(t - upper, 0.0, above)
 

@@ -28,9 +28,9 @@ from .schema import broken
 #: One temperature difference [K], or an array of temperature differences.
 Kelvins: TypeAlias = float | Floats
 
-#: Length of the tangent that continues a curve beyond its range / width of the range. A parabola
-#: deviates from a tangent in proportion to the square of the distance from the point of contact:
-#: at the outer end of the tangent by 1/16 of the deviation at the far end of the range.
+#: Length of the tangent that continues a curve beyond its range / width of the range. At the outer
+#: end of this tangent a parabola deviates from the tangent by 1/16 of its deviation at the other
+#: end of the range.
 TANGENT_SPANS = 0.25
 #: Largest accepted error of a function's value at the reference temperature.
 NORMALISATION_TOLERANCE = 1e-9

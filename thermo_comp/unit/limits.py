@@ -25,7 +25,7 @@ from .schema import broken
 if TYPE_CHECKING:
     from .calibration import Calibration
 
-#: Limits of the relative scale, also with the largest change of the scale by all columns.
+#: Limits of the relative scale of the curves, plus or minus the largest effect of all columns.
 SMALLEST_RELATIVE_SCALE, LARGEST_RELATIVE_SCALE = 0.1, 10.0
 #: Largest bias / full scale; samples in an offset code have a bias of half of their range.
 FULL_SCALES = 2.0
@@ -110,7 +110,7 @@ def _check_bias(key: str, level: float, reached: tuple[float, float], most: floa
 
 
 def _check_scale(key: str, reached: tuple[float, float], gain: float) -> None:
-    """Refuse a relative scale that breaks its limits if columns add `gain` or -`gain`."""
+    """Refuse curves of the relative scale that, plus or minus `gain`, leave the limits."""
     for word, value, is_kept, limit in (
         ('above', reached[0] - gain, operator.gt, SMALLEST_RELATIVE_SCALE),
         ('below', reached[1] + gain, operator.lt, LARGEST_RELATIVE_SCALE),

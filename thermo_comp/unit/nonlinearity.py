@@ -195,7 +195,7 @@ class BeyondForce(NamedTuple):
 
 
 def beyond_force(calibration: Calibration) -> BeyondForce:
-    """Return the variance of an unknown square term beyond the fit's |f|, by default 1.01 g."""
+    """Return the variance of an unknown square term beyond the largest |f| of the fit."""
     known = calibration.nonlinearity
     edge = known.force_range_m_s2[1] if known else AT_REST * calibration.gravity_m_s2
     sd = (known.beyond_sd_g_g2 if known else K2_SD) / STANDARD_GRAVITY
@@ -244,10 +244,10 @@ class ForceCorrection:
         Return the contribution of the nonlinear terms to the coefficients of x^2 to x^6 in the
         error variance of an axis, (5, n), at temperatures less the reference, (n,).
 
-        `rows`, `rest`: covariance of the coefficients of k terms as a factor, (2 k, rank), and
-        variances added to its diagonal; `on_bias`, `on_scale`: factors for bias and relative
-        scale, (rank, n). The covariances of Kq with other parameters are omitted: most are
-        negative, so in most cases the result is too large.
+        `rows`, (2 k, rank), and `rest`: factor of the covariance of the coefficients of k terms,
+        and variances added to its diagonal; `on_bias`, `on_scale`, (rank, n): bias and relative
+        scale due to each column of the factor. The covariances of Kq with other parameters are
+        omitted: most are negative, so in most cases the result is too large.
         """
         k = len(self._of.terms)
         kinds = [list(POWERS).index(term.kind) for term in self._of.terms]

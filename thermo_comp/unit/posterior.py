@@ -113,9 +113,9 @@ def lay_out(
 
 class ParameterLayout(NamedTuple):
     """
-    The order of a calibration's parameters in its posterior: axis by axis the bias [input units],
-    then the scale [relative]; axis by axis from `nonlinear` on the nonlinear coefficients, then
-    the changes of these per kelvin; from `misalignment` on M[1][0], M[2][0], M[2][1].
+    The order of a calibration's parameters in its posterior. For each axis: bias [input units],
+    then scale [relative]. From `nonlinear` on, for each axis: the nonlinear coefficients, then
+    their changes per kelvin. From `misalignment` on: M[1][0], M[2][0], M[2][1].
     """
 
     bias: list[Block]

@@ -126,20 +126,20 @@ def _play(column: Column) -> Quantity:
 
 
 _ALL: Final = (
-    # Effect of the heat flow from a thermometer to the board; `rate`: without case thermometer.
+    # Effect of the heat flow from a thermometer to the board; no fit makes columns of kind `rate`.
     Term('gradient', 'g_s', _gradient),
     Term('rate', 'dT_board/dt [K/s]', lambda _: state.Rate()),
-    # Effect of a part that lags the board; `gradient_lag`: of a part between thermometers.
+    # `board`: a part that lags the board; `gradient_lag`: a part between board and thermometer.
     Term('board', 'T_board - lagged T_board', _part, positive=('tau_s',)),
     Term('gradient_lag', 'lagged g_s', _lagged_gradient, positive=('tau_s',)),
-    # Curve over the temperature of a part; without lag, effect of the square of a heat flow.
+    # With lag: curve over the temperature of a part; without lag: square of a heat flow.
     Term(
         *('square', '(T_board - lagged T_board)^2, or q_s^2 without lag', _part_or_gradient),
         *(_SQUARE, 2, 'rest_k'),
     ),
     # Cubic curve over the temperature of a part.
     Term('cube', '(T_board - lagged T_board)^3', _part, _CUBE, 3, 'rest_k', positive=('tau_s',)),
-    # Effect of a heat load, as of a heat pump; `gradient_even`: of a load that saturates.
+    # `size`: a heat load, as of a heat pump; `gradient_even`: a heat load that saturates.
     Term('size', 'abs(q_s)', _gradient, _SIZE, centre_key='rest_k'),
     Term(
         *('gradient_even', 'tanh((q_s / width)^2)', _gradient, _EVEN),
@@ -169,7 +169,7 @@ GROUPS: Final = {
     # `board`, `product` and `square`, for each axis.
     'part': 'curve of the part of each axis',
     'gradient_lag': 'parts between case and board',
-    # The columns of the next two groups give coefficients that change with temperature.
+    # `product` and `gradient_x_temperature`: the effect of a lag or gradient changes with t.
     'product': 'lags, with effects that change with temperature',
     'gradient_x_temperature': 'heat flow, with an effect that changes with temperature',
     'square': 'curves of parts that lag',
