@@ -167,7 +167,7 @@ def _rows(file: Iterable[str], delimiter: str) -> _Rows:
 def _begin(rows: _Rows, width: int, has_header: bool | None) -> tuple[list[str], _Rows]:
     """
     Skip the preamble; return the headings, if any, and the rows of a table. A row has `width`
-    cells, of which the last may be blank. Rows of this width directly before the first row of
+    cells, of which the last may be blank. Rows of `width` cells directly before the first row of
     numbers belong to the table, and the first of these rows has the headings.
     """
     first = list(islice(rows, _PREAMBLE_ROWS))
