@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the node `thermo_comp`, which turns samples and temperatures into force, flag and diagnostics.
+Owns the node `thermo_comp`: from samples and temperatures to force, regime flag and diagnostics.
 
 The output equals that of the offline replay of the same messages in the same order bit for bit.
 Parameters are checked when they are set, and applied between two wake-ups of the node's loop.

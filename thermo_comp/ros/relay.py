@@ -3,8 +3,8 @@
 """
 Owns the processing of samples in the node in order of arrival, whenever the loop wakes up.
 
-Messages do not identify their publisher. While several publishers may send on a topic, its
-messages are dropped; so is the first batch after a publisher left: the publisher may have sent it.
+Messages do not identify their publisher. While several publishers may send on a topic, the topic's
+messages are dropped. So is the first batch after a publisher has left, which may have sent it.
 """
 
 from bisect import bisect_left, bisect_right

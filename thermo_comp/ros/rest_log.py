@@ -209,9 +209,9 @@ class RestKeeper:
 
 
 def samples_of(messages: Sequence[bytes], *, is_imu: bool) -> tuple[Stamps, Floats]:
-    """Read stamps [ns] and samples of little-endian messages that have the last one's length."""
+    """Read stamps [ns] and samples of little-endian messages of the last message's length."""
     size = len(messages[-1]) if messages else 0
-    # Shorter messages than those with an empty frame_id are malformed.
+    # A message shorter than one with an empty frame_id is malformed.
     if size < _SHORTEST[is_imu]:
         return np.zeros(0, np.int64), np.zeros((0, 3))
     content = b''.join([message for message in messages if len(message) == size])

@@ -196,7 +196,7 @@ class WaitLoop:
         self.node.destroy_subscription(raw.subscription)
 
     def call_soon(self, callback: Callable[[], None]) -> None:
-        """Queue a call in the loop's thread, one per wake-up; callable from any thread."""
+        """Queue a function that the loop's thread then calls; callable from any thread."""
         self._soon.append(callback)
         with suppress(InvalidHandle):
             self._guard.trigger()
