@@ -226,7 +226,7 @@ class Compensator:
         if not is_new:
             return row
         if self.gravity.is_refuted and not is_too_fast:
-            # Dropped samples enter the check of |f|, too: output resumes if |f| agrees with gravity.
+            # The check of |f| uses dropped samples, too: output resumes if |f| is gravity again.
             self.is_refusing = True
             if row is not None:
                 counters.n_out -= 1

@@ -105,8 +105,8 @@ class Reporter:
                 rate = new['n_in'] / passed_s
         self._before, self._before_ns = counts, status.stamp_ns
         findings = [*self._findings(), *findings_of(loaded, status, new, rate, silence_s)]
-        # Vehicle accelerations give no warning: if the calibration has no nonlinearity, the warning
-        # begins at 2.01 g, where the unknown square term has an sd of 0.1 mg.
+        # Vehicle accelerations give no warning: without nonlinearity in the calibration, warnings
+        # begin at 2.01 g, where the unknown square term has an sd of 0.1 mg.
         least = 0.0 if loaded.calibration.nonlinearity else STANDARD_GRAVITY
         if (over := self._force_excess()) > least:
             text = f'|f| {over:.3g} m/s^2 above the largest |f| of the fit: the covariance grows'
