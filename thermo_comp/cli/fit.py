@@ -245,7 +245,7 @@ def _behind_s(parts: Sequence['Part']) -> list[float]:
 
 
 def _text_of(parts: Sequence['Part']) -> str:
-    """Describe the part on whose temperature each axis depends: its lag, and what it lags."""
+    """Describe the part on whose temperature an axis depends: its lag, and what it lags."""
     lags = ', '.join(f'{behind_s:.0f}' for behind_s in _behind_s(parts))
     text = f'lags the board by {lags} s (x, y, z)'
     if any(part.sensor_share for part in parts):

@@ -36,8 +36,8 @@ _STEPS_S = (5e-5, 0.5)
 #: `_BLOCK` samples, between still blocks (sd below `_QUIET` g): too fast a turn for times in ms.
 _SLOW_S, _BLOCK, _TURN, _QUIET = 2.0, 12, 0.5, 0.02
 _FASTEST_RAD_S = 20.0  # largest angular rate of a unit that is turned by hand [rad/s]
-#: Stamps of the years 2000 to 2038, and their largest interval [s]. A count of us since power-up
-#: may look like such a stamp in s, but it rises by more than this interval from row to row.
+#: Stamps of the years 2000 to 2038, and their largest interval [s]. A count of us since power-up,
+#: read as seconds, may be a date of these years, but it rises by over 60 s from row to row.
 _SINCE_1970_S, _SINCE_1970_STEP_S = (946_684_800.0, 2_147_483_648.0), 60.0
 #: Largest ratio of the range of temperatures in a log to the duration of the log [K/s]; a hair
 #: dryer warms a board by some 0.1 K/s.
@@ -311,7 +311,7 @@ def _span(values: Floats) -> float:
 def _stamp(
     named: Headings, times: Floats | None, rate_hz: float | None, accel: Floats, span: float
 ) -> Stamp:
-    """Guess the unit of times by heading, else by size and steps; `span` of temperatures [K]."""
+    """Guess the unit of times by heading or values; `span`: range of temperatures [K]."""
     if times is None:
         return Stamp(rate_hz=rate_hz)
     column = f'its column {named.time!r}'

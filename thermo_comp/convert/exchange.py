@@ -202,7 +202,7 @@ def import_calibration(
 ) -> Calibration:
     """
     Read the file of one of `TOOLS`, recognised by its content; both regimes get the same curves.
-    `number` chooses a parameter set or IMU, None the only set in use; `full_scale` is in m/s^2.
+    `number` chooses a parameter set or IMU (None: the only one in use); `full_scale` is in m/s^2.
     """
     readings = (tool.read(text, number) for tool in TOOLS.values())
     content = next((reading for reading in readings if reading is not None), None)

@@ -294,7 +294,7 @@ def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:
         return Stillness(float('nan'), float('nan'), 0.0, ())
     sd = np.sqrt(cells.variance[full].mean(axis=1))
     # The quiet level is the lower quartile of the cells' sd, as a unit may be handled for most of
-    # a log. The level is at least a quantum, as smaller noise is not visible.
+    # a log. The quiet level is at least a quantum, as smaller noise is not visible.
     is_quiet = sd <= _MOVING_RATIO * max(np.quantile(sd, 0.25), cells.quantum.max())
     cell_ns = round(cells.cell_s * 1e9)
     moving: list[tuple[int, int]] = []

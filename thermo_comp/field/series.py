@@ -184,8 +184,8 @@ def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
     Return the time at which a calibration was determined, the time up to which its covariance
     includes ageing [both in days since 1970], and whether it is an update.
 
-    An update was determined at its last rest, another calibration at the date of the test or file.
-    Both times are -inf without a date.
+    An update was determined at its last rest, another calibration at the date of the test or file;
+    without a date, the two times are -inf.
     """
     every = (source.name for source in calibration.provenance.sources)
     names = [name for name in every if name.startswith(_UNTIL)]
@@ -196,7 +196,7 @@ def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
         ahead = float(aged.removesuffix(' d') or 0.0)
     except ValueError:
         return -np.inf, -np.inf, False
-    # Ignore times of ageing that `update` cannot have written: below 0, or a century.
+    # Ignore times of ageing that `update` cannot have written: below 0, a century or more.
     if np.isnat(moment) or not 0.0 <= ahead < 36525.0:
         return -np.inf, -np.inf, False
     begin = int(moment.astype(np.int64)) / _DAY_NS
@@ -225,7 +225,7 @@ def series_of(
     averaged = partial(means_by, group)
     of_rests = beginnings[np.searchsorted(group, np.arange(len(sizes)))]
     _, first, start = np.unique(of_rests, return_index=True, return_inverse=True)
-    start = np.argsort(np.argsort(first))[start]  # starts numbered from 0 in the order of rests
+    start = np.argsort(np.argsort(first))[start]  # node starts, numbered in the order of rests
     states, mean, shares, local = map(averaged, (states, mean, shares, local))
     bias, scale = (part.T for part in correction.bias_scale(states.T))
     x = (mean - bias) / scale
@@ -283,7 +283,7 @@ def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
 
     The windows of a group belong to one start of the node. The unit vector of the force differs by
     less than 1e-3 in each component, and the temperature by less than 1 K, from the first window.
-    For vectors an angle apart, the norm of the mean decreases by at most half the squared angle.
+    The mean of unit vectors that are an angle a apart has a norm of at least 1 - a^2 / 2.
     """
     direction = force / np.sqrt((force**2).sum(axis=1, keepdims=True))
     group = np.zeros(len(start), dtype=np.int64)

@@ -4,8 +4,8 @@
 Owns the update of a calibration from rests in the field, and its score on left-out rests.
 
 A rest determines the error along gravity alone, so rests in few attitudes leave axes undetermined.
-An axis is updated only if the rests reduce the sd of a combination of its bias and scale to at
-most 0.6 times the sd before the update, with ageing. Other axes keep values, with a larger sd.
+An axis is updated only if the rests reduce the sd of a combination of its bias and scale to 0.6
+times the sd (with ageing) before the update or less. Other axes keep their values with larger sds.
 """
 
 from collections.abc import Sequence
@@ -242,7 +242,7 @@ def _axis_changes(
 
 
 def _judged(series: RestSeries, model: Model, solution: Solution, determined: Bools) -> Judged:
-    """Score an update by earlier rests on each day (on each node start if under 5 days)."""
+    """Score updates by earlier rests on each day (if under 5 days, on each node start)."""
     over, labels = 'days', series.day
     if len(np.unique(labels)) < 5:
         over, labels = 'starts', series.start

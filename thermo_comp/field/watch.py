@@ -142,9 +142,9 @@ def watch(series: RestSeries, calibration: Calibration, tolerance: float | None 
         ageing = updated.ageing
         forecast, interval = _forecasts(updated, tolerance)
     is_out, is_row_out = recent > 1.0, np.array([not row.is_within for row in days])
-    # The RMS of a week responds late to a change. One day above the limit is therefore sufficient
-    # for a unit outside its claim, and two days within the limit for a unit within its claim, if
-    # the error by the ageing model at the last rest is on the same side of the limit.
+    # The RMS of a week responds late to a change. A unit is therefore outside its claim after one
+    # day above the limit, and within its claim after two days within the limit, if the error by
+    # the ageing model at the last rest is on the same side of the limit.
     is_error_out = bool(forecast) and forecast[1] == 0.0
     is_out[-1] &= is_error_out or is_row_out[-2:].any()
     is_out[-1] |= is_error_out and is_row_out[-1]

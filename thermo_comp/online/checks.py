@@ -65,9 +65,9 @@ REFUTING_SIGMAS: Final = 5.0
 
 
 #: Run of equal readings of an axis: first sample with its stamp [ns]; number of repeats; largest
-#: change of both other axes since the first sample [input unit]. After the `STUCK_SAMPLES`th
-#: repeat, also: number of changes of the other axes by `NOISY_SDS` sd or more from sample to
-#: sample; smallest change, which is the converter's step [input unit].
+#: change of both other axes since the first sample [input unit]. Counted after the
+#: `STUCK_SAMPLES`th repeat: number of changes of the other axes by `NOISY_SDS` sd or more from
+#: sample to sample; smallest change, which is the converter's step [input unit].
 Run: TypeAlias = tuple[tuple[float, float, float, int], int, float, int, float]
 
 
@@ -135,7 +135,7 @@ class StuckCheck:
         return first, n + 1, moved, n_noisy, step
 
     def find(self, stamps: Ints, samples: Floats) -> Bools:
-        """Find the samples (n > 0, 3) that `Compensator` drops as stuck or as three zeros."""
+        """Return which samples, (n > 0, 3), `Compensator` drops as stuck or as three zeros."""
         n = len(stamps)
         columns = samples.T
         changes = np.empty((3, n), dtype=np.bool_)
@@ -177,7 +177,7 @@ class StuckCheck:
         self, run: Run, columns: Floats, here: slice, equal: Ints, axis: int
     ) -> tuple[Floats, Ints, Floats]:
         """
-        Return `moved`, `n_noisy`, `step` of a run after each of the samples `here` of `columns`;
+        Return `moved`, `n_noisy`, `step` of a `Run` after each of the samples `here` of `columns`;
         `equal`: number of repeats of the first reading of the run up to each sample.
         """
         first, _, moved, n_noisy, step = run
@@ -197,7 +197,7 @@ class StuckCheck:
 
 
 def _begun(sample: tuple[float, float, float, int]) -> tuple[Run, ...]:
-    """Return the runs of the three axes that begin with a sample."""
+    """Return the runs of equal readings of the three axes that begin with a sample."""
     return ((sample, 0, 0.0, 0, math.inf),) * 3
 
 
@@ -274,7 +274,7 @@ class GravityCheck:
     def add(
         self, stamp_ns: int, force: Sequence[float], covariance: Sequence[float], noise: float
     ) -> None:
-        """Take a force [m/s^2], its covariance (xx to zz), and the trace of its noise part."""
+        """Add a force [m/s^2], its covariance (xx to zz) and the trace of its noise covariance."""
         self._watch_step(stamp_ns, force, covariance, noise)
         since_ns, step_ns = stamp_ns - self._begin_ns, stamp_ns - self._last_ns
         if not (0 <= since_ns < LONGEST_WINDOW_NS and 0 <= step_ns < 3 * WINDOW_NS):

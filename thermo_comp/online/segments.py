@@ -6,7 +6,7 @@ Owns the segments: time intervals between temperature readings, with a correctio
 A segment ends at a temperature reading, or after one second. The correction is evaluated at both
 ends of a segment and interpolated, so a sample takes a few operations, the output has no steps
 between two readings, and a batch needs one evaluation per segment. The slowly varying variance due
-to parameters and initial lag states is evaluated every 10 s; after a start, in each segment.
+to parameters and initial lag states is evaluated every 10 s; soon after a start, in each segment.
 """
 
 from collections.abc import Sequence

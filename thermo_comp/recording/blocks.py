@@ -40,7 +40,7 @@ _MOST_JUMPS = 100
 _FEWEST_READINGS, _APART_S = 10, 10.0
 #: Shortest time between successive equal readings in the result of `Readings.thinned` [ns].
 _REPEAT_NS = 10_000_000_000
-#: Duration above which the mean interval between messages is limited, and its upper limit [ns].
+#: Longest mean interval between messages [ns] in a recording longer than `_SPARSE_NS` [ns].
 _SPARSE_NS, _SPARSEST_NS = 10 * 86400 * 10**9, 10 * 10**9
 
 
@@ -128,7 +128,7 @@ class Readings(NamedTuple):
     after: Ints = np.empty(0, np.int64)
 
     def take(self, which: Ints | Bools | slice) -> Readings:
-        """Select readings; the number of samples before each reading is dropped."""
+        """Select readings; the result has no `after`."""
         return Readings(self.stamp_ns[which], self.celsius[which])
 
     def thinned(self) -> Readings:

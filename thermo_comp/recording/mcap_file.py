@@ -196,7 +196,7 @@ class McapFile(BagFile):
                     raise DamagedError(f'the record at byte {at} is not complete')
                 words = _CUTS.get(opcode, _CUTS[-1]).format('{}', at=at)
                 if opcode == 0 and at == last.position + last.length:
-                    # Add the zeros to the span: `scan_records` then drops the message before them.
+                    # Add zero bytes to the span, so that `scan_records` drops the last message.
                     kind = last.kind if last.kind == 'loose' else 'torn'
                     spans[-1] = replace(last, length=last.length + PREFIX.size, kind=kind)
                 elif opcode == Opcode.CHUNK:

@@ -107,7 +107,7 @@ class CellAccumulator:
         self._last = np.zeros((0, 3))  # last sample of the previous block
         self._shift = np.zeros(3)
         # Row of a cell: its number, number of samples, sums of times, samples and their squares;
-        # change from the cell before; sum of squared changes. The last cell may get more samples.
+        # change from the cell before; sum of squared changes. The last cell may grow.
         self._sums: list[Floats] = [np.empty((0, 15))]
         self._n_dropped = self._n_saturated = self._n_glitches = self._n_repeated = 0
         self._n_looked_at = 0
@@ -200,8 +200,8 @@ class CellAccumulator:
         step, between = float(np.median(steps)), 0.0
         gaps = steps[steps > 10.0 * step]
         if gaps.sum() > 0.5 * steps.sum():
-            # A polled buffer gives bursts of samples at a constant interval below 5 s; a cell
-            # then has two bursts. Pauses between positions held by hand are irregular or longer.
+            # A polled buffer gives bursts of samples at a constant interval below 5 s; a cell then
+            # has two bursts. Pauses between positions held by hand are irregular or above 5 s.
             usual = float(np.median(gaps))
             is_regular = np.mean(np.abs(gaps - usual) < 0.2 * usual) > 0.9
             if is_regular and usual < 5e9:
@@ -248,7 +248,7 @@ def widened(full_scale: float, samples: Floats) -> float:
 
 
 def _part_of(window_s: float, least: float) -> float:
-    """Return a cell length [ns]: a whole number of cells fills 1 to 60 windows; else `least`."""
+    """Return a cell length [ns] such that whole cells fill 1 to 60 windows, or else `least`."""
     for stretch in STRETCHES:
         n_cells = int(stretch * window_s * 1e9 / least * (1.0 + 1e-6))
         if n_cells:
@@ -265,7 +265,7 @@ def _quantum_of(samples: Floats, few: list[Floats]) -> Floats:
     for axis in range(3):
         changes = np.abs(np.diff(samples[:, axis]))
         changes = np.sort(np.concatenate((few[axis], changes[changes > 0.0])))
-        # One or two changes may be turns of the unit: wait for further changes.
+        # One or two changes of samples may be turns of the unit: wait for further changes.
         few[axis] = changes[: 3 * (len(changes) < 3)]
         if len(changes) < 3:
             continue

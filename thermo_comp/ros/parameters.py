@@ -299,7 +299,7 @@ class ParameterRequests:
             raise
 
     def _repeats_fixed_value(self, change: Parameter) -> bool:
-        """Whether a change sets a fixed parameter to its present value, as a loaded dump does."""
+        """Whether a fixed parameter is set to its present value, as by `ros2 param load`."""
         node = self._loop.node
         return bool(
             node.has_parameter(change.name)

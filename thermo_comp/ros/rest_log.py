@@ -34,7 +34,7 @@ DAY_BYTES, FOLDER_BYTES = 320_000, 64_000_000
 _UNTHINNED_BYTES = 16_000
 #: Largest number of lines that wait for the disk.
 _WAITING = 1000
-#: Stamps before 2000-01-01 [ns] are times since the start of a driver, no dates: rests with such
+#: Stamps before 2000-01-01 [ns] are times since the start of a driver, not dates: rests with such
 #: stamps get the time of this computer.
 _EPOCH_NS = 946_684_800 * 10**9
 #: Smallest backward step of the stamps [ns] that begins a new recording.
@@ -153,7 +153,7 @@ class RestKeeper:
     def gather(
         self, messages: list[bytes], loaded: LoadedCalibration, compensator: Compensator
     ) -> None:
-        """Sum messages that the compensator has processed; queue the rests that end in them."""
+        """Sum messages that the compensator has processed; queue the rests that they complete."""
         # All messages are summed with the present calibration, although those that arrived before
         # a reload were corrected with the old calibration.
         self._use(loaded, compensator)
