@@ -5,7 +5,7 @@ Owns the export of calibrations to the files of other tools, and the import of s
 
 All tools correct a reading N to a specific force ``a = A (N - b)``. In autopilots the bias b
 depends on temperature and the matrix A is 1; in tools for tumble tests b and A are constant. The
-notes of an export name the parts of a calibration that the file lacks, most with the error.
+notes of an export name the parts of the calibration that are lost, most with the resulting error.
 """
 
 from dataclasses import replace
