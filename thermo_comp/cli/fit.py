@@ -245,7 +245,7 @@ def _behind_s(parts: Sequence['Part']) -> list[float]:
 
 
 def _text_of(parts: Sequence['Part']) -> str:
-    """Describe the lag of each axis' part of the unit, and the temperature that the part lags."""
+    """Describe the part on whose temperature an axis depends: its lag, and what it lags."""
     lags = ', '.join(f'{behind_s:.0f}' for behind_s in _behind_s(parts))
     text = f'lags the board by {lags} s (x, y, z)'
     if any(part.sensor_share for part in parts):
@@ -384,7 +384,7 @@ def _of_axes(values: Iterable[float], shown: Callable[[float], str | None]) -> s
 def _steps(
     rows: Iterable[Any], steps: Iterable[str], shown: Callable[[float], str | None], axes: int = 1
 ) -> list[tuple[Cell, ...]]:
-    """Return a row per section: number of windows (`axes` values each), RMS residual per step."""
+    """Return a table row per section: its number of windows, and an RMS residual for each step."""
     return [
         (row.section, row.fitted.n // axes, *(shown(getattr(row, x).rms) for x in steps))
         for row in rows

@@ -256,7 +256,7 @@ def update(
         'Days of ageing after the last rest that the claimed sd covers.', 1.0, min=0.0, max=3650.0
     ),
     allow: list[str] | None = option(
-        'gravity: take local gravity as exact; unit: accept |f| as wrong as of another unit.'
+        'gravity: take local gravity as exact; unit: accept a |f| like that of another unit.'
     ),
     force: bool = options.FORCE,
     out: Output = options.out,

@@ -199,14 +199,14 @@ def _duration(text: str) -> float:
 def _print_account(
     out: Output, account: 'Account', problems: Sequence[str], last: dict[str, str]
 ) -> None:
-    """Print the texts of the account that changed since they were printed (`last`, by name)."""
+    """Print the texts on the test that differ from those printed last (`last`, by name)."""
     news = {'problem': ', '.join(problems)} if problems else {}
     if not problems:
         last.pop('problem', None)
     for number, position in enumerate(account.positions, 1):
         if position.n_rests:
             news[f'position {number}'] = f'{position.reason or "good"}; {_reading(position.up)}'
-    # The direction, after the semicolon, changes with the noise, so the direction is not compared.
+    # Noise changes the direction after the semicolon: compare only the text before the semicolon.
     new = {name: text for name, text in news.items() if last.get(name) != text.partition(';')[0]}
     for name, text in new.items():
         last[name] = text.partition(';')[0]

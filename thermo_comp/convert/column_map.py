@@ -32,12 +32,12 @@ from .table import STAMP_EXPONENTS, Format, Stamp, Table, TimeUnit, read_parquet
 _CELSIUS = {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}
 #: Range of plausible intervals between samples [s], which decides the unit of the times.
 _STEPS_S = (5e-5, 0.5)
-#: A turn by over `_TURN` rad within two blocks of `_BLOCK` samples, between still blocks (sd below
-#: `_QUIET` g), would be too fast with times in ms: then intervals up to `_SLOW_S` s are plausible.
+#: Intervals up to `_SLOW_S` s are plausible if the unit turns by over `_TURN` rad in two blocks of
+#: `_BLOCK` samples, between still blocks (sd below `_QUIET` g): too fast a turn for times in ms.
 _SLOW_S, _BLOCK, _TURN, _QUIET = 2.0, 12, 0.5, 0.02
 _FASTEST_RAD_S = 20.0  # largest angular rate of a unit that is turned by hand [rad/s]
 #: Stamps of the years 2000 to 2038, and their largest interval [s]. A count of us since power-up,
-#: taken as seconds, may be in this range, but its steps are larger than this interval.
+#: read as seconds, may be a date of these years, but it rises by over 60 s from row to row.
 _SINCE_1970_S, _SINCE_1970_STEP_S = (946_684_800.0, 2_147_483_648.0), 60.0
 #: Largest ratio of the range of temperatures in a log to the duration of the log [K/s]; a hair
 #: dryer warms a board by some 0.1 K/s.
@@ -311,7 +311,7 @@ def _span(values: Floats) -> float:
 def _stamp(
     named: Headings, times: Floats | None, rate_hz: float | None, accel: Floats, span: float
 ) -> Stamp:
-    """Guess the unit of times by heading, or size and interval; `span`: temperature range [K]."""
+    """Guess the unit of times by heading or values; `span`: range of temperatures [K]."""
     if times is None:
         return Stamp(rate_hz=rate_hz)
     column = f'its column {named.time!r}'

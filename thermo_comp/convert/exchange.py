@@ -3,9 +3,9 @@
 """
 Owns the export of calibrations to the files of other tools, and the import of such files.
 
-All tools correct a reading N to a specific force ``a = A (N - b)``. In autopilots b depends on
-temperature and A is 1; in tools for tumble tests b and A are constant. The notes of an export
-name the parts of a calibration that the file cannot hold, most with the resulting error.
+All tools correct a reading N to a specific force ``a = A (N - b)``. In autopilots the bias b
+depends on temperature and the matrix A is 1; in tools for tumble tests b and A are constant. The
+notes of an export name the parts of the calibration that are lost, most with the resulting error.
 """
 
 from dataclasses import replace
@@ -202,7 +202,7 @@ def import_calibration(
 ) -> Calibration:
     """
     Read the file of one of `TOOLS`, recognised by its content; both regimes get the same curves.
-    `number` chooses a parameter set or IMU, None the only set in use; `full_scale` is in m/s^2.
+    `number` chooses a parameter set or IMU (None: the only one in use); `full_scale` is in m/s^2.
     """
     readings = (tool.read(text, number) for tool in TOOLS.values())
     content = next((reading for reading in readings if reading is not None), None)

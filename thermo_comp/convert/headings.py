@@ -146,7 +146,7 @@ def map_lines(columns: Any) -> list[str]:
 
 
 def _given(value: Any) -> Any:
-    """Turn a dataclass into a mapping, without the defaults of keys other than `unit`."""
+    """Turn a dataclass into a mapping; leave out default values, except that of `unit`."""
     if is_dataclass(value):
         pairs = ((field, getattr(value, field.name)) for field in fields(value))
         return {f.name: _given(x) for f, x in pairs if x != f.default or f.name == 'unit'}

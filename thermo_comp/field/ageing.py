@@ -8,11 +8,11 @@ Owns the ageing model of a unit: a Gaussian model of ``|f| - g`` at rest, fitted
 with the calibration's covariance; b and s are random walks of bias and scale since the
 calibration, o_k is the bias offset of start k, l_k are the unknown lag states at start k, lack is
 the lack of fit of the calibration, e_i is independent noise. The matrices H_i, B_i, S_i and L_i
-are derivatives of ``|f|``. The slopes of the bias over temperature are random walks of a fixed sd
-per root day. Jumps of the levels (bias and scale of each axis) or of gravity, and a change of the
-slope of the bias over temperature, are added one at a time, up to four, while the log Bayes factor
-of the next change is at least 5. The variances of random walks, offsets, lag states and scatter
-maximise the marginal likelihood times wide priors.
+are derivatives of ``|f|`` by parameters, bias, scale and lag states. The slopes of the bias over
+temperature are random walks of a fixed sd per root day. Jumps of the levels (bias and scale of
+each axis) or of gravity, and a change of the slope of the bias over temperature, are added one at
+a time, up to four, while the log Bayes factor of the next change is at least 5. The variances of
+random walks, offsets, lag states and scatter maximise the marginal likelihood times wide priors.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from ..unit.calibration import Calibration
 from ..unit.gravity import MICRO_G
 from .series import RestSeries
 
-#: Prior medians, divided by that of the turn-on offset's sd: sd of the random walks of bias and of
-#: scale times g, per root day; sd of the scatter of rests. Prior sd of the natural logarithm of
-#: each sd in `Ageing` (1 sd is a factor of 5).
+#: Prior medians relative to the prior median of the turn-on offset's sd: sd of the random walks of
+#: bias and of scale times g, per root day; sd of the scatter of rests. Prior sd of the natural
+#: logarithm of each sd in `Ageing` (1 sd is a factor of 5).
 _WALK_SHARE, _SCATTER_SHARE, _LOG_SD = 0.5, 0.3, 1.6
 #: Smallest prior median of the turn-on offset's sd [m/s^2].
 _LEAST_TURN_ON = 5.0 * MICRO_G
@@ -132,7 +132,7 @@ class Rows:
 
     @property
     def by_jump(self) -> Floats:
-        """Derivatives by a jump of levels, times `_JUMP_SHARES`, and of gravity, (n, 7)."""
+        """Derivatives by jumps of bias and scale (times `_JUMP_SHARES`) and of gravity, (n, 7)."""
         return np.column_stack((self.by_level * _JUMP_SHARES, self.by_gravity))
 
     def at(self, chosen: Bools) -> Rows:
@@ -163,7 +163,7 @@ def rows_of(series: RestSeries, scatter: float) -> Rows:
     searched = rows.start[rows.rank < _SEARCH_ROWS]
     if len(searched) <= _MOST_ROWS:
         return rows
-    # The oldest starts are left out: they have little information about the levels of today.
+    # The oldest starts are left out: they tell little about the present bias and scale.
     return rows.at(rows.start > searched[-_MOST_ROWS])
 
 
@@ -207,7 +207,7 @@ class Model:
         return result
 
     def fitted(self, centre: Ageing) -> tuple[Ageing, Floats]:
-        """Return the sds of the largest posterior density, and the inverse covariance of rows."""
+        """Return the sds that maximise the posterior, and the inverse covariance of rows."""
         middle = np.log(list(vars(centre).values()))
 
         def loss(logs: Floats) -> tuple[float, Floats]:
@@ -253,7 +253,7 @@ class Model:
 
 
 def usual(calibration: Calibration) -> Ageing:
-    """Return prior medians of `Ageing` from the fit's residual sd, or else the noise in 1 Hz."""
+    """Return prior medians of `Ageing` from the fit's residual sd, else from the noise."""
     residual = max(axis.residual_sd_m_s2 for axis in calibration.static.axes())
     turn_on = max(residual or max(calibration.noise_density_m_s2_sqrt_hz), _LEAST_TURN_ON)
     walk = _WALK_SHARE * turn_on
@@ -375,7 +375,7 @@ class Solution:
     gravity: tuple[tuple[Change, float, float], ...] = ()
 
     def before(self, row: int) -> Floats:
-        """Return the shift due to the equations before `row`."""
+        """Return the parameters' shift due to the equations before `row`."""
         return np.asarray(self.gains[:row].T @ self.innovations[:row])
 
 

@@ -32,13 +32,13 @@ _SPACING = ((360, 30), (60, 6), (0, 1))
 
 #: Thermal state, and remaining fractions of the unknown initial lag states.
 _State = tuple[Sequence[float], Sequence[float]]
-#: A function that returns the present state, or None before the first temperature reading.
+#: Returns the present thermal state, or None before the first temperature reading.
 StateNow = Callable[[], _State | None]
 
 
 @dataclass
 class _Cell:
-    """Sums of samples, less the first sample `origin`, over the seconds `begin` to `last`."""
+    """Sums, over the seconds `begin` to `last`, of samples less the first sample, `origin`."""
 
     begin: int
     last: int

@@ -4,8 +4,8 @@
 Owns the update of a calibration from rests in the field, and its score on left-out rests.
 
 A rest determines the error along gravity alone, so rests in few attitudes leave axes undetermined.
-An axis is updated only if the rests reduce the sd of a combination of its bias and scale to at
-most 0.6 times the sd before the update, with ageing. Other axes keep their values; their sd grows.
+An axis is updated only if the rests reduce the sd of a combination of its bias and scale to 0.6
+times the sd (with ageing) before the update or less. Other axes keep their values with larger sds.
 """
 
 from collections.abc import Sequence
@@ -27,11 +27,11 @@ from ..unit.provenance import Provenance, ResidualSummary, Source
 from .ageing import Ageing, Change, Model, Solution, learn, solve
 from .series import RestSeries, last_rest, valid_since
 
-#: Conclusions that `--allow` excludes: that gravity is not as stated; that the unit is another.
+#: Conclusions that `--allow` excludes: gravity is not as stated; the rests are of another unit.
 OVERRIDES = ('gravity', 'unit')
 #: Limits of the RMS of |f| - g over the rests of a start: relative to gravity (1 mg, as after a
-#: shock), and in claimed sd (30, some milli-g for a poor sensor). An RMS above both limits is
-#: taken for that of another unit.
+#: shock), and in claimed sd (30, some milli-g for a poor sensor). Rests with an RMS above both
+#: limits are taken for rests of another unit.
 _LARGEST_PART, _LARGEST_SIGMAS = 1e-3, 30.0
 
 
@@ -138,8 +138,8 @@ def update(
         )
     _, aged, is_update = valid_since(calibration)
     first, last = float(series.time.min()), float(series.time.max())
-    # The random walks begin at the time `aged` up to which the covariance includes ageing; if this
-    # time is unknown or after the first rest (the last, for an updated file), at the first rest.
+    # The covariance includes ageing up to the time `aged`. The random walks begin at `aged` if it
+    # is before the first rest (for an updated file, the last rest), else at the first rest.
     since = aged if -np.inf < aged < (last if is_update else first) else first
     ageing, model, used = learn(series, calibration, since, is_gravity_certain=is_gravity_certain)
     solution = solve(model, ageing, *_derivatives(calibration), ahead)
@@ -242,7 +242,7 @@ def _axis_changes(
 
 
 def _judged(series: RestSeries, model: Model, solution: Solution, determined: Bools) -> Judged:
-    """Score an update by earlier rests on each day (on each node start if under 5 days)."""
+    """Score updates by earlier rests on each day (if under 5 days, on each node start)."""
     over, labels = 'days', series.day
     if len(np.unique(labels)) < 5:
         over, labels = 'starts', series.start
@@ -304,7 +304,7 @@ def _shifted(calibration: Calibration, shift: Floats, covariance: Floats) -> Cal
 
 
 def _with_residual(part: RegimeSet, turn_on: float, changes: Sequence[AxisChange]) -> RegimeSet:
-    """Set the residual sd to `turn_on` on determined axes, and at least to `turn_on` on others."""
+    """Set the residual sd: `turn_on` on determined axes, at least `turn_on` on all others."""
     axes: dict[str, Any] = {}
     for axis, change in zip(part.axes(), changes, strict=True):
         sd = turn_on if change.is_determined else max(turn_on, axis.residual_sd_m_s2)

@@ -143,8 +143,8 @@ def watch(series: RestSeries, calibration: Calibration, tolerance: float | None 
         forecast, interval = _forecasts(updated, tolerance)
     is_out, is_row_out = recent > 1.0, np.array([not row.is_within for row in days])
     # The RMS of a week responds late to a change. A unit is therefore outside its claim after one
-    # day above the limit if the error by the ageing model at the last rest is also above it; and
-    # within its claim after two days within the limit if this error is within the limit, too.
+    # day above the limit, and within its claim after two days within the limit, if the error by
+    # the ageing model at the last rest is on the same side of the limit.
     is_error_out = bool(forecast) and forecast[1] == 0.0
     is_out[-1] &= is_error_out or is_row_out[-2:].any()
     is_out[-1] |= is_error_out and is_row_out[-1]
@@ -156,8 +156,8 @@ def watch(series: RestSeries, calibration: Calibration, tolerance: float | None 
         outside_since = next((row.name for row in window if not row.is_within), window[-1].name)
         forecast = ()
     elif (recent > 1.0).any():
-        # The day after the last day above the limit exists, because the last day is within the
-        # limit if the unit is within its claim.
+        # If the unit is within its claim, the last day is within the limit, so that a day follows
+        # the last day above the limit.
         until = int(np.flatnonzero(recent > 1.0)[-1])
         inside_since = days[int(np.flatnonzero(is_row_out[: until + 1])[-1]) + 1].name
     periods = _rows(series, firsts, ordered[::together].tolist(), tolerance)
@@ -240,17 +240,17 @@ def passage(
     """
     Return quantiles of the time [days] at which the norm of a random walk first exceeds a bound.
 
-    The initial value has the mean `mean`, (k,), and the covariance `covariance`, (k, k). Its
-    change after d days is sqrt(d) `walk`, (k, m), times m independent normal variables; `rate_sd`
-    is the sd of the logarithm of the variance of the walk. The time is 0 if the initial norm is
-    above the bound, else at least 0.01 days.
+    The walk begins at a random vector of mean `mean`, (k,), and covariance `covariance`, (k, k).
+    In d days the walk changes by sqrt(d) `walk`, (k, m), times m independent normal variables;
+    `rate_sd` is the sd of the logarithm of the variance of the walk. A walk that begins above the
+    bound has the time 0, any other walk at least 0.01 days.
     """
     rng = np.random.default_rng(1)
     # Principal directions with less than a thousandth of the largest error are left out.
     size, vectors = np.linalg.eigh(covariance + np.outer(mean, mean) + walk @ walk.T)
     onto = vectors[:, size > 1e-6 * size[-1]].T
     mean, covariance = onto @ mean, onto @ covariance @ onto.T
-    # Reduce the independent variables to one per direction, without a change of the covariance.
+    # One independent variable per direction gives a walk of the same covariance.
     walk = np.transpose(np.linalg.qr((onto @ walk).T, mode='r'))
     values, vectors = np.linalg.eigh(covariance)
     initial = vectors * np.sqrt(np.maximum(values, 0.0))
@@ -271,8 +271,8 @@ def passage(
         error = error + (speed * np.sqrt(step))[:, np.newaxis] * moved
         size = np.sqrt(np.einsum('ij,ij->i', error, error))
         # Between two times a Brownian bridge crosses the bound with the probability exp(-2 a b /
-        # variance): a and b are the distances from the bound at these times, and the variance is
-        # that of the step along the error.
+        # variance), with the distances a and b from the bound at these times and the variance of
+        # the component of the step along the error.
         onto_walk = error @ walk
         along = np.einsum('ij,ij->i', onto_walk, onto_walk) * speed**2 * step
         product = left * np.maximum(bound - size, 0.0) * size**2

@@ -80,8 +80,8 @@ def fit_fleet(
     Fit all units without a stored result. Raises ThermoCompError if the folder has no bag, a
     package is missing or the Dask cluster cannot be used, OutputError if a file cannot be written.
 
-    `progress` is called with the numbers of finished and of all tests of a round: without a prior,
-    then with the prior.
+    `progress` gets the numbers of finished and of all tests, first for the fits without a prior,
+    then for the fits with the prior.
     """
     _require_packages()
     storage = Storage(url)

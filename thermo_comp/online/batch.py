@@ -56,7 +56,7 @@ class CompensatedBlock:
 def process_block(
     compensator: Compensator, block: Block, angular_rate: Floats | None = None
 ) -> CompensatedBlock:
-    """Correct a block's samples and angular rates (n, 3), with the bits of single samples."""
+    """Correct a block's samples and rates (n, 3); the result equals `process` bit for bit."""
     thermal = compensator.thermal
     stamps = np.asarray(block.accel_stamp_ns, dtype=np.int64)
     samples = np.asarray(block.accel, dtype=np.float64)
@@ -124,8 +124,8 @@ def _push(
     while arrivals and arrivals[-1][0] <= place:
         _, _, name, stamp_ns, celsius = arrivals.pop()
         if len(thermal.queue) >= PENDING_LIMIT:
-            # The node applies waiting readings while no samples come. A batch applies old readings
-            # if the queue is full, but once it has a sample, none later than the next sample.
+            # The node applies waiting readings while no samples come. A batch with a full queue
+            # applies old readings; after a sample, only readings up to the next sample's stamp.
             limit_ns = NEVER_NS if compensator.now_ns is None else due_ns
             thermal.flush(min(limit_ns, stamp_ns - DISORDER_NS))
         thermal.push(name, stamp_ns, celsius)

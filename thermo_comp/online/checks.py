@@ -5,9 +5,9 @@ Owns the plausibility checks of samples: a stuck converter, more samples than th
 make, and |f| at rest, which must be gravity.
 
 A converter with noise does not repeat its numbers for seconds; three exact zeros indicate a dead
-wire. A count is charge per cycle, so the scale factor changes with the sample rate. With an aged
-calibration, or that of another unit, |f| at rest may differ from gravity by more than the stated
-uncertainty. |f| is averaged over windows of a second or longer. A window is still if its
+wire. A converter counts charge per cycle, so the scale factor changes with the sample rate. With
+an aged calibration, or that of another unit, |f| at rest may differ from gravity by more than the
+stated uncertainty. |f| is averaged over windows of a second or longer. A window is still if its
 scatter is within the sensor's noise and its mean agrees with the mean of the previous window. A
 step of |f| from a rest to another rest is judged within a second.
 """
@@ -27,9 +27,9 @@ STUCK_SAMPLES: Final = 50
 #: Change of both other axes [m/s^2] at which an axis that repeats its reading counts as stuck: the
 #: change in a turn by 1.2 degrees, above the noise and the steps of a converter at rest.
 MOTION: Final = 0.2
-#: An axis that repeats its reading although nothing moves is stuck if the other axes have changed
-#: `NOISY_CHANGES` times by `NOISY_SDS` sd of their noise from one sample to the next, and if its
-#: own noise [sd] is at least `VISIBLE_SDS` times the converter's step, which would show the noise.
+#: An axis that repeats its reading at rest is stuck if the other axes change `NOISY_CHANGES` times
+#: by `NOISY_SDS` sd of their noise from sample to sample, and if the sd of its own noise is at
+#: least `VISIBLE_SDS` steps of the converter, so that the noise would show.
 NOISY_CHANGES: Final = 20
 NOISY_SDS: Final = 1.5
 VISIBLE_SDS: Final = 2.0
@@ -64,10 +64,10 @@ STEP_NS: Final = 300_000_000
 REFUTING_SIGMAS: Final = 5.0
 
 
-#: Run of equal readings of an axis: its first sample with the stamp [ns], number of samples after
-#: the first, the largest change since then that both other axes have made [input unit], and, after
-#: the `STUCK_SAMPLES`th repeat, the changes of the other axes from sample to sample: number of
-#: changes by `NOISY_SDS` sd or more; smallest change, the converter's step [input unit].
+#: Run of equal readings of an axis: first sample with its stamp [ns]; number of repeats; largest
+#: change of both other axes since the first sample [input unit]. Counted after the
+#: `STUCK_SAMPLES`th repeat: number of changes of the other axes by `NOISY_SDS` sd or more from
+#: sample to sample; smallest change, which is the converter's step [input unit].
 Run: TypeAlias = tuple[tuple[float, float, float, int], int, float, int, float]
 
 
@@ -75,9 +75,9 @@ class StuckCheck:
     """
     Counts consecutive equal readings of each axis; `timeout_s` [s]: 0 = nothing is stuck.
 
-    After the time-out samples are stuck if all three axes repeat their readings, or if an axis
-    repeats its reading while both other axes change by `motion` [input unit], or while another
-    axis shows noise that this axis would show as well. `noise_sds`: sd of the noise of each axis
+    After the time-out samples are stuck if all three axes repeat their readings. One axis alone is
+    stuck if it repeats its reading while both other axes change by `motion` [input unit], or while
+    they show noise and this axis would show noise, too. `noise_sds`: sd of the noise of each axis
     [input unit]. An axis whose noise is below the converter's step may repeat its reading.
     """
 
@@ -121,7 +121,7 @@ class StuckCheck:
         j: int,
         k: int,
     ) -> Run:
-        """Return the run of an axis, extended by `sample`; `j`, `k`: the other axes."""
+        """Extend an axis' run of equal readings by `sample`; `j`, `k`: the other axes."""
         first, n, moved, n_noisy, step = run
         change, other = abs(sample[j] - first[j]), abs(sample[k] - first[k])
         if change > moved and other > moved:
@@ -135,7 +135,7 @@ class StuckCheck:
         return first, n + 1, moved, n_noisy, step
 
     def find(self, stamps: Ints, samples: Floats) -> Bools:
-        """Find the samples (n > 0, 3) that `Compensator` drops as stuck or as three zeros."""
+        """Return which samples, (n > 0, 3), `Compensator` drops as stuck or as three zeros."""
         n = len(stamps)
         columns = samples.T
         changes = np.empty((3, n), dtype=np.bool_)
@@ -177,7 +177,7 @@ class StuckCheck:
         self, run: Run, columns: Floats, here: slice, equal: Ints, axis: int
     ) -> tuple[Floats, Ints, Floats]:
         """
-        Return `moved`, `n_noisy`, `step` of a run after each of the samples `here` of `columns`;
+        Return `moved`, `n_noisy`, `step` of a `Run` after each of the samples `here` of `columns`;
         `equal`: number of repeats of the first reading of the run up to each sample.
         """
         first, _, moved, n_noisy, step = run
@@ -188,7 +188,7 @@ class StuckCheck:
             moved_by = np.abs(values[:, 1:].T - np.take(first[:3], [axis - 2, axis - 1]))
             changes = np.abs(np.diff(values))
         most = np.fmax.accumulate(np.append(moved, moved_by.min(axis=1)))[1:]
-        # The streaming check looks at changes from the repeat after the `STUCK_SAMPLES`th on.
+        # As in `_continued`, changes up to the `STUCK_SAMPLES`th repeat do not count.
         changes[:, equal <= STUCK_SAMPLES] = 0.0
         noisy = np.take(self._noisy, [axis - 2, axis - 1])[:, np.newaxis]
         counts = n_noisy + np.cumsum(np.sum(changes >= noisy, axis=0))
@@ -197,7 +197,7 @@ class StuckCheck:
 
 
 def _begun(sample: tuple[float, float, float, int]) -> tuple[Run, ...]:
-    """Return the runs of the three axes that begin with a sample."""
+    """Return the runs of equal readings of the three axes that begin with a sample."""
     return ((sample, 0, 0.0, 0, math.inf),) * 3
 
 
@@ -274,7 +274,7 @@ class GravityCheck:
     def add(
         self, stamp_ns: int, force: Sequence[float], covariance: Sequence[float], noise: float
     ) -> None:
-        """Take a force [m/s^2], its covariance (xx to zz), and the trace of its noise part."""
+        """Add a force [m/s^2], its covariance (xx to zz) and the trace of its noise covariance."""
         self._watch_step(stamp_ns, force, covariance, noise)
         since_ns, step_ns = stamp_ns - self._begin_ns, stamp_ns - self._last_ns
         if not (0 <= since_ns < LONGEST_WINDOW_NS and 0 <= step_ns < 3 * WINDOW_NS):
@@ -296,7 +296,7 @@ class GravityCheck:
         if self.is_refuted or not (self._off or rests):
             self._off, self._is_resting = [], False
             return
-        # Largest difference of two samples at rest, including four sd of the noise difference.
+        # Largest difference of two samples at rest: `LARGEST_CHANGE` plus four sd of its noise.
         near = LARGEST_CHANGE + 4.0 * math.sqrt(2.0 * noise / 3.0)
         was_resting, reference = self._is_resting, (self._off or [self._last_mean or ()])[0]
         is_near = max(abs(a - b) for a, b in zip(force, reference, strict=True)) <= near
@@ -326,7 +326,7 @@ class GravityCheck:
         squares = [(v - m) ** 2 for values, m in zip(axes, mean, strict=True) for v in values]
         scatter = math.fsum(squares) / (n - 1)
         last, self._last_mean = self._last_mean or [math.inf] * 3, mean
-        # Largest difference of two means at rest, including four sd of the noise difference.
+        # Largest difference of two means at rest: `LARGEST_CHANGE` plus four sd of its noise.
         change = LARGEST_CHANGE + 4.0 * math.sqrt(2.0 * noise_variance / (3.0 * n))
         largest = max(abs(a - b) for a, b in zip(mean, last, strict=True))
         if not (scatter <= SCATTER_FACTOR**2 * noise_variance and largest <= change):
@@ -341,7 +341,7 @@ class GravityCheck:
         if is_against == self._is_against:
             self._n_agreeing += 1
         else:
-            # The windows before a change of the verdict do not describe the present error.
+            # The windows before |f| crossed the limit do not describe the present error of |f|.
             self._is_against, self._n_agreeing, self._weight = is_against, 1, 0.0
         if self._n_agreeing >= (REFUTING_WINDOWS if is_against else RESTORING_WINDOWS):
             self.is_refuted = is_against

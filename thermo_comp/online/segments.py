@@ -6,7 +6,7 @@ Owns the segments: time intervals between temperature readings, with a correctio
 A segment ends at a temperature reading, or after one second. The correction is evaluated at both
 ends of a segment and interpolated, so a sample takes a few operations, the output has no steps
 between two readings, and a batch needs one evaluation per segment. The slowly varying variance due
-to parameters and initial lag states is evaluated every 10 s, at first in each segment.
+to parameters and initial lag states is evaluated every 10 s; soon after a start, in each segment.
 """
 
 from collections.abc import Sequence
@@ -84,7 +84,7 @@ class Model:
         self.inputs = (BOARD_INPUT, *calibration.sensors)
 
     def slow_rows(self, held: Sequence[SlowState]) -> Floats:
-        """Evaluate the slow variance of force (`n_slow` rows), then of angular rate, (rows, n)."""
+        """Evaluate slowly varying variances, (rows, n): `n_slow` rows of force, then of rate."""
         states, shares, rates = (np.array(part).T for part in zip(*held, strict=True))
         return np.concatenate([part.at(states, shares, rates) for part in self.uncertainty])
 
@@ -144,12 +144,12 @@ class ThermalSide:
         return config, unit.board_lag_s, unit.rest_gradient_range_k or ANY_RANGE
 
     def take_over(self, model: Model, config: CompensatorConfig, now_ns: int | None) -> None:
-        """Use `model` and `config` from now on; an object that `self` copies does not change."""
+        """Use `model` and `config` from now on; copy objects that another compensator shares."""
         old, self.queue = self.tracker, copy(self.queue)
         unit, rate = self.calibration.unit, copy(self.rate)
         self._use(model, config)
         if self.calibration.unit == unit:
-            # For the same unit, output that was stopped by the check of the rate stays stopped.
+            # If the rate check has stopped the output of the same unit, the output stays stopped.
             self.rate = rate
         self.queue.keep(lambda entry: entry[2] in self.inputs)
         is_same = self.calibration.detector == old.settings
@@ -206,7 +206,7 @@ class ThermalSide:
         return not self.model.needs_temperature and self.tracker.board.stamp_ns is None
 
     def sample(self, stamp_ns: int) -> tuple[float, ...]:
-        """Return the thermal state at a stamp; if `is_unmeasured`, a soak at the reference."""
+        """Return the thermal state at a stamp; if `is_unmeasured`, of a soak at T_ref."""
         if self.is_unmeasured:
             gradients = (0.0, 0.0) * len(self.calibration.sensors)
             reference = self.calibration.reference_temperature_c
@@ -215,7 +215,7 @@ class ThermalSide:
 
     @property
     def fresh_until_ns(self) -> int:
-        """Last stamp with a fresh board temperature; NEVER_NS: none needed, EVER_NS: none read."""
+        """Last stamp with a valid board temperature; NEVER_NS: not needed, EVER_NS: not read."""
         if not self.model.needs_temperature:
             return NEVER_NS
         board_ns = self.tracker.board.stamp_ns
@@ -259,7 +259,7 @@ class ThermalSide:
         return self._slow_rows
 
     def _slow_at(self, start_ns: int, end_state: tuple[float, ...]) -> SlowState:
-        """Return the arguments of the slowly varying variance, new at least every `SLOW_NS`."""
+        """Return the arguments of the slowly varying variance, renewed after `SLOW_NS` at most."""
         # The unknown initial lag states depend on the board's rate, which the first readings after
         # a start do not determine: evaluate the variance in each segment.
         is_young = self.tracker.board.n_in_row < YOUNG_READINGS
@@ -267,7 +267,7 @@ class ThermalSide:
         if key != self._slow_key:
             self._slow_key = key
             if self.is_unmeasured:
-                # Temperature unknown: evaluate the variance one sd above the reference.
+                # The temperature is unknown: evaluate the variance at T_ref plus one sd.
                 end_state = (end_state[BOARD] + UNMEASURED_SD_K, *end_state[1:])
             memory = self.tracker.memory
             shares = memory.remaining_shares(start_ns + SEGMENT_NS)

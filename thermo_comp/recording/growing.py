@@ -24,7 +24,7 @@ from .reader import open_recording
 from .topics import Topics
 from .writer import BagWriter
 
-_CHUNK_BYTES = 1 << 17  # chunk size [bytes]: 17 s of counts at 100 Hz, which a kill loses
+_CHUNK_BYTES = 1 << 17  # chunk size [bytes]: a kill loses at most 17 s of counts at 100 Hz
 _PERIOD_S = 1.0  # shortest pause between two passes over the growing bag [s]
 _NEVER_NS = 2**63 - 1
 #: Hidden name of an unfinished bag: number of the bag, and id of the process that writes the bag.
@@ -90,8 +90,8 @@ def leftovers(folder: Path) -> dict[Path, int]:
 
 def finish(path: Path, number: int) -> Path | None:
     """
-    Copy an unfinished bag to a bag named `number` (if that exists, the largest number plus 1) and
-    delete the unfinished bag; None for a bag without messages, RecordingError if unreadable.
+    Copy an unfinished bag to the bag `number`, or if it exists, to the largest number plus 1;
+    delete the unfinished bag. None for a bag without messages, RecordingError if it is unreadable.
     """
     with open_recording(path, require=()) as reader:
         numbers = {int(bag.stem) for bag in numbered_bags(path.parent)}

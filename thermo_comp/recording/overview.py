@@ -184,7 +184,7 @@ class _Clock:
         later = stamp_ns[not self.n :]
         steps = np.diff(later, prepend=self.last_ns)
         self.n, self.last_ns = self.n + len(stamp_ns), int(stamp_ns[-1])
-        # After a backward step by an hour or less, samples are left out until stamps are new.
+        # After a backward step by an hour or less, samples up to the newest stamp are left out.
         restarts = np.flatnonzero(steps < -LONGEST_PAUSE_NS)
         self.n_restarts += len(restarts)
         for number, part in enumerate(np.split(later, restarts)):

@@ -83,7 +83,7 @@ class RecordingReader(ExitStack):
                 raise RecordingError(f'cannot be opened: {error.strerror}', path) from error
             raise
         self._part = topics.part
-        #: Time from the bag's first sample to the selected part's [s]; 0 before both are read.
+        #: Time from the first sample of the bag to the first of the part [s]; 0 until read.
         self.since_s = 0.0
         self.apart = ''  # warning about stamps that are all equal, or of a second clock
 

@@ -105,8 +105,8 @@ class Reporter:
                 rate = new['n_in'] / passed_s
         self._before, self._before_ns = counts, status.stamp_ns
         findings = [*self._findings(), *findings_of(loaded, status, new, rate, silence_s)]
-        # If the calibration has no nonlinearity, the warning begins 1 g above 1.01 times gravity,
-        # where the unknown square term has an sd of 0.1 mg, and not at each vehicle acceleration.
+        # Vehicle accelerations give no warning: without nonlinearity in the calibration, warnings
+        # begin at 2.01 g, where the unknown square term has an sd of 0.1 mg.
         least = 0.0 if loaded.calibration.nonlinearity else STANDARD_GRAVITY
         if (over := self._force_excess()) > least:
             text = f'|f| {over:.3g} m/s^2 above the largest |f| of the fit: the covariance grows'
@@ -135,7 +135,7 @@ class Reporter:
                 log.error(message.message)
 
     def _force_excess(self) -> float:
-        """Return the excess of the last |f| over that of the fit, or over 1.01 g [m/s^2]."""
+        """Return by how much the last |f| exceeds the largest |f| of the fit or 1.01 g [m/s^2]."""
         last = self._relay.running.converter.last_result
         if last is None:
             return 0.0

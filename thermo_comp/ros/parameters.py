@@ -5,8 +5,8 @@ Owns the node's parameters: their table, and the services that set them.
 
 The table of the parameters is `NodeConfig`. The node runs with one immutable `NodeConfig`; a
 change makes a new `NodeConfig` or is refused as a whole. A separate process reads files, while a
-thread waits for the process; then the node's loop starts to use the new `NodeConfig`. Requests are
-answered in order of arrival, but a request without a file does not wait for requests with files.
+thread waits for the process; then the node's loop starts to use the new `NodeConfig`. A queue of
+requests that set `calibration_file`, and a queue of all other requests, are served in parallel.
 """
 
 import math
@@ -79,7 +79,7 @@ class NodeConfig:
     input: str = _parameter(
         'counts',
         'Input to compensate: accel/counts (Vector3Stamped) or imu/uncompensated (Imu). If '
-        '`topics` names one of the two at the start, that input is used.',
+        '`topics` names only counts or only imu, the start sets `input` to this name.',
         choices=('counts', 'imu'),
     )
     frame_id: str = _parameter(
@@ -107,9 +107,9 @@ class NodeConfig:
     )
     stuck_timeout: float = _parameter(
         _DEFAULTS.stuck_timeout_s,
-        'Time after which samples that repeat their values on all axes, or on one axis while the '
-        'others change or show their noise, are not published [s]; samples of three zeros are '
-        'dropped at once; 0: repeated values and zeros are published.',
+        'Longest repetition of equal readings that is published [s], on all axes, or on one axis '
+        'while the others change or show noise. Samples of three zeros are dropped at once. 0: '
+        'repetitions and zeros are published.',
         (0.0, 3600.0),
     )
     local_gravity: float = _parameter(
@@ -234,7 +234,7 @@ class ParameterRequests:
     ) -> None:
         self._loop, self._prepare, self._apply = loop, prepare, apply
         self._n_waiting = 0
-        # With two threads a request without a file does not wait for requests with files.
+        # A second thread answers requests without `calibration_file`, which read no file.
         self._slow, self._quick = (ThreadPoolExecutor(1, 'parameters') for _ in range(2))
         for service in loop.node.services:
             if service.srv_type in (srv.SetParameters, srv.SetParametersAtomically):
@@ -299,7 +299,7 @@ class ParameterRequests:
             raise
 
     def _repeats_fixed_value(self, change: Parameter) -> bool:
-        """Whether a change sets a fixed parameter to its present value, as a loaded dump does."""
+        """Whether a fixed parameter is set to its present value, as by `ros2 param load`."""
         node = self._loop.node
         return bool(
             node.has_parameter(change.name)

@@ -3,8 +3,8 @@
 """
 Owns the processing of samples in the node in order of arrival, whenever the loop wakes up.
 
-Messages do not identify their publisher. While several publishers may send on a topic, its
-messages are dropped; so is the first batch after a publisher left: the publisher may have sent it.
+Messages do not identify their publisher. While several publishers may send on a topic, the topic's
+messages are dropped. The first batch after a publisher has left is also dropped.
 """
 
 from bisect import bisect_left, bisect_right
@@ -187,7 +187,7 @@ class Relay:
             self.rests.gather(messages, self.running.loaded, self.running.compensator)
 
     def advance_without_samples(self, silence_ns: int) -> None:
-        """Use readings while no samples arrive, so that the regime flag is still published."""
+        """Use temperatures while no samples arrive, so that regime flags are still published."""
         if self._newest_reading_ns is None:
             return
         horizon_ns, compensator = self._newest_reading_ns - IDLE_NS, self.running.compensator

@@ -34,7 +34,7 @@ DAY_BYTES, FOLDER_BYTES = 320_000, 64_000_000
 _UNTHINNED_BYTES = 16_000
 #: Largest number of lines that wait for the disk.
 _WAITING = 1000
-#: Stamps before 2000-01-01 [ns] are times since the start of a driver, no dates: rests with such
+#: Stamps before 2000-01-01 [ns] are times since the start of a driver, not dates: rests with such
 #: stamps get the time of this computer.
 _EPOCH_NS = 946_684_800 * 10**9
 #: Smallest backward step of the stamps [ns] that begins a new recording.
@@ -153,7 +153,7 @@ class RestKeeper:
     def gather(
         self, messages: list[bytes], loaded: LoadedCalibration, compensator: Compensator
     ) -> None:
-        """Sum messages that the compensator has processed; queue the rests that end in them."""
+        """Sum messages that the compensator has processed; queue the rests that they complete."""
         # All messages are summed with the present calibration, although those that arrived before
         # a reload were corrected with the old calibration.
         self._use(loaded, compensator)
@@ -209,9 +209,9 @@ class RestKeeper:
 
 
 def samples_of(messages: Sequence[bytes], *, is_imu: bool) -> tuple[Stamps, Floats]:
-    """Read stamps [ns] and samples of little-endian messages that have the last one's length."""
+    """Read stamps [ns] and samples of little-endian messages of the last message's length."""
     size = len(messages[-1]) if messages else 0
-    # Shorter messages than those with an empty frame_id are malformed.
+    # A message shorter than one with an empty frame_id is malformed.
     if size < _SHORTEST[is_imu]:
         return np.zeros(0, np.int64), np.zeros((0, 3))
     content = b''.join([message for message in messages if len(message) == size])
