@@ -203,7 +203,7 @@ def test_curve_columns_of_a_fit_are_powers_of_temperature(
     weight = np.linspace(0.0, 1.0, 9)
     columns = sets.columns(t, weight)
     assert len(columns) == len(sets.groups) == sets.static.n_free + 1 + sets.dynamic.n_free
-    # At the reference temperature all columns are 0 except the level of the dynamic set.
+    # At the reference temperature only the column for the dynamic set's level is not 0.
     nothing = sets.columns(np.zeros(3), np.array([0.0, 0.5, 1.0]))
     for k, column in enumerate(nothing):
         expected = [0.0, 0.5, 1.0] if k == sets.level else 0.0

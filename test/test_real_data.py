@@ -70,8 +70,8 @@ def test_six_faces_leave_the_misalignment_at_its_prior(real_data, work):
     result = fit(sources, replace(OPTIONS, input=kind))
     calibration = result.calibration
     assert len(result.positions) == 6
-    # The prior sd of the misalignment of a MEMS is 0.01. Faces are tilted by up to 1 degree, which
-    # determines the misalignment by less than 1 % of this sd.
+    # Six faces, tilted by up to 1 degree, hardly determine misalignments: their sd stays within
+    # 1 % of the prior sd for a MEMS, 0.01 rad.
     np.testing.assert_allclose(calibration.misalignment, np.eye(3), atol=1e-4)
     np.testing.assert_allclose(calibration.misalignment_sd, 1e-2, rtol=0.01)
     # Expected bias: half of the sum of opposite faces; scale factor: half of their difference.

@@ -78,7 +78,7 @@ def headline():
     [
         ('1 mK', 45.0, 90.0),
         ('10 mK', 150.0, 180.0),
-        # Two steps of 62.5 mK are needed, on average a change by 94 mK, which takes 146 s +- 6 s.
+        # A detection needs two steps of 62.5 mK, on average a change by 94 mK, after 146 +- 6 s.
         ('1 mK, 62.5 mK steps', 158.0, 180.0),
         ('10 mK, 62.5 mK steps', 150.0, 180.0),
     ],
@@ -102,7 +102,7 @@ def test_the_onset_delay_is_below_twice_that_of_a_cusum_test(headline, sensor, t
     signature = lagged(np.append(0.0, k), [(0.0, 0.5)], LAG_S)[1:]
     delays = []
     for _ in range(40):
-        # This likelihood-ratio test, given the onset, too, is at most 1 s faster than CUSUM.
+        # A likelihood-ratio test that also knows the onset is at most 1 s faster than CUSUM.
         x = signature + rng.normal(0.0, noise, len(k))
         ratio = np.cumsum(signature * x - 0.5 * signature**2) / noise**2
         delays.append(k[np.argmax(ratio > threshold)])
@@ -259,7 +259,7 @@ def test_the_relaxed_rate_sets_the_end_of_the_dynamic_regime():
         switches(detector_settings(0.001, relaxed_rate_k_min=rate), t, case, board)[-1][0]
         for rate in (0.025, 0.05, 0.1)
     ]
-    # The longest lag, LAG_S, determines the end: the board's rate halves in LAG_S * ln 2.
+    # Halving the relaxed rate delays the end by LAG_S * ln 2, with the longest lag LAG_S.
     assert ends[0] - ends[1] == pytest.approx(LAG_S * math.log(2.0), rel=0.25)
     assert ends[1] - ends[2] == pytest.approx(LAG_S * math.log(2.0), rel=0.25)
 

@@ -247,7 +247,7 @@ def test_values_and_deviations_have_equal_decimals_if_u_is_withheld(is_known, tm
                 text, expanded, deviation = cells[k : k + 3]
                 n_withheld += expanded == '–'
                 assert len(text.partition('.')[2]) == len(deviation.partition('.')[2])
-                # With and without the uncertainty the numbers are equal within their rounding.
+                # Values and deviations with U and without U must be equal within their rounding.
                 for value, place in ((text, k), (deviation, k + 2)):
                     half = 0.5 * 10.0 ** -len(value.partition('.')[2])
                     number, expected = (

@@ -85,7 +85,7 @@ def test_a_further_error_source_does_not_change_the_random_numbers_of_other_sour
         plain.truth.scale - 1.0
     ) * unit.scale_factor * (plain.truth.specific_force @ np.linalg.inv(unit.M).T)
     difference = np.cumsum(plain.counts - still.counts, axis=0) - np.cumsum(moved, axis=0)
-    # Sums of counts are within one count of the integrals; both runs begin with equal remainders.
+    # Both runs begin with the same rounding remainder, so sums of counts agree within one count.
     assert np.abs(difference).max() < 1.0 + 1e-6
 
 
