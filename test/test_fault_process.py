@@ -87,7 +87,7 @@ def truncated(path):
 
 
 def cut_between_keys(path):
-    # WHY: all keys from `misalignment_sd` on have defaults, so a file cut there was accepted.
+    # WHY: a file cut before `misalignment_sd` was accepted, as all later keys have defaults.
     content = path.read_bytes()
     path.write_bytes(content[: content.index(b'\nmisalignment_sd:') + 1])
 

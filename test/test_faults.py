@@ -3,7 +3,7 @@
 """
 For each row of the fault table the output of compensator and diagnostics is compared with the
 truth. Rows about the order of arrival are also sent over DDS to a node process, whose output must
-equal that without DDS.
+equal the output without DDS.
 """
 
 from copy import deepcopy

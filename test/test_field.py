@@ -178,7 +178,7 @@ def test_the_sd_of_an_old_calibration_aged_to_the_last_rest_includes_the_random_
     walk = np.cumsum(60.0 / np.sqrt(3.0) * MICRO_G * rng.standard_normal((90, 3)), axis=0)
     logged = rests(unit, upright, lambda day: walk[round(3 * day)], 30)
     x, y, z = update(series_of(logged, unit), unit).axis_changes
-    # The bias of x has an sd of 10 ug. At rest z reads bias plus scale error, 10 ug each.
+    # The bias of x has an sd of 10 ug; at 1 g bias and scale of z have an sd of 10 ug each.
     residual = unit.static.x.residual_sd_m_s2
     assert x.claimed_sd == pytest.approx(np.hypot(10.0 * MICRO_G, residual), rel=0.01)
     assert z.claimed_sd == pytest.approx(np.hypot(np.sqrt(200.0) * MICRO_G, residual), rel=0.01)

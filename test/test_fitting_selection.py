@@ -178,8 +178,8 @@ def test_rounding_removes_no_correlation_time_from_the_search():
 
 
 def test_the_estimated_prior_sd_of_a_column_is_the_rms_of_its_true_weights(calm):
-    # sd^2 = sum of squared weights / effective parameters (3 per column). A hyperprior with an sd
-    # of ln 10 moves ln sd towards its centre by 1 / (2 x 3 x 5.3) of the distance.
+    # Prior variance of a column: sum of its squared weights / 3 effective parameters. A hyperprior
+    # with an sd of ln 10 moves ln sd to its centre by 1 / (2 x 3 x 5.3) of the distance.
     regression, chosen, truth = calm
     true = np.sqrt(np.mean((truth.on_bias * regression.rms) ** 2, axis=0))
     np.testing.assert_allclose(chosen.posterior.prior.column_sd[0, :4], true[:4], rtol=0.25)

@@ -297,7 +297,7 @@ def test_sections_and_kelvins_of_columns_agree_with_formulas(bags):
         assert (np.diff(section) >= 0).all()
         assert np.ptp(np.bincount(section, minlength=N_SECTIONS)) <= 2
     rms = np.sqrt(np.mean(data.columns**2, axis=0))
-    # `kelvins`: RMS of a column / its largest slope over t, which is 1 for t, 2 max |t| for t^2.
+    # `kelvins`: RMS of a column / its largest slope over t (slope of t: 1, of t^2: 2 max |t|).
     lines = [0, *(k for k, column in enumerate(bank(), start=6) if column.group == 'board')]
     np.testing.assert_allclose(data.kelvins[lines], rms[lines], rtol=1e-6)
     assert data.kelvins[1] == pytest.approx(rms[1] / (2.0 * np.abs(t).max()), rel=0.02)

@@ -17,7 +17,7 @@ TAUS = (60.0, 900.0, 7680.0)
 
 @pytest.mark.parametrize('step_s', [0.5, 5.0, 77.0])
 def test_the_lag_of_a_ramp_agrees_with_the_closed_formula(step_s):
-    # For a ramp u = r t from rest, u - lagged u = r tau (1 - exp(-t / tau)), at any interval.
+    # For a ramp u = r t after a soak, u - lagged u = r tau (1 - exp(-t / tau)), at any interval.
     rate, n = 0.01, 200
     bank = LagBank(TAUS)
     for k in range(n + 1):
@@ -60,7 +60,7 @@ TWO_STAGES = Lag('board', 900.0, 150.0)
 
 
 def after_two_stages(times, board):
-    """Integrate two lags in series, from rest, with the board as input; return the output."""
+    """Integrate two lags in series after a soak, with the board as input; return the output."""
 
     def slope(t, parts):
         u = np.interp(t, times, board)
@@ -144,7 +144,7 @@ def test_the_lag_of_a_part_agrees_with_a_solver_if_the_thermometer_lags(rng, sec
     reading, _, part = solve_ivp(slope, (0.0, fine[-1]), [board[0]] * 3, t_eval=fine, rtol=1e-9,
                                  atol=1e-9, max_step=1.0).y  # fmt: skip
     behind = memory_on_grid(MemorySpec(lags=(lag,)), 1.0, reading, [reading])[:, 0]
-    # The memory interpolates the readings linearly between their stamps.
+    # `memory_on_grid` interpolates the readings linearly between their stamps.
     np.testing.assert_allclose(reading - behind, part, atol=1e-3)
     memory = ThermalMemory(MemorySpec(lags=(lag,)))
     for time, celsius in zip(fine, reading, strict=True):

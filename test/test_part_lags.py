@@ -102,7 +102,7 @@ def judged(calibration, study):
 
 def test_the_fitted_lag_of_each_axis_is_that_of_its_part(parts):
     unit, study, calibration, _ = parts
-    # A part that changes the bias by 10 ug/K lags by 10 K: 1 % of its time constant is 1 ug.
+    # In a ramp a part lags by 10 K and changes the bias by 10 ug/K: 1 % of its lag causes 1 ug.
     assert np.array(taus_of(calibration)) == pytest.approx(unit.part_s[:, None], rel=0.01)
     # The noise of |f| in a mean over 60 s is 0.65 ug.
     assert judged(calibration, study).norm < 2.0
@@ -339,7 +339,7 @@ def test_a_bias_decay_after_power_on_is_not_fitted_by_a_lag():
         for way, n in ((WARM, 12), (WARM_HELD, 4))
     )
     study = Study('', fit, one_test(held), {'full_scale': 32767.0})
-    # The bias decay has an RMS of 0.32 mg over a bag; the constants absorb its mean.
+    # The bias decay has an RMS of 0.32 mg over a bag, and a smaller mean, which constants absorb.
     assert judged(strangers.fitted(study), study).vector < np.sqrt(2.0) * 320.0
 
 

@@ -46,7 +46,7 @@ def case_and_board(t, corners, lag=LAG_S, start=20.0):
 
 
 def onsets(noise, quantum, rate_k_min, lag, n, *, dt=1.0, end_s=1500.0, soak_s=1500.0):
-    """Run n ramps; return switches after each onset, and the number of runs static at onset."""
+    """Run n ramps; return regime switches after each onset, and the number static at onset."""
     settings = detector_settings(noise, quantum, lag)
     collected, n_static = [], 0
     for seed in range(n):
@@ -223,7 +223,7 @@ def test_the_regime_is_unknown_until_there_are_enough_readings():
 
 
 def run_once(corners, *, noise=0.001, quantum=0.0, lag=LAG_S, begin=-1800.0, end=8000.0, **parts):
-    """Return the switches of a run; `parts`: functions of (t, readings) that change readings."""
+    """Return a run's regime switches; `parts`: functions of (t, readings) changing readings."""
     rng = np.random.default_rng(8)
     t = np.arange(begin, end)
     truths = dict(zip(('case', 'board'), case_and_board(t, corners, lag), strict=True))

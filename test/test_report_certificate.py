@@ -158,7 +158,7 @@ def test_the_uncertainty_budget_adds_up_to_the_claimed_sd(tmp_path):
     standards = {source.name: source.standard for source in budget(evidence(), CertificateInfo())}
     assert standards['gravity'] is None
     assert standards['thermometers'] is None
-    # The residual is below the claimed sd, so noise, attitude and model add up to the claimed sd.
+    # As the residual is below the claimed sd, `noise`, `attitude` and `model` add up to this sd.
     windows = evidence().judgement.windows
     claim = float(np.sqrt(np.mean(windows.claimed_sd[windows.is_inside] ** 2)))
     parts = [standards[name] for name in ('noise', 'attitude', 'model')]

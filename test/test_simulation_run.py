@@ -90,7 +90,7 @@ def test_a_further_error_source_does_not_change_the_random_numbers_of_other_sour
 
 
 def test_the_sum_of_counts_without_noise_is_the_integral_of_the_truth(unit):
-    """The sum of counts is that of ``bias + K scale inverse(M) f`` within one count."""
+    """Summed counts equal the integral of ``bias + K scale inverse(M) f`` within one count."""
     run = simulate(noiseless(unit), DEMO, UP, rate_hz=50.0)
     truth = run.truth
     s = truth.specific_force @ np.linalg.inv(unit.M).T

@@ -40,7 +40,7 @@ def unit(**given):
 
 
 def ramp(given, rate, hours, environment=units.CHAMBER):
-    """Ramp the air at `rate` [K/s] from equilibrium; return times [s] and node temperatures."""
+    """Ramp the air at `rate` [K/s] after a soak; return times [s] and node temperatures."""
     A, b, h = units.network(given, environment)
     at = np.arange(0.0, 3600.0 * hours, 10.0)
     return at, units.integrate(A, b, h, rate * at, 10.0, np.linalg.solve(A, -h))
@@ -57,7 +57,7 @@ def test_a_node_lags_a_ramp_by_its_time_constant():
 
 
 def test_the_integration_is_exact_at_each_step_of_a_ramp():
-    # The lag of x behind a ramp u from rest is u - x = rate * tau * (1 - exp(-t / tau)).
+    # The lag of x behind a ramp u after a soak is u - x = rate * tau * (1 - exp(-t / tau)).
     A, b, h = np.array([[-1 / 300.0]]), np.array([1 / 300.0]), np.zeros(1)
     at = np.arange(0.0, 1500.0, 5.0)
     states = units.integrate(A, b, h, 0.01 * at, 5.0, np.zeros(1))

@@ -15,7 +15,7 @@ FACES = np.concatenate((np.eye(3), -np.eye(3)))
 NOISE = 2.5e-3
 #: Lag behind the board of the part that determines the bias of each axis [s].
 LAGS_S = 180.0, 300.0, 120.0
-#: Time from the begin of a turn to that of the next turn, and duration of a turn [s].
+#: Time from the beginning of one turn to that of the next, and duration of a turn [s].
 DWELL_S, TURN_S = 400, 8
 
 
