@@ -43,7 +43,7 @@ class Truth:
     #: Correlated noise of the bias, in addition to white noise with an sd of `sigma`.
     noise: Noise = field(default_factory=Noise)
     offset_sd: float = 0.0
-    #: Sd of support tilts [rad] by a column of temperature with an RMS of 1.
+    #: Sd of the support tilt [rad] caused by a temperature column with an RMS of 1.
     tilt_sd: float = 0.0
 
     @property

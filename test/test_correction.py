@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The correction with all kinds of columns: equal bits in blocks, and the claimed sd."""
+"""With all kinds of columns, blocks and samples give equal bits, and the claimed sd is right."""
 
 import math
 from dataclasses import replace

@@ -42,7 +42,7 @@ def test_the_probability_of_a_first_passage_agrees_with_closed_forms():
         assert float((-1.0) ** k @ inside) == pytest.approx(1.0 - probability, abs=0.025)
         stays = 2.0 * (-1.0) ** (n + 1) @ np.exp(-((n * np.pi) ** 2) * rate * of_ball / 5000.0)
         assert stays == pytest.approx(1.0 - probability, abs=0.025)
-    # A random walk passes a nearer bound earlier, and a unit that does not age never passes it.
+    # A random walk passes a nearer bound earlier; a unit that does not age never passes a bound.
     assert walked(rate, bound, mean=30.0)[1] < walked(rate, bound)[1]
     assert walked(1e-12, bound) == (np.inf,) * 3
     assert walked(rate, bound, mean=51.0) == (0.0,) * 3

@@ -370,8 +370,8 @@ def test_an_update_by_three_positions_has_errors_near_the_claimed_sd(rng):
         out = aged.correct(np.arange(1.0, len(reading) + 1.0), reading)
         variance = np.diagonal(out.covariance, axis1=1, axis2=2) - 0.02**2
         ratios.append((out.specific_force - GRAVITY * corners) ** 2 / variance)
-    # Both fits are of a unit with six random changes, of scales and biases: the mean square of six
-    # normal numbers is uncertain by 60 %.
+    # The scales and biases of the unit have six random changes: the mean square of six normal
+    # numbers is uncertain by 60 %.
     assert np.mean(ratios) < 3.0
 
 

@@ -124,7 +124,7 @@ def drawn(rng, n, steps, noise):
 
 @pytest.mark.parametrize('noise', [Noise(1.0, 600.0), Noise(0.3, 2000.0), Noise(30.0, 300.0)])
 def test_variance_ratio_and_correlation_time_are_estimated(rng, noise):
-    # 240 correlation times of data determine the variance to 9 % and the time to about 15 %.
+    # 240 correlation times of data determine the variance to 9 %, the correlation time to 15 %.
     whitener, weight, series = drawn(rng, 9, 300, noise)
     fitted = whitener.estimate(5.0 * series, weight)
     assert 0.5 < fitted.ratio / noise.ratio < 2.0

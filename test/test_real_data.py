@@ -136,8 +136,8 @@ def test_the_error_of_the_freezer_run_on_held_out_minutes(
     assert len(raw) >= 17 * len(sets) // n_sets
     # One attitude does not determine the constants, so compare the sd of |a|.
     assert np.std(raw) / MG == pytest.approx(drift, abs=0.2)
-    # Means over 60 s have a noise of 0.19 mg. The first of five parts is outside the temperatures
-    # of its fit.
+    # Means over 60 s have a noise of 0.19 mg. The first of five held-out parts is at temperatures
+    # that the fit to the other parts does not contain.
     assert np.sqrt(np.mean(np.square(left))) / MG == pytest.approx(mg, rel=0.35)
 
 

@@ -129,7 +129,7 @@ def test_each_ramp_switches_the_regime_to_dynamic_once(noise, quantum, rate_k_mi
     delays, _ = onsets(noise, quantum, rate_k_min, lag, 2 if dt < 1.0 else 3, dt=dt, end_s=end_s)
     for each in delays:
         assert [regime for _, regime, _ in each] in ([DYNAMIC], [STATIC, DYNAMIC])
-        # The longest delay is that of two steps of 1 K at 0.2 K/min behind a lag of 15 min.
+        # A detection takes longest for two steps of 1 K at 0.2 K/min behind a lag of 15 min.
         assert each[-1][0] < 0.5 * end_s
 
 
@@ -167,8 +167,8 @@ def test_three_soaks_of_5_h_have_at_most_two_false_alarms(sensor):
 
 def test_the_rate_of_false_alarms_is_below_that_of_the_setting():
     # The setting allows 20 alarms per hour, 1000 in 50 h; the signal is noise. The threshold is
-    # set by Rice's formula for crossings, which come in groups, so there are fewer separate
-    # alarms. The lower limit shows that the detector is active.
+    # set by Rice's formula for crossings; as crossings come in groups, there are fewer separate
+    # alarms. The lower limit on the alarms excludes a detector that does nothing.
     settings = ThermometerSettings(0.01, lag_s=LAG_S)
     test = ChangeDetector(settings, 0.2 / 60.0, ripple=0.0, false_alarms=20.0 / 3600.0)
     rng = np.random.default_rng(6)
@@ -242,7 +242,7 @@ RAMP = [(0.0, 0.5), (3600.0, 0.0)]
 
 
 def test_the_dynamic_regime_ends_when_the_board_rate_is_below_the_relaxed_rate():
-    # The end is when the board's rate has been below 0.05 K/min for the dwell time, 60 s.
+    # The regime ends when the board's rate has been below 0.05 K/min for the dwell time, 60 s.
     changes = run_once(RAMP)
     assert [regime for _, regime, _ in changes] == [STATIC, DYNAMIC, STATIC]
     t = np.arange(3600.0, 12000.0)

@@ -232,7 +232,7 @@ def without_uncertainty(calibration):
 
 @pytest.mark.parametrize('is_known', [True, False])
 def test_values_and_deviations_have_equal_decimals_if_u_is_withheld(is_known, tmp_path):
-    # WHY: the scale was printed as -1777 ppm, its deviation as 23.12 ppm.
+    # WHY: the scale was printed without decimals, -1777 ppm, its deviation with two, 23.12 ppm.
     calibration = fitted().calibration
     if not is_known:
         calibration = without_uncertainty(calibration)

@@ -53,7 +53,7 @@ def test_the_claimed_sd_covers_a_start_in_a_ramp():
 
 
 def test_if_the_case_sensor_is_lost_the_gradient_is_its_last_value_at_rest():
-    # WHY: the board is 1 K warmer than the case, but after a loss of the case 0 K was assumed.
+    # WHY: the board is 1 K warmer than the case; without case readings 0 K was assumed.
     unit = calibration(response=(term('gradient', (30.0, 0.0, 0.0)),))
     compensator = Compensator(unit, UNCHECKED)
     corrected = []
@@ -284,7 +284,7 @@ def test_the_claimed_sd_grows_with_the_distance_from_the_range():
             line = correction.line(state, state, slow.at(state, nobody), 0.0)
             variances.append(line[list(VARIANCES), 0])
         assert (np.diff(variances, axis=0) > 0.0).all()
-        # If the true curve is constant beyond the edge, the error is within the claimed sd.
+        # If the true curve is constant outside the range, the error is within the claimed sd.
         slopes = np.abs(correction.curves.slopes(np.array([35.0]))[0, :3, 0]) / correction.K[:, 0]
         assert (np.sqrt(variances[3]) > 3.0 * np.abs(slopes)).all()
 

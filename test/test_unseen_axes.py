@@ -195,6 +195,6 @@ def test_the_claimed_sd_is_right_if_one_ramp_cannot_separate_bias_and_scale(draw
     study = Study('', tuple(bags[:15]), one_test(held), options)
     tests = {'': [strangers.minutes(bag) for bag in held]}
     score = strangers.scored(study, strangers.fitted(study), tests)['']
-    # A ramp in one attitude does not determine the slopes of the three scale factors. If their
-    # claimed sd is right, the RMS of error / claimed sd exceeds 1.9 for 1 % of all units.
+    # A ramp in one attitude does not determine the slopes of the three scale factors. If claimed
+    # sd are right, the RMS of error / claimed sd exceeds 1.9 for 1 % of all units.
     assert score.ratio < 1.9
