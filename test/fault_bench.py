@@ -175,7 +175,7 @@ class Bench:
         return n
 
     def meet(self):
-        """Send samples, stamped after all bags, until the node publishes; copy its counters."""
+        """Send samples, stamped after all bags, until the node publishes; read its counters."""
         pause = threading.Event()
         standing = _STANDING.copy()
         for k in range(1000):

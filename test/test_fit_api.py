@@ -132,7 +132,7 @@ def test_a_bag_of_another_environment_is_excluded_and_increases_the_claimed_sd()
     for unit in (joint, later):
         (note,) = [note for note in unit.provenance.notes if note.startswith('environment: r4')]
         assert 'did not use these data' in note
-        # The added variance covers the bias error in bag r4, up to 1.1 mg above the knee.
+        # The variance added because of bag r4 covers the bias error in r4, up to 1.1 mg.
         more = sd_of_a_correction(unit) ** 2 - sd_of_a_correction(alone) ** 2
         assert 0.5 < true_error / np.sqrt(more.mean()) < 1.5
     # A new bag whose bias slope is that of the first four bags gives no note on its environment.
