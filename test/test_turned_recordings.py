@@ -78,7 +78,7 @@ def test_a_lag_is_corrected_at_twice_the_rates_of_the_fit():
 
 def test_the_claimed_sd_of_a_mems_with_a_single_turn_on_is_0_3_to_1_5_mg():
     # WHY: one recording does not show how much the bias changes at a turn-on. The claimed sd was
-    # too small: a MEMS that changes by 0.6 mg erred by 5 times its claimed sd after a turn-on.
+    # too small: a bias change of 0.6 mg at a turn-on of a MEMS was 5 times the claimed sd.
     rng = np.random.default_rng(3)
     bag, *_ = turned(rng, ((0.0, 20.0), (9000.0, 20.0)), 'one')
     unit = tc.fit([bag], gravity=GRAVITY, input='m/s^2')
