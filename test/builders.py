@@ -194,8 +194,8 @@ def batch(compensator, events):
 
 def assert_equal_bits(unit, config, events, chunk):
     """
-    Check that one block of all events, and blocks of `chunk` events, give the same bits as single
-    samples; return the rows of the single samples, the whole block and the three compensators.
+    Check that a block of all events, blocks of `chunk` events and single events give equal bits.
+    Return the rows by single events, the block of all events, and the three compensators.
     """
     streamed, whole, cut = (Compensator(unit, config) for _ in range(3))
     rows, index = stream(streamed, events)

@@ -51,8 +51,8 @@ def test_the_demonstration_prints_the_output_shown_on_the_pages(tmp_path, monkey
         rows = re.findall(rf'^{section} +([a-z ]+?) +\d+ +([\d.]+) ', printed, re.MULTILINE)
         assert len(rows) == 4, printed
         raw, node, two_sets, one_set = (float(rms) for _, rms in rows)
-        # One set cannot describe the difference of the regimes, two sets cannot describe lags: the
-        # node must be better than both. Noise is below 10 ug.
+        # A curve for both regimes lacks their difference, a curve per regime lacks lags: the node
+        # must have a smaller error than both. Noise is below 10 ug.
         assert raw > 150.0
         assert node < 10.0
         assert node < 0.5 * min(one_set, two_sets)

@@ -134,7 +134,7 @@ def test_a_bend_has_slopes_over_board_temperature_and_lag():
     state = np.zeros((StateLayout(spec).width, 1))
     lag = StateLayout(spec).places[Lag('board', 60.0)]
     state[BOARD], state[lag] = 24.0, 0.5
-    # Slopes over the quantity of each column (t, lag), then over the board temperature.
+    # Slopes of both columns: over t and over the lag, then over the board temperature.
     assert np.ravel(table.slopes(state)).tolist() == [1.0, -1.0, 1.0, 1.0]
     state[BOARD] = 21.0
     assert not np.any(table.slopes(state))

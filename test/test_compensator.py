@@ -37,8 +37,8 @@ NOISE = 1e-4**2 / 0.01 + (1.0 / 6.0) / 300.0**2
 
 
 def test_the_offset_is_half_the_sum_of_signed_counts():
-    # From counts at +g and -g: offset = sum / 2, scale = difference / 2. The paper prints Eq. (3)
-    # and (4) with sum and difference exchanged.
+    # From counts at +g and -g: offset = sum / 2, scale = difference / 2. Golovach's paper has sum
+    # and difference exchanged in its Eq. (3) and (4).
     plus, minus = 300.0 * GRAVITY + 12.0, -300.0 * GRAVITY + 12.0
     axis = AxisReference((plus - minus) / 2.0 / GRAVITY, (plus + minus) / 2.0)
     compensator = Compensator(calibration(axes=Axes(*[axis] * 3)))
@@ -48,7 +48,7 @@ def test_the_offset_is_half_the_sum_of_signed_counts():
 
 
 def test_a_corrected_sample_agrees_with_the_formula_of_the_static_set():
-    # The expected values are the formula of the static set at t = 10 K without a gradient or rate.
+    # Expected: the formula of the static set at t = 10 K, for a gradient and a rate of 0.
     axis = axis_set((0.0, 0.5, 0.01), (1.0, 1e-4), delta=2.0)
     unit = calibration(
         axes=equal_axes(300.0, 7.0),
@@ -111,8 +111,8 @@ def at_seconds(*events):
     ]
 
 
-# In the explicit examples a reading that was applied before, or a reading one day later, shows
-# that stored readings have stamps of another clock.
+# In the explicit examples the step of the stamp from a reading that was already applied, or that
+# is a day ahead, to the next reading shows whether both are from one clock.
 @given(event_lists, st.integers(3, 30), st.sampled_from([0.0, 5.0]))
 @example(at_seconds('A', 3, 'A', 0, 'B', 2, 'B', 86_400, 'C', 0, 'A', 0), 5, 0.0)
 @example(at_seconds('B', 26, 'B', 21, 'A', 23, 'B', 16.5), 1, 0.0)
@@ -285,7 +285,7 @@ def test_a_new_transition_time_does_not_restart_the_check_of_gravity(rng):
     other = replace(compensator.config, transition_time_s=50.0)
     compensator.take_over(compensator.thermal.model, other)
     assert published(range(65, 70), 1.3 * count_per_g) == 0
-    # A change of the tolerance restarts the check.
+    # A change of the tolerance of |f| restarts the check of |f|.
     other = replace(other, gravity_tolerance_m_s2=5.0)
     compensator.take_over(compensator.thermal.model, other)
     assert published(range(70, 75), 1.1 * count_per_g) > 0

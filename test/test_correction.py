@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The correction with all kinds of columns: equal bits in blocks, and the claimed sd."""
+"""With all kinds of columns, blocks and samples give equal bits, and the claimed sd is right."""
 
 import math
 from dataclasses import replace
@@ -171,7 +171,7 @@ def test_corrections_drawn_from_the_posterior_scatter_by_the_claimed_sd(rng):
             # The covariance of n draws is uncertain by at most 8 % of the product of both sd.
             sds = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
             assert (np.abs(claimed - expected) < 0.33 * sds).all()
-            # Claimed and drawn variances agree in all directions, so correlations agree, too.
+            # Claimed variances equal those of the draws in all directions, so correlations agree.
             root = np.linalg.inv(np.linalg.cholesky(expected))
             assert np.abs(root @ claimed @ root.T - np.eye(3)).max() < 0.5
 

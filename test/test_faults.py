@@ -3,7 +3,7 @@
 """
 For each row of the fault table the output of compensator and diagnostics is compared with the
 truth. Rows about the order of arrival are also sent over DDS to a node process, whose output must
-equal that without DDS.
+equal the output without DDS.
 """
 
 from copy import deepcopy
@@ -78,7 +78,7 @@ def undisturbed():
 
 
 def direct(events):
-    """Run events; up to the first group with a fault, use the results of the undisturbed run."""
+    """Return the output for events; reuse the undisturbed run up to the first difference."""
     given, known = list(lots(events)), undisturbed()
     n = next((k for k, lot in enumerate(given) if lot != known[k][0]), len(given))
     run = deepcopy(known[n][1])

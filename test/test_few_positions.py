@@ -47,8 +47,8 @@ def left_by(pair, **options):
 @pytest.mark.slow
 def test_two_positions_determine_the_thermal_response():
     # Noise of 9 ug/sqrt(Hz) is 1.2 ug in means over 60 s; 128 means determine the sd to 6 %, and
-    # superfluous columns may increase the sd by 10 %. Over all 36 pairs of bags the median sd is
-    # 1.3 ug (docs/accuracy.md).
+    # superfluous columns may increase the sd by 10 %. Over all 36 pairs of fitted bags the sd of
+    # the corrected means has a median of 1.3 ug (docs/accuracy.md).
     assert left_by((1, 2)) == pytest.approx([1.2] * 3, rel=0.3)
 
 
@@ -122,9 +122,9 @@ def test_one_position_gives_bias_over_temperature_on_three_axes(one_position):
 def test_one_position_leaves_the_scale_at_its_prior(one_position):
     calibration = one_position.calibration
     for axis in calibration.static.axes():
-        # Each power of the scale curve has a prior sd of 1e-4 at the RMS of its column.
+        # By the prior each power of t changes the scale by 1e-4 (sd) at the RMS of this power.
         assert np.abs(axis.scale_function.value(np.array([-4.0, 15.0])) - 1.0).max() < 5e-4
-    # The prior sd of a MEMS are 5 % for the scale and 0.01 for the misalignment.
+    # For a MEMS the prior sd of scale factors is 5 %, that of misalignments 0.01 rad.
     sd = np.sqrt(np.diag(calibration.posterior.covariance()))
     for block in parameter_layout(calibration).scale:
         assert sd[block.static] == pytest.approx(0.05, rel=0.3)
@@ -136,7 +136,7 @@ def test_one_position_leaves_the_scale_at_its_prior(one_position):
 
 def test_after_soaks_in_one_position_the_drift_error_is_within_three_claimed_sd(rng):
     # WHY: norms in one attitude do not separate bias and scale. The fit attributed the drift to
-    # the scale, and claimed an sd of 0 for the drift of the bias, which was wrong on two axes.
+    # the scale; the bias drift was wrong on two axes, with a claimed sd of 0.
     slope = 0.1 * SLOPE
     bags = []
     for celsius in (5.0, 20.0, 35.0):
@@ -161,12 +161,12 @@ def test_rests_at_three_temperatures_give_the_bias_slope_despite_a_warm_up_of_th
     calibration, at = result.calibration, np.array([6.0, 36.0])
     curves = [axis.bias_function for axis in calibration.static.axes()]
     slopes = np.array([np.diff(curve.value(at))[0] / 30.0 for curve in curves])
-    # The norm of a rest has a noise of 1 ug, and due to the warm-up by 1 K the sensor's
-    # temperature in a rest is uncertain by 0.1 K.
+    # The mean |f| of a rest has a noise of 1 ug. As the board warms up by 1 K, the temperature of
+    # the sensor in a rest is uncertain by 0.1 K.
     np.testing.assert_allclose(slopes, 0.1 * MG * SLOPE, atol=0.002 * MG)
     assert 'misfit' not in names_of(result)
-    # Soaks do not determine the weight of a lag column, which is at most the bias slope: the
-    # claimed sd of this weight is between half of the bias slope and the bias slope.
+    # Soaks do not determine the weights of lags; their claimed sd is between half of the bias
+    # slope and the bias slope, the largest possible weight.
     variance, layout = np.diag(calibration.posterior.covariance()), parameter_layout(calibration)
     of_lags = [variance[block.response : block.end].sum() for block in layout.bias]
     assert 0.5 < np.sqrt(np.mean(of_lags) / np.mean(slopes**2)) < 1.0
@@ -203,7 +203,7 @@ def test_tilts_of_two_supports_are_not_taken_for_a_scale_slope_of_a_level_axis(r
     # 15000 samples (noise 0.1 mg) determine the mean bias slope of the two rests to 1 ug/K.
     assert np.diff(z.bias_function.value(at))[0] == pytest.approx(MG, abs=0.01 * MG)
     # With a force of 0.03 g, an error of 1 ug/K is 33 ppm/K of the scale factor, and the
-    # difference of two rests with such errors is 47 ppm/K; the limit is ten times this.
+    # difference of two rests with such errors is 47 ppm/K; the limit is 470 ppm/K.
     assert abs(np.diff(z.scale_function.value(at))[0]) < 10.0 * 47e-6
 
 
@@ -227,7 +227,7 @@ def test_positions_without_a_thermometer_give_constants_and_wide_temperature_slo
     out = calibration.correct([1.0], [[0.1, -0.2, GRAVITY + 0.3]])
     np.testing.assert_allclose(out.specific_force, [[0.0, 0.0, GRAVITY]], atol=0.02)
     left = np.array([0.05, 0.05, np.hypot(0.05, 2e-3 * GRAVITY)])
-    # The sd of an output: 0.02 m/s^2 noise of a sample, and 10 K times the slopes' sd (`left`).
+    # Sd of an output: noise of a sample, 0.02 m/s^2, and 10 K times the sd of the slopes, `left`.
     np.testing.assert_allclose(
         np.sqrt(np.diagonal(out.covariance[0])), np.hypot(left, 0.02), rtol=0.05
     )
@@ -273,8 +273,8 @@ def test_the_bias_sd_of_one_recording_contains_the_sd_of_a_turn_on(rng):
 
 @pytest.mark.slow
 def test_the_claimed_variance_of_a_curve_contains_that_of_turn_ons_at_each_temperature(rng):
-    # WHY: the claimed variance was 1.6 to 1.9 times that of a turn-on, as turn-ons at three
-    # temperatures were taken for an error of the mean offset, not of the curve.
+    # WHY: the claimed variance was 1.6 to 1.9 times the variance of a turn-on, because turn-ons at
+    # three temperatures were counted as an error of the mean bias, not of the curve.
     turn_on, ups, dwell = 5e-3, positions(9, 3), 600
     bags = []
     for celsius in (-15.0, 20.0, 55.0):
@@ -287,9 +287,9 @@ def test_the_claimed_variance_of_a_curve_contains_that_of_turn_ons_at_each_tempe
     unit = tc.fit(bags, gravity=GRAVITY, input='m/s^2', mounting_sd=turn_on)
     for bag in (bags[0], bags[2]):
         out = unit.correct(bag.time_s, bag.counts, board=bag.temperatures['board'])
-        # At the ends of the range a curve through three equidistant points has 5/6 (line) to 1
-        # (parabola) times the variance of a turn-on, which the next turn-on adds once more. If
-        # `mounting_sd` is the sd of nine independent mountings, bias and scale add 1/3 each.
+        # V: variance of a turn-on. At the ends of the range a line through three equidistant
+        # points has the variance 5/6 V, a parabola V; the next turn-on adds V. Nine independent
+        # mountings with an sd of `mounting_sd` add V / 3 by the bias, and V / 3 by the scale.
         variance = np.diagonal(out.covariance[-dwell:].mean(axis=0)) - 1e-3**2
         assert ((1.0 + 5.0 / 6.0) * turn_on**2 < variance).all()
         assert (variance < (1.0 + 1.0 + 2.0 / 3.0) * turn_on**2).all()
@@ -370,16 +370,16 @@ def test_an_update_by_three_positions_has_errors_near_the_claimed_sd(rng):
         out = aged.correct(np.arange(1.0, len(reading) + 1.0), reading)
         variance = np.diagonal(out.covariance, axis1=1, axis2=2) - 0.02**2
         ratios.append((out.specific_force - GRAVITY * corners) ** 2 / variance)
-    # Both fits are of a unit with six random changes, of scales and biases: the mean square of six
-    # normal numbers is uncertain by 60 %.
+    # The scales and biases of the unit have six random changes: the mean square of six normal
+    # numbers is uncertain by 60 %.
     assert np.mean(ratios) < 3.0
 
 
 @pytest.mark.parametrize('size', [1, 6])
 def test_turn_ons_between_six_faces_are_not_taken_for_a_misalignment(rng, size):
-    # WHY: with a turn-on (sd 1 mg) in each of six faces, the fit found misalignments of 20 mrad;
-    # with three turn-ons of six faces each, the fit assumed 18 independent offsets, and claimed an
-    # sd of the misalignments of 5 to 12 mrad.
+    # WHY: with a turn-on (sd 1 mg) in each of six faces the fit found misalignments of 20 mrad.
+    # With three turn-ons of six faces each the fit assumed 18 independent offsets, so the claimed
+    # sd of the misalignments was 5 to 12 mrad.
     M = np.array([[1.0, 0.0, 0.0], [2e-3, 1.0, 0.0], [-2e-3, 1e-3, 1.0]])
     sensed = np.linalg.inv(M)
     faces = np.vstack((np.eye(3), -np.eye(3)))

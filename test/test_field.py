@@ -94,7 +94,7 @@ def test_an_update_with_the_true_variances_equals_a_kalman_filter():
         bias, scale = layout.bias[axis].static, layout.scale[axis].static
         sd = np.sqrt(solved.posterior[bias, bias]) / field_units.K
         expected = best.state[axis] + best.state[15 + axis]
-        # The update averages the rests of a turn-on to a few rows: an error below 0.2 sd.
+        # The update averages rests of a turn-on to a few rows, which errs by less than 0.2 sd.
         assert abs(solved.shift[bias] / field_units.K - expected) < 0.2 * sd
         P = best.P[np.ix_([axis, 15 + axis], [axis, 15 + axis])].sum()
         assert sd == pytest.approx(np.sqrt(P), rel=0.1)
@@ -178,15 +178,15 @@ def test_the_sd_of_an_old_calibration_aged_to_the_last_rest_includes_the_random_
     walk = np.cumsum(60.0 / np.sqrt(3.0) * MICRO_G * rng.standard_normal((90, 3)), axis=0)
     logged = rests(unit, upright, lambda day: walk[round(3 * day)], 30)
     x, y, z = update(series_of(logged, unit), unit).axis_changes
-    # The bias of x has an sd of 10 ug. At rest z reads bias plus scale error, 10 ug each.
+    # The bias of x has an sd of 10 ug; at 1 g bias and scale of z have an sd of 10 ug each.
     residual = unit.static.x.residual_sd_m_s2
     assert x.claimed_sd == pytest.approx(np.hypot(10.0 * MICRO_G, residual), rel=0.01)
     assert z.claimed_sd == pytest.approx(np.hypot(np.sqrt(200.0) * MICRO_G, residual), rel=0.01)
-    # Rests in one attitude do not separate bias and scale: the ageing model gives the bias of x
-    # and y between half and all of the variance of the random walk.
+    # Rests in one attitude do not separate bias and scale: the ageing model attributes between
+    # half and all of the variance of the random walk to the biases of x and y.
     for axis in (x, y):
         assert 0.5 < axis.present_sd / (329.0 * MICRO_G) < 1.5
-    # The present sd of z must be the size of the change of z to 40 ug, two sd of a turn-on offset.
+    # The present sd of z must equal the change of z within 40 ug, two sd of a turn-on offset.
     assert z.present_sd == pytest.approx(abs(walk[-1, 2]), abs=40.0 * MICRO_G)
 
 
@@ -215,7 +215,7 @@ def test_a_change_of_gravity_is_not_taken_for_a_change_of_three_scales(day):
     (text,) = (line for line in change_texts(result) if 'as if gravity' in line)
     assert text.startswith('from 2026-')
     assert 'as if gravity were not the stated 9.80665 m/s^2: no scale was changed' in text
-    # If the user states gravity as certain, the update attributes the step to the three scales.
+    # If gravity is stated as certain, the update takes the step of |f| for three scale changes.
     certain = update(series_of(stepped(history, size, day), unit), unit, is_gravity_certain=True)
     assert certain.solution.gravity == ()
     assert all(axis.scale > 150e-6 for axis in certain.axis_changes)
@@ -447,9 +447,9 @@ def test_an_unknown_regime_after_a_turn_on_does_not_increase_the_noise_of_a_rest
 
 @pytest.mark.parametrize('lags', [0.0, 1.0])
 def test_unknown_initial_lag_states_are_not_taken_for_scatter_of_rests(rng, lags):
-    # A turn-on has three rests, in which 100, 70 and 40 % of the initial lag states remain. Sd of
-    # walks per root day: bias 15, scale 10 ug; turn-ons 20 ug, rests 3 ug; initial lag states:
-    # `lags` times the assumed sd (40 to 100 ug).
+    # A turn-on has three rests, in which 100, 70 and 40 % of the initial lag states remain. Random
+    # walks grow by 15 ug (bias) and 10 ug (scale, at 1 g) per root day; sd of turn-ons: 20 ug, of
+    # rests: 3 ug, of initial lag states: `lags` times the assumed sd (40 to 100 ug).
     unit = rich_calibration()
     each = series_of(with_shares(rests(unit, in_any_attitude, no_error, days=60), 1.0), unit)
     n, names = len(each), [k for k, v in vars(each).items() if isinstance(v, np.ndarray)]

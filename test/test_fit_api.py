@@ -20,7 +20,7 @@ UPS = np.array(
 
 
 def recording(up, rng, slope=None):
-    """Simulate times [s], samples [m/s^2] and board [degC] for two hours: 10, 32, 12 degC."""
+    """Simulate times [s], samples [m/s^2] and board [degC]: in two hours from 10 to 32 to 12."""
     time_s = np.arange(0.0, 7200.0, 2.0)
     board = np.interp(time_s, (0.0, 600.0, 3600.0, 7200.0), (10.0, 10.0, 32.0, 12.0))
     bias = (SLOPE if slope is None else slope) * MICRO_G * np.maximum(board - KNEE_C, 0.0)
@@ -132,9 +132,9 @@ def test_a_bag_of_another_environment_is_excluded_and_increases_the_claimed_sd()
     for unit in (joint, later):
         (note,) = [note for note in unit.provenance.notes if note.startswith('environment: r4')]
         assert 'did not use these data' in note
-        # The increase covers the true error in bag r4, a bias up to 1.1 mg above the knee.
+        # The variance added because of bag r4 covers the bias error in r4, up to 1.1 mg.
         more = sd_of_a_correction(unit) ** 2 - sd_of_a_correction(alone) ** 2
         assert 0.5 < true_error / np.sqrt(more.mean()) < 1.5
-    # A new bag with the bias slope of the first four bags is not reported as another environment.
+    # A new bag whose bias slope is that of the first four bags gives no note on its environment.
     again = tc.fit(columns_of([SLOPE] * 5)[-1:], gravity=G, input='m/s^2', prior=alone)
     assert not [note for note in again.provenance.notes if note.startswith('environment')]

@@ -112,13 +112,13 @@ def test_the_paper_s_model_fits_a_unit_of_the_paper_s_physics(golovach):
     assert calibration.response == ()
     assert calibration.provenance.model == 'golovach'
     for row in golovach.residuals[1:]:
-        # The paper's model has a curve per regime; residuals of a single curve are not computed.
+        # Golovach's model has a curve per regime; residuals of a single curve are not computed.
         assert not row.one_set.n
         assert row.two_sets.rms < row.raw.rms, row.section
-    # The paper's model has a linear static set and a quadratic dynamic set.
+    # In Golovach's model the bias is linear in the static set, quadratic in the dynamic set.
     assert calibration.static.x.bias_function.n_free == 1
     assert calibration.dynamic.x.bias_function.n_free == 2
-    # The errors of the biases are below the largest residual of the paper's model.
+    # The errors of the biases are below the largest residual of Golovach's model.
     left = golovach.residuals[-1].fitted
     bias, scale, M = constants(calibration)
     error = (bias - PAPER.bias_at_reference) / np.array(PAPER.counts_per_micro_g)

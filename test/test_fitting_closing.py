@@ -124,7 +124,7 @@ def drawn(rng, n, steps, noise):
 
 @pytest.mark.parametrize('noise', [Noise(1.0, 600.0), Noise(0.3, 2000.0), Noise(30.0, 300.0)])
 def test_variance_ratio_and_correlation_time_are_estimated(rng, noise):
-    # 240 correlation times of data determine the variance to 9 % and the time to about 15 %.
+    # 240 correlation times of data determine the variance to 9 %, the correlation time to 15 %.
     whitener, weight, series = drawn(rng, 9, 300, noise)
     fitted = whitener.estimate(5.0 * series, weight)
     assert 0.5 < fitted.ratio / noise.ratio < 2.0
@@ -162,8 +162,8 @@ def score(drift, norms=(), by_thermometer=0.0):
 
 def test_few_norms_that_both_models_predict_do_not_select_the_model():
     # WHY: a MEMS was recorded in six faces at three temperatures. Only four left-out values of |f|
-    # could be predicted both with and without a curve over temperature. The curve reduced their
-    # errors by less than two standard errors, so the fit left it out: the force error was 7 mg.
+    # could be predicted both with and without a curve over temperature. As the curve reduced the
+    # four errors by less than two standard errors, the fit rejected it: the force error was 7 mg.
     constants = score(20.0, [22.4, 457.7, 54.6, 26.1])
     curve = score(20.0, [16.8, 21.0, 22.5, 25.2])
     assert not is_better(constants, curve)
@@ -174,12 +174,12 @@ def test_few_norms_that_both_models_predict_do_not_select_the_model():
 
 def test_a_larger_model_must_not_explain_the_errors_of_a_coarse_thermometer():
     # WHY: readings in steps of 1 K have equal errors in all bags of one temperature program. Knees
-    # in the curve halved the left-out drift, but doubled the error in another program.
+    # of a curve halved the left-out drift, but doubled the error in other temperature programs.
     by_thermometer = 49.0
     curve, parts, bends = (score(drift, (), by_thermometer) for drift in (120.0, 46.0, 20.0))
     assert is_better(curve, parts)
     assert not is_better(parts, bends)
-    # Errors of |f| above those by the thermometer (49 ug) select the curve that reduces them.
+    # The curve is chosen if it reduces errors of |f| larger than the thermometer's, 49 ug.
     flat, curved = (score(46.0, size * np.ones(9), by_thermometer) for size in (3000.0, 60.0))
     assert is_better(flat, curved)
     assert not is_better(curved, score(20.0, 30.0 * np.ones(9), by_thermometer))

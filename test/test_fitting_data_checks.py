@@ -93,8 +93,8 @@ def test_missing_data_of_a_test_are_reported(good, name, changed, message):
 
 
 def test_the_noise_of_soaks_is_not_taken_for_a_ramp_or_for_exchanged_sensors(good, rng):
-    # WHY: bags of soaks were refused, because noise of the readings in rate and gradient was taken
-    # for ramps with exchanged sensors.
+    # WHY: bags of soaks were refused, because noise of readings gave rates and gradients as in
+    # ramps with exchanged thermometers.
     windows, up = good
     noise = rng.standard_normal(len(windows.rate))
     soaks = 5.0 + 15.0 * (windows.data.position % 3)

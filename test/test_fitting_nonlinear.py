@@ -49,7 +49,7 @@ SIZES = np.tile([GRAVITY, 30.0, 60.0, 95.0], 6)
 
 
 def table(rng, k2=0.0, kq=0.0, k3=0.0, *, share=0.01, radius_sd=0.0, radius_error=0.0):
-    """Draw windows of 24 positions on a centrifuge; terms grow by 100 * `share` % per K."""
+    """Draw windows at 24 centrifuge positions; nonlinear terms grow by 100 * `share` % per K."""
     truth = Truth(on_bias=np.zeros((3, 6)), on_scale=np.zeros((3, 6)), offset_sd=MICRO)
     windows, up = table_of(truth, 24, rng, n_windows=10)
     t = windows.columns[:, 0]

@@ -325,7 +325,7 @@ def test_thermometer_settings_are_estimated_from_readings(quantum, noise, rng):
 @pytest.mark.parametrize('noise', [0.02, 0.05, 0.09])
 def test_readings_that_alternate_at_edges_of_1_k_steps_show_their_noise(noise, rng):
     learned = learn_thermometer([soak_ramp_soak(1.0, noise, rng)], ThermometerSettings())
-    # The readings pass each of 30 rounding edges once; only the two slowest passes show noise.
+    # The readings cross 30 rounding edges; noise shows only at the two slowest crossings.
     assert learned.noise_sd_c == pytest.approx(noise, rel=0.3)
 
 
@@ -391,8 +391,8 @@ def test_a_drift_averages_the_error_of_rounding(rng):
 
 @pytest.mark.parametrize('step', [1.0, 0.04])
 def test_steps_of_a_converter_after_a_constant_soak_do_not_divide_a_rest(rng, step):
-    # WHY: the step of the converter was searched in the first 20000 samples only. If these samples
-    # were constant, each later step of the converter began a new rest.
+    # WHY: the step of the converter was searched in the first 20000 samples only. After 20000
+    # constant samples each step of the converter began a new rest.
     rest = Rest(rng, duration_s=3600.0, sd=0.0)
     ramp = np.maximum(rest.time - 1800.0, 0.0) / 1800.0
     rest.accel = np.rint(rest.accel / 0.04 + 6.0 * np.outer(ramp, (1.0, -1.3, 0.7))) * step

@@ -151,7 +151,7 @@ def solved(request):
     windows = replace(windows, weight=weight, bag=bag, pose=pose)
     regression, state = begin(windows, up)
     # The derivatives of the regression omit products of parameter changes. In one or two poses
-    # bias, scale and misalignment are undetermined; narrow priors keep the products small.
+    # bias, scale and misalignment are undetermined; narrow priors keep these products small.
     narrow = {'scale_sd': 1e-5, 'misalignment_sd': 1e-5, 'bias_sd': np.full(3, 1e-4)}
     narrow['column_sd'] = column_sd(('curve', 'board'), 1e-2, 1e-5)
     narrow = narrow if pose_of else {}
@@ -250,8 +250,8 @@ def refit_of(whole, regression, prior, kept):
 
 
 #: The left-out score is computed by linear steps from the fit to all rows. With the groups LINEAR
-#: the model is linear in all parameters but directions, and the score is exact. With PRODUCTS the
-#: score neglects the product of the changes of an initial lag state and of its weight.
+#: the model is linear in all parameters but attitudes, and the score is exact. With PRODUCTS the
+#: score neglects (change of an initial lag state) * (change of the weight of this lag).
 LINEAR, PRODUCTS = ('curve',), ('curve', 'board')
 
 
@@ -320,7 +320,7 @@ def test_a_position_that_alone_determines_a_parameter_has_no_left_out_norm(rng):
     score = score_of(regression, mode)
     assert np.isnan(score.force).all()
     assert np.isnan(score.norms.square).all()
-    # The drift of a left-out position does not depend on bias and scale, so its score is finite.
+    # The drift of a left-out position does not depend on bias and scale, so the drift has a score.
     # M keeps its prior mean and sd.
     assert np.isfinite(score.positions.square).all()
     np.testing.assert_allclose(mode.state.misalignment, 0.0, atol=1e-6)
@@ -399,8 +399,8 @@ def test_published_huygens_coefficients_come_back(rng):
 
 @pytest.mark.parametrize('noise', [Noise(), Noise(0.5, 1500.0)])
 def test_scores_of_inactive_columns_agree_with_a_fit_in_which_they_are_active(noise):
-    # In a linear problem S is the inverse covariance of the weights that inactive columns would
-    # have in a fit with these columns, and S^-1 Q is the estimate of these weights.
+    # In a linear problem a fit with the inactive columns would give their weights the covariance
+    # S^-1 and the values S^-1 Q (S: sparsity factor, Q: quality factor).
     truth, asked = Truth(noise=noise), np.isin(GROUPS, ('board', 'idle'))
     windows, up = table_of(truth, 12, np.random.default_rng(4), n_windows=30)
     regression, state = begin(without_starts(windows), up)
@@ -431,8 +431,8 @@ def test_scores_of_inactive_columns_agree_with_a_fit_in_which_they_are_active(no
 
 
 def test_inactive_and_active_columns_share_initial_lag_states(solved):
-    # WHY: the prior of the sum of the initial lag states was left out. If the bias has the lag of
-    # an inactive column of the scale, the information S on this column was 50 times too large.
+    # WHY: S lacked the prior of the sum of initial lag states. For an inactive column of the scale
+    # whose lag also changes the bias, the information S was 50 times too large.
     regression, prior, mode = solved
     of_scale = np.isin(GROUPS, ('board',)) * [[0.0], [1.0]]
     without = replace(prior, column_sd=np.where(of_scale > 0.0, 0.0, prior.column_sd))

@@ -94,7 +94,7 @@ def test_each_tried_model_has_a_left_out_error(calm):
     assert rms[()] > 2.0 * rms['curve',] > 10.0 * rms['curve', 'board']
     (chosen,) = (trial for trial in selected.trials if trial.is_chosen)
     assert chosen.score is selected.score
-    # By errors of the fit the left-out error is above the white noise, by 15 % at most.
+    # Errors of the fit make the left-out error larger than white noise, by 15 % at most.
     assert 1.0 < selected.score.rms / truth.sigma[0] < 1.15
     assert all(is_better(trial.score, selected.score) for trial in selected.trials[:2])
 
@@ -150,8 +150,8 @@ def test_estimated_noise_parameters_agree_with_the_truth(noisy):
 def test_flicker_noise_has_several_correlation_times():
     # WHY: with a single correlation time, initial lag states and tilts fitted the slower part of
     # flicker noise, and the errors of the biases were 1.9 claimed sd RMS.
-    # WHY: flicker noise whose shortest correlation time is below 3 windows was taken for noise of
-    # one correlation time, because its variance was not yet estimated at the comparison.
+    # WHY: flicker noise with a shortest correlation time below 3 windows was taken for noise of
+    # one correlation time: both models were compared before the noise variance was estimated.
     errors = []
     for seed, time_s in ((0, 400.0), (5, 400.0), (6, 400.0), (6, 180.0)):
         truth = Truth(noise=Noise(4.0, time_s, 3))
@@ -178,8 +178,8 @@ def test_rounding_removes_no_correlation_time_from_the_search():
 
 
 def test_the_estimated_prior_sd_of_a_column_is_the_rms_of_its_true_weights(calm):
-    # sd^2 = sum of squared weights / effective parameters (3 per column). A hyperprior with an sd
-    # of ln 10 moves ln sd towards its centre by 1 / (2 x 3 x 5.3) of the distance.
+    # Prior variance of a column: sum of its squared weights / 3 effective parameters. A hyperprior
+    # with an sd of ln 10 moves ln sd to its centre by 1 / (2 x 3 x 5.3) of the distance.
     regression, chosen, truth = calm
     true = np.sqrt(np.mean((truth.on_bias * regression.rms) ** 2, axis=0))
     np.testing.assert_allclose(chosen.posterior.prior.column_sd[0, :4], true[:4], rtol=0.25)
@@ -341,8 +341,8 @@ def test_the_variance_of_initial_lag_states_is_estimated(start_sd, lower, upper)
 
 @pytest.mark.parametrize('offset', [0.0, 30.0])
 def test_the_evidence_selects_the_sd_of_an_informative_prior(calm, offset):
-    # The unit differs from the prior's mean by 0 or by 30 sd; candidates are the prior, and the
-    # prior with 100 times the sd.
+    # The unit differs from the mean of the prior by 0 or by 30 sd; the fit chooses between the sd
+    # of the prior and 100 times this sd.
     _, selected, truth = calm
     state = selected.posterior.state
     regression, _ = begin(calm[0].windows, state.up)
@@ -428,8 +428,8 @@ def test_the_drift_of_scale_factors_determines_the_sd_of_turn_on_offsets():
     candidates = candidates_of(windows, ('curve', 'board'))
     candidates = replace(candidates, typical=candidates.typical * ~IDLE)
     posterior = select(regression, state, constants(truth), candidates).posterior
-    # Changes of |f| with the scale factors determine the 27 offsets, except for 9 combinations
-    # that equal changes of constants. 18 offsets determine their sd to 1 / sqrt(2 * 18), 17 %.
+    # The drift of |f| with the scale factors determines 18 of 27 combinations of offsets; 9 equal
+    # changes of constants. 18 numbers determine their sd to 1 / sqrt(2 * 18), 17 %.
     assert posterior.prior.offset_sd == pytest.approx(300.0 * MICRO, rel=0.5)
     for errors in truth.errors(regression, posterior).values():
         # The RMS of three standard normal errors exceeds 2 with a probability of 0.7 %.

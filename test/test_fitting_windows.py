@@ -203,7 +203,7 @@ def test_curve_columns_of_a_fit_are_powers_of_temperature(
     weight = np.linspace(0.0, 1.0, 9)
     columns = sets.columns(t, weight)
     assert len(columns) == len(sets.groups) == sets.static.n_free + 1 + sets.dynamic.n_free
-    # At the reference temperature all columns are 0 except the level of the dynamic set.
+    # At the reference temperature only the column for the dynamic set's level is not 0.
     nothing = sets.columns(np.zeros(3), np.array([0.0, 0.5, 1.0]))
     for k, column in enumerate(nothing):
         expected = [0.0, 0.5, 1.0] if k == sets.level else 0.0
@@ -297,7 +297,7 @@ def test_sections_and_kelvins_of_columns_agree_with_formulas(bags):
         assert (np.diff(section) >= 0).all()
         assert np.ptp(np.bincount(section, minlength=N_SECTIONS)) <= 2
     rms = np.sqrt(np.mean(data.columns**2, axis=0))
-    # `kelvins`: RMS of a column / its largest slope over t, which is 1 for t, 2 max |t| for t^2.
+    # `kelvins`: RMS of a column / its largest slope over t (slope of t: 1, of t^2: 2 max |t|).
     lines = [0, *(k for k, column in enumerate(bank(), start=6) if column.group == 'board')]
     np.testing.assert_allclose(data.kelvins[lines], rms[lines], rtol=1e-6)
     assert data.kelvins[1] == pytest.approx(rms[1] / (2.0 * np.abs(t).max()), rel=0.02)

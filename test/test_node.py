@@ -272,7 +272,7 @@ def test_a_node_with_constants_needs_no_thermometer(peer, saved):
         for k in range(20):
             driver.counts(START_NS + k * CYCLE_NS, *standing(k))
         _, status, values = wait(lambda _, values: values['samples out'] == '20')
-        # The report may arrive before the last samples, which are on a different topic.
+        # The diagnostics may arrive before the last samples, which have a different topic.
         peer.wait_for(lambda: len(heard) == 20)
     # The samples are sent without pauses, so the report may warn of a wrong sample rate.
     assert 'not corrected for temperature' in status.message or 'samples/s' in status.message

@@ -198,7 +198,7 @@ def test_swapped_topics_are_reported(preset, sensor):
 
 
 def test_the_warm_up_after_power_on_is_not_taken_for_swapped_topics():
-    # WHY: in the warm-up after power-on the board leads the case, which was taken for exchanged
+    # WHY: a board that leads the case, as in the warm-up after power-on, was taken for exchanged
     # topics; the claimed sd was 20 times too large. WHAT: the board warms up by 4 K, the case by
     # 1.3 K; in the ramp after the warm-up the case leads.
     tracker = tracker_of(memory=LAG)
@@ -230,7 +230,7 @@ def test_one_topic_given_for_both_thermometers_is_named_and_claimed(order):
     # In a ramp of 1 K/min the case of a unit with a board lag of 900 s is 15 K above the board.
     assert abs(state[GRADIENT]) < 0.1
     assert state[VAR_GRADIENT] ** 0.5 == pytest.approx(15.0, rel=0.2)
-    # Case readings that differ from the board's end the fault.
+    # The fault ends with case readings that differ from board readings.
     tracker.read('board', 300 * SECOND_NS, 25.0)
     tracker.read('case', 300 * SECOND_NS, 25.1)
     assert not tracker.copies['case'].is_copy

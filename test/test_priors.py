@@ -221,8 +221,8 @@ def test_rests_at_one_temperature_correct_a_bias_change_and_keep_the_response():
         for calibration, changed in ((old, lambda record: record), (old, aged), (new, aged))
     ]
     assert left[1] > 10.0 * left[0]
-    # In a rest of 10 min a lag of 1 h with an unknown initial state acts like a bias: sd 10 ug if
-    # six norms determine three biases, 20 ug if they also determine three scale factors.
+    # In a rest of 10 min the unknown initial state of a lag of 1 h acts like a bias. Six norms
+    # give three biases an sd of 10 ug, or of 20 ug if they also determine three scale factors.
     sd = float(sd_of_levels(new).max())
     assert sd < 20e-6 * STANDARD_GRAVITY
     assert left[2] < np.hypot(left[0], sd)

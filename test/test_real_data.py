@@ -70,8 +70,8 @@ def test_six_faces_leave_the_misalignment_at_its_prior(real_data, work):
     result = fit(sources, replace(OPTIONS, input=kind))
     calibration = result.calibration
     assert len(result.positions) == 6
-    # The prior sd of the misalignment of a MEMS is 0.01. Faces are tilted by up to 1 degree, which
-    # determines the misalignment by less than 1 % of this sd.
+    # Six faces, tilted by up to 1 degree, hardly determine misalignments: their sd stays within
+    # 1 % of the prior sd for a MEMS, 0.01 rad.
     np.testing.assert_allclose(calibration.misalignment, np.eye(3), atol=1e-4)
     np.testing.assert_allclose(calibration.misalignment_sd, 1e-2, rtol=0.01)
     # Expected bias: half of the sum of opposite faces; scale factor: half of their difference.
@@ -136,8 +136,8 @@ def test_the_error_of_the_freezer_run_on_held_out_minutes(
     assert len(raw) >= 17 * len(sets) // n_sets
     # One attitude does not determine the constants, so compare the sd of |a|.
     assert np.std(raw) / MG == pytest.approx(drift, abs=0.2)
-    # Means over 60 s have a noise of 0.19 mg. The first of five parts is outside the temperatures
-    # of its fit.
+    # Means over 60 s have a noise of 0.19 mg. The first of five held-out parts is at temperatures
+    # that the fit to the other parts does not contain.
     assert np.sqrt(np.mean(np.square(left))) / MG == pytest.approx(mg, rel=0.35)
 
 

@@ -168,7 +168,7 @@ def test_the_figure_of_rates_shows_the_bias_of_the_gyroscope():
         celsius, drawn = np.array(soak.get_data(), dtype=float)
         bias = np.degrees(curve.bias_function.value(celsius - 20.0)) * 1e3
         slope = np.polyfit(celsius, bias, 1)[0]
-        # The figure shows the gyroscope's bias less a line in temperature [mdeg/s].
+        # The figure shows the gyroscope's bias minus its linear fit over temperature [mdeg/s].
         np.testing.assert_allclose(drawn, bias - slope * (celsius - 20.0), atol=1e-9)
         assert f'{slope:+.3g}'.replace('-', '\u2212') in axes.get_title(loc='left')
     names = [figure.name for figure in figures_of(replace(evidence(), calibration=unit))]

@@ -155,7 +155,7 @@ def test_a_constant_axis_at_rest_is_stuck_if_its_noise_would_show(dead, rng):
         return tuple(counts)
 
     stream(compensator, recording(1000, 100.0, sample))
-    # An axis counts as stuck after the time-out of 2 s, or later, once the others show noise.
+    # An axis counts as stuck after the time-out, 2 s, or later, once the other axes show noise.
     assert 201 <= compensator.counters.n_out <= 260
     assert compensator.counters.n_stuck == 1000 - compensator.counters.n_out
 

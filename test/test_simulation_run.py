@@ -85,12 +85,12 @@ def test_a_further_error_source_does_not_change_the_random_numbers_of_other_sour
         plain.truth.scale - 1.0
     ) * unit.scale_factor * (plain.truth.specific_force @ np.linalg.inv(unit.M).T)
     difference = np.cumsum(plain.counts - still.counts, axis=0) - np.cumsum(moved, axis=0)
-    # Sums of counts are within one count of the integrals; both runs begin with equal remainders.
+    # Both runs begin with the same rounding remainder, so sums of counts agree within one count.
     assert np.abs(difference).max() < 1.0 + 1e-6
 
 
 def test_the_sum_of_counts_without_noise_is_the_integral_of_the_truth(unit):
-    """The sum of counts is that of ``bias + K scale inverse(M) f`` within one count."""
+    """Summed counts equal the integral of ``bias + K scale inverse(M) f`` within one count."""
     run = simulate(noiseless(unit), DEMO, UP, rate_hz=50.0)
     truth = run.truth
     s = truth.specific_force @ np.linalg.inv(unit.M).T

@@ -40,7 +40,7 @@ def unit(**given):
 
 
 def ramp(given, rate, hours, environment=units.CHAMBER):
-    """Integrate a ramp of the air [K/s] from rest; return times [s] and temperatures of nodes."""
+    """Ramp the air at `rate` [K/s] after a soak; return times [s] and node temperatures."""
     A, b, h = units.network(given, environment)
     at = np.arange(0.0, 3600.0 * hours, 10.0)
     return at, units.integrate(A, b, h, rate * at, 10.0, np.linalg.solve(A, -h))
@@ -57,7 +57,7 @@ def test_a_node_lags_a_ramp_by_its_time_constant():
 
 
 def test_the_integration_is_exact_at_each_step_of_a_ramp():
-    # The lag of x behind a ramp u from rest is u - x = rate * tau * (1 - exp(-t / tau)).
+    # The lag of x behind a ramp u after a soak is u - x = rate * tau * (1 - exp(-t / tau)).
     A, b, h = np.array([[-1 / 300.0]]), np.array([1 / 300.0]), np.zeros(1)
     at = np.arange(0.0, 1500.0, 5.0)
     states = units.integrate(A, b, h, 0.01 * at, 5.0, np.zeros(1))
@@ -89,7 +89,7 @@ def test_simulated_samples_have_the_stated_noise_bias_scale_and_misalignment():
     n = len(error)
     sd = 5.0 * UG * np.sqrt(0.5)
     assert np.abs(error.mean(axis=0)).max() < 4.0 * sd / np.sqrt(n)
-    # The sd of n errors is uncertain by 1 / sqrt(2 n); gain and M change the noise by 3 %.
+    # The sd of n errors is uncertain by 1 / sqrt(2 n); division by 1 + gain changes it by 3 %.
     assert error.std(axis=0) == pytest.approx([sd] * 3, rel=0.03 + 4.0 / np.sqrt(2 * n))
 
 
@@ -194,7 +194,7 @@ def test_the_cramer_rao_bound_is_proportional_to_noise_over_root_of_the_data():
 
 
 def of_attitudes(given, board):
-    """Return means of a unit in all attitudes of `ATTITUDES` at each board temperature."""
+    """Return noise-free means of samples in all `ATTITUDES` at each board temperature."""
     force = GRAVITY * np.repeat(ATTITUDES, len(board), axis=0)
     at = np.tile(board, len(ATTITUDES))
     parts = np.repeat(at[:, None], 3, axis=1)

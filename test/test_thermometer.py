@@ -254,9 +254,9 @@ def test_a_gap_increases_the_variance_and_a_long_gap_restarts_the_estimate():
 
 
 def test_the_noise_is_estimated_if_the_setting_is_too_small():
-    # WHY: sensors on a die have a noise of 0.1 K; with a setting of 5 mK each reading was taken
-    # for an outlier. WHAT: the ratio of noise to setting is estimated to 20 %, as some noise is
-    # taken for changes of the rate; the claimed variance is at least half of the squared error.
+    # WHY: sensors on a die have a noise of 0.1 K; with the noise set to 5 mK all readings were
+    # taken for outliers. WHAT: the ratio of true to set noise is estimated to 20 %, as some noise
+    # is taken for rate changes; the claimed variance is at least half of the squared error.
     thermometer = Thermometer(ThermometerSettings(0.005))
     rng = np.random.default_rng(3)
     out = run(thermometer, np.arange(4000.0), read(np.full(4000, 20.0), 0.125, 0.0, rng))
