@@ -114,9 +114,9 @@ def main() -> None:
             factor = np.log(np.maximum(printed, 0.3) / np.maximum(true, 0.3))
             print(
                 f'{kind:12} {name}: {len(rows)} units, {100 * shares.mean():.0f} % of true days '
-                f'in 10 .. 90 %; median stated {np.median(printed):.0f} days, true '
-                f'{np.median(true):.0f}, ratio {np.exp(np.median(factor)):.2f} (scatter over the '
-                f'units: factor {np.exp(np.std(factor)):.1f})'
+                f'in the 10 .. 90 % range; median {np.median(printed):.0f} days, true '
+                f'{np.median(true):.0f} days, ratio {np.exp(np.median(factor)):.2f} (scatter over '
+                f'the units: factor {np.exp(np.std(factor)):.1f})'
             )
     for kind in KINDS[:2]:
         verdicts(kind, arguments.units, arguments.days)
