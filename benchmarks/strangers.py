@@ -259,7 +259,7 @@ def run(
     earlier: Mapping[tuple[str, int], Mapping[str, Score]],
 ) -> list[Result]:
     """
-    Fit all models to a study and score them.
+    Fit all models to a study's bags, and score them on held-out bags.
 
     Parameters
     ----------
