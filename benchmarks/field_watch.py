@@ -10,9 +10,9 @@ continuations of the random walk are drawn, until the RMS of |f| - g over random
 kind, with the scatter of the turn-ons, exceeds a tolerance of 200 ug. The figures of a forecast
 are the percentage of the drawn times in the forecast's 10 to 90 % interval, and the forecast's
 median divided by the median drawn time.
-In a second part, a verdict is taken every five days on level and on carried units, half of which
-do not age; the figures are the number of verdicts "outside", by classes of the true RMS of |f| - g
-divided by the limit.
+A second part takes a verdict every five days on level and on carried units, half of which do not
+age. The figures are the numbers of verdicts "outside" by class of the true RMS of |f| - g divided
+by the limit.
 """
 
 from __future__ import annotations
