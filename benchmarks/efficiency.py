@@ -28,8 +28,8 @@ def exact_unit(seed: int) -> UnitModel:
     """
     Make a unit whose bias and scale are quadratics of the board's temperature alone.
 
-    The constants hold at the reference temperature without heat flow. Without self-heating the
-    soaks in the bags have no heat flow, so the bound needs no extrapolation.
+    A calibration's constants are those without heat flow. The unit has no self-heating, so soaks
+    have no heat flow, and the bound needs no extrapolation.
     """
     rng = np.random.default_rng(seed)
 

@@ -87,8 +87,8 @@ def worse(after: list, new: Calibration, kalman: Floats) -> tuple[bool, bool]:
     Return whether the updated calibration, and whether the Kalman filter, has a larger RMS of
     |f| - g on the rests of a day than the laboratory's calibration.
 
-    A difference counts if it exceeds the standard error of an RMS over n turn-ons, which is the
-    claimed sd / sqrt(2 n).
+    An RMS is larger if the difference exceeds the standard error of an RMS over n turn-ons, which
+    is the claimed sd / sqrt(2 n).
     """
     old, updated = (series_of(after, given) for given in (LABORATORY, new))
     counts = np.array([rest.mean for _, rest in after]) / K
@@ -132,8 +132,8 @@ def best(history: History, process: Process, days: int) -> BestFilter:
 
 def unit(kind: str, seed: int, days: int) -> tuple[dict[str, Floats], list, float]:
     """
-    Age and update a unit; return the errors after the last day, the comparisons of `worse` by day,
-    and the time of the last update [s].
+    Age and update a unit; return the errors after the last day, the result of `worse` for each
+    update, and the time of the last update [s].
     """
     shock_day = np.random.default_rng([seed, 7]).uniform(0.2, 0.8) * days
     process = Process(shock_day=float(shock_day))
@@ -199,8 +199,8 @@ def simulated(kind: str, n_units: int, days: int) -> None:
     print(f'  error / claimed sd of |f| {ratio:.2f} (goal 0.7 .. 1.4)')
     days_after = np.array([pair for result in results for pair in result[1]])
     print(
-        f'  {len(days_after)} days after an update; error larger by a standard error than without '
-        f'the update on {days_after[:, 0].sum()} days (filter: {days_after[:, 1].sum()})'
+        f'  error with the update larger by a standard error than without on '
+        f'{days_after[:, 0].sum()} (filter: {days_after[:, 1].sum()}) of {len(days_after)} days'
     )
     print(f'  time of an update: {max(result[2] for result in results):.1f} s at most')
 

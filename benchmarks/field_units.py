@@ -103,7 +103,7 @@ def calibration() -> Calibration:
 
 
 def _parts(state: Floats, warmth: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return bias [m/s^2], relative scale and M for deviations `state`, shape (15,) or (24,)."""
+    """Return bias [m/s^2], relative scale and matrix M for deviations `state`, (15,) or (24,)."""
     bias, slope, scale, scale_slope, tilt = state[:15].reshape(5, 3)
     if len(state) > 15:
         walk_bias, walk_scale, turn_on = state[15:].reshape(3, 3)

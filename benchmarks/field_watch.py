@@ -10,9 +10,9 @@ continuations of the random walk are drawn, until the RMS of |f| - g over random
 kind, with the scatter of the turn-ons, exceeds a tolerance of 200 ug. The figures of a forecast
 are the percentage of the drawn times in the forecast's 10 to 90 % interval, and the forecast's
 median divided by the median drawn time.
-In a second part, a verdict is taken every five days on level and on carried units, half of which
-do not age; the figures are the number of verdicts "outside", by classes of the true RMS of |f| - g
-divided by the limit.
+A second part takes a verdict every five days on level and on carried units, half of which do not
+age. The figures are the numbers of verdicts "outside" by class of the true RMS of |f| - g divided
+by the limit.
 """
 
 from __future__ import annotations
@@ -114,9 +114,9 @@ def main() -> None:
             factor = np.log(np.maximum(printed, 0.3) / np.maximum(true, 0.3))
             print(
                 f'{kind:12} {name}: {len(rows)} units, {100 * shares.mean():.0f} % of true days '
-                f'in 10 .. 90 %; median stated {np.median(printed):.0f} days, true '
-                f'{np.median(true):.0f}, ratio {np.exp(np.median(factor)):.2f} (scatter over the '
-                f'units: factor {np.exp(np.std(factor)):.1f})'
+                f'in the 10 .. 90 % range; median {np.median(printed):.0f} days, true '
+                f'{np.median(true):.0f} days, ratio {np.exp(np.median(factor)):.2f} (scatter over '
+                f'the units: factor {np.exp(np.std(factor)):.1f})'
             )
     for kind in KINDS[:2]:
         verdicts(kind, arguments.units, arguments.days)

@@ -89,7 +89,7 @@ def units_of(folder: Path, n_units: int) -> list[FoundUnit]:
 @dataclass(frozen=True)
 class Measured:
     """
-    Figures of a run over a fleet.
+    Times, traffic and processor time of a fit of a fleet.
 
     Parameters
     ----------

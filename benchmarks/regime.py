@@ -162,7 +162,7 @@ def rate_table(matrix: Matrix) -> Rows:
 
 
 def scene_table(matrix: Matrix, lag: float) -> Rows:
-    """Return median delay and dynamic fraction of ramps, for scenes with a given case lag."""
+    """Return median delay and flagged share of ramps, for scenes with a given case lag [s]."""
     rows = [['sensor', 'Hz', 'K/min', 'median, s', 'share flagged']]
     for scene, result in matrix:
         if scene.lag_s == lag:

@@ -82,9 +82,9 @@ def known_signature_delays(
     Return median and 95 % quantile of the delays [s] of a CUSUM test that is given the true ramp,
     baseline and noise.
 
-    The test is Page's: the largest log likelihood ratio over the onset times, with the true ramp
-    as signature. The threshold for `per_hour` false alarms is extrapolated by a line in the
-    logarithm of the number of exceedances over the threshold, counted in noise without a ramp.
+    The test statistic (Page's) is the largest log likelihood ratio over the onset times, with the
+    true ramp as signature. The threshold for `per_hour` false alarms is extrapolated from noise
+    without a ramp, where the logarithm of the number of exceedances is a line over the threshold.
     """
     rng = np.random.default_rng([seed, 9])
     dt = 1.0 / scene.rate_hz

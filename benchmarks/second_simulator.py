@@ -33,7 +33,7 @@ STEP_S, SAMPLE_S, READING_S = 2.0, 1.0, 2.0
 NOISE_UG, READING_SD, READING_STEP = 5.0, 0.005, 0.001
 REFERENCE_C, AIR_S, FULL_SCALE = 20.0, 90.0, 8388607.0
 Program = tuple[float, float, list[tuple[float, float, float]]]
-#: For each plan: seed text and program of the test, duration [s], seed text and held-out programs.
+#: For each plan: seed, program and duration [s] of the test; seed and programs of held-out runs.
 #: A program: start [degC], soak [min], then target [degC], rate [K/min] and soak [min] per ramp.
 PLANS: dict[str, tuple[str, Program, float, str, list[Program]]] = {
     'wide': (

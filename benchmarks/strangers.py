@@ -50,8 +50,8 @@ PACKAGE: dict[str, dict[str, Any]] = {
     'sets': {'groups': ('curve', 'set')},
 }
 BASELINES = ('constants', 'cubic', 'golovach', 'sets')
-#: Smallest share of minutes with all samples corrected for a fit to pass; below 1, because samples
-#: before the first reading of a thermometer are not corrected.
+#: A fit passes if at least this share of the minutes is corrected completely; below 1, because
+#: samples before the first reading of a thermometer are not corrected.
 LEAST_PUBLISHED = 0.98
 #: Cases of recorded bags, each with a single unit.
 RECORDED = ('sample-bags', 'no-case', 'board-twice', 'cats')
@@ -140,8 +140,8 @@ def score(outs: Sequence[Corrected], bags: Sequence[Minutes], *, is_drift: bool)
     forces = [out.force for out in outs]
     plain = error_of(forces, bags, is_drift=is_drift)
     if is_drift:
-        # The offset of a new mounting cancels in the drift of a pose: subtract the smallest
-        # variance, which is that at the reference temperature.
+        # A mounting's bias offset cancels in the drift: subtract the smallest claimed variance,
+        # that at the reference temperature, from all claimed variances of a bag.
         variances = [np.diagonal(out.claim, axis1=1, axis2=2) for out in outs]
         sd = np.sqrt(np.concatenate(
             [v - v.min(axis=0) + out.white for v, out in zip(variances, outs, strict=True)]
@@ -205,8 +205,8 @@ def bias_score(calibration: thermo_comp.Calibration, study: Study) -> Score:
     bag = Bag('zero', time_s, zero, temperatures)
     out = corrected(calibration, bag, config)
     error = out.force[len(out.force) // 2 :].mean(axis=0)
-    # The Cramer-Rao bound does not include thermometer noise and turn-ons: subtract their claimed
-    # variance, which is that of the calibration without a posterior.
+    # The Cramer-Rao bound does not include thermometer noise and turn-ons: subtract their
+    # variance, which is all that a calibration without a posterior claims.
     exact = corrected(replace(calibration, posterior=None), bag, config)
     sd = np.sqrt(np.maximum(np.diag(out.claim[-1] - exact.claim[-1]), 0.0))
     return Score(
@@ -221,9 +221,9 @@ def without_constants(calibration: thermo_comp.Calibration) -> thermo_comp.Calib
     """
     Return a calibration in whose posterior bias, scale and misalignment have no variance.
 
-    A single pose determines these constants to 50 mg only. The drift in a pose does not depend on
-    the constants, but the difference of two claimed variances does: an acceleration `a`, which has
-    noise, contributes ``a^2`` times the variance of the scale factor.
+    A single pose determines bias and scale to 50 mg only. The drift in a pose does not depend on
+    the constants, but the differences of claimed variances do: each contains ``a^2`` times the
+    variance of the scale factor, with the noise of the acceleration `a`.
     """
     if calibration.posterior is None:
         return calibration
@@ -259,7 +259,7 @@ def run(
     earlier: Mapping[tuple[str, int], Mapping[str, Score]],
 ) -> list[Result]:
     """
-    Fit all models to a study and score them.
+    Fit all models to a study's bags, and score them on held-out bags.
 
     Parameters
     ----------

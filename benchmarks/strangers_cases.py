@@ -448,7 +448,7 @@ def bias_bound(unit: Unit, up: Floats, bags: Sequence[Bag], window_s: float = 60
     ))  # fmt: skip
 
     def modelled(p: Any) -> Any:
-        """Return the samples in g for complex `p`, whose imaginary step gives derivatives."""
+        """Return samples [g] for complex parameters `p`, for derivatives by imaginary steps."""
         a, b, c = p[6:9]
         u = up + np.einsum('pk,pki->pi', p[21:].reshape(n, 2), tangents)
         u = u / np.sqrt((u**2).sum(axis=1, keepdims=True))

@@ -121,8 +121,8 @@ LIMITS = {
     'plain': Limit(norm=1.3, vector=2.0, low=0.7, high=1.4),
     'one-pose: own bag': Limit(vector=2.0, low=0.7, high=1.4),
     'one-pose: other program': Limit(vector=5.0, low=0.7, high=1.4),
-    # For 'returned', `score` subtracts the smallest claimed variance over temperature, which
-    # contains a slope's variance: error / claimed sd has no meaning and no limit.
+    # `score` subtracts the smallest claimed variance of a bag. For 'returned' this variance
+    # contains that of a slope: error / claimed sd has no meaning and no limit.
     'returned': Limit(high=np.inf),
     'soaks': Limit(low=0.5, high=1.5, claim=3.0),
     'turn-on': _TURN_ON,
@@ -139,7 +139,7 @@ LIMITS = {
     'bump': Limit(norm=60.0),
     'carry': Limit(),
     'support': Limit(vector=60.0),
-    # The baselines use the same wrong gravity, so only error / claimed sd is limited.
+    # Fit and baselines are given the same wrong gravity: only error / claimed sd is limited.
     'gravity': Limit(best=np.inf),
     'cold-start': Limit(),
     # The claimed sd includes flicker noise over times longer than the recordings, so the error
@@ -149,7 +149,7 @@ LIMITS = {
     'coarse-thermometer': Limit(),
     'slow-drift': Limit(),
     'third-node alone': Limit(),
-    # The still-air bag may increase the chamber bags' error by 2 % at most, the noise of a fit.
+    # A bag in still air may increase the error in the chamber by 2 %, the noise of a fit.
     'third-node joint: chamber': Limit(than='alone: chamber', times=1.02),
     'third-node joint: still air': Limit(than='alone: still air', times=1.02),
     'third-node joint: its attitude': Limit(than='alone: its attitude', times=0.5),
@@ -260,7 +260,7 @@ def misses(row: Row, others: Sequence[Row]) -> list[str]:
             if limit.than and other.title.endswith(limit.than) and 'fit' in other.scores:
                 share = getattr(fit, name) / getattr(other.scores['fit'], name)
                 checks.append((f'{name} / {limit.than}', share, limit.times))
-    # An undefined figure, such as the vector without a true force, is NaN and violates no limit.
+    # An undefined figure, as the vector error without a true force, is NaN and violates no limit.
     exceeded += [f'{name} {value:.3g} > {most:g}' for name, value, most in checks if value > most]
     if ratio < limit.low:
         exceeded.append(f'ratio {ratio:.2g} < {limit.low:g}')

@@ -232,7 +232,7 @@ def consumer_grade(rng: np.random.Generator) -> Unit:
 def network(unit: Unit, environment: Environment = CHAMBER) -> tuple[Floats, Floats, Floats]:
     """Return A, b, h of ``x' = A x + b air + h``; x: case, board, parts, hidden node [degC]."""
     A, b, h = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
-    # Conductances of the case per its heat capacity: 0.1 to the board, `film` to the air.
+    # Relative conductances of the case: 0.1 to the board, `film` to the air (1 in a chamber).
     A[CASE, CASE] = -environment.film - 0.1
     A[CASE, BOARD] = 0.1
     b[CASE] = environment.film
@@ -438,7 +438,7 @@ def lagged(node: Floats, tau_s: float) -> Floats:
     if not tau_s:
         return node
     decay = np.exp(-STEP_S / tau_s)
-    # `behind`: node less lagged temperature; it tends to `tau_s` times the rate of a ramp.
+    # `behind`: node temperature less lagged temperature, in a long ramp `tau_s` times the rate.
     gain = tau_s / STEP_S * (1.0 - decay)
     behind = lfilter([gain], [1.0, -decay], np.diff(node, prepend=node[0]))
     return np.asarray(node - behind)
