@@ -119,7 +119,7 @@ class AxisSet:
 
 @dataclass(frozen=True)
 class LackOfFit:
-    """Slow error of a regime's curves at a board temperature, not predicted by the posterior."""
+    """Error of a regime's curves at a board temperature, beyond the sd of the posterior."""
 
     temperature_c: Annotated[Celsius, 'Board temperature of the entry [degC].']
     sd_m_s2: Annotated[
@@ -131,8 +131,8 @@ class LackOfFit:
 class RegimeSet:
     """
     The curves of one regime. Outside `temperature_range_c` the covariance of the force grows, and
-    a curve differs from that of the other regime by a constant; outside the ranges of both regimes
-    a curve is a tangent for a quarter of the range, then constant.
+    a curve is that of the other regime plus a constant; outside the ranges of both regimes it
+    continues along its tangent for a quarter of the range, and is constant beyond.
     """
 
     temperature_range_c: Annotated[tuple[Celsius, Celsius], 'Calibrated range of T_board [degC].']
