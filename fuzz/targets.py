@@ -79,7 +79,7 @@ def check_calibration(data: bytes) -> None:
         return
     assert parse_calibration(dump_calibration(value).encode()) == value
     row = Compensator(value).process(START_NS, 1.0, 2.0, 3.0)
-    # Without a reading only a calibration that needs no temperature corrects a sample.
+    # Before the first temperature, a sample is corrected only if the calibration needs none.
     assert row is None or not value.needs_temperature
 
 
