@@ -69,8 +69,8 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     fit = _with_lags(windows, problem)
     has_case = all(len(bag.case.value) for bag in bags)
     has_choice = has_case and options.prior is None and options.detector is None
-    # Compare detectors if the chosen model has a curve for each regime, or if such a model has a
-    # score near the best (`is_near`) and on each axis under 80 % of the chosen model's noise.
+    # Compare detectors if the chosen model has a curve for each regime, or if another model with a
+    # curve for each regime `is_near` and has under 80 % of the chosen model's noise on each axis.
     trials = fit.selected.trials
     chosen = next(trial for trial in trials if trial.is_chosen)
     limit = 0.8 * chosen.posterior.prior.sigma
@@ -105,9 +105,9 @@ def windows_of(
 
 def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
     """
-    Fit the windows with one lag per axis (`find_parts`) or, if no lags are found, with the columns
-    of `windows`. Neither a fit with a prior nor Golovach's model searches for lags. If all lags
-    leave a left-out drift above `Parts.most_drift`, the better of both fits is returned.
+    Fit the windows with one lag per axis (`find_parts`). If no lags are found, or all lags leave a
+    left-out drift above `Parts.most_drift`, fit the windows with the columns of `windows`, too,
+    and return the better fit. No lags are searched with a prior, or for Golovach's model.
     """
     bags, options = problem.bags, problem.options
     is_free = options.prior is None and options.model != 'golovach'

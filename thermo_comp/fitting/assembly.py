@@ -86,7 +86,7 @@ def build_calibration(
         nonlinearity=nonlinearity,
     )
     if known is not None and not (known.needs_temperature or windows.has_temperature):
-        # Without a thermometer the calibration must not depend on temperature by rounding errors.
+        # Without a thermometer, the dependence on temperature is a rounding error: remove it.
         places = parameter_layout(blank)
         for block in (*places.bias, *places.scale):
             level = values[block.static]

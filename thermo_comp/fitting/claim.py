@@ -153,10 +153,10 @@ def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Fl
         # A test of 12 positions determines the sd of mounting offsets within a factor of 1.5.
         ratio = 10.0 ** np.arange(-1.5, 1.51, 0.125)
         return known_sd * ratio, log_student(np.log(ratio) / np.log(1.5))
-    # `least`: smallest usual offset sd over `scale`. By data sheets, the bias of navigation-grade
+    # `least`: smallest usual offset sd / `scale`. By data sheets, the bias of navigation-grade
     # triads repeats to 10 ug at best between turn-ons, better between mountings of a turn-on.
     least = 0.01 if kind == 'mounting' else min(1e-4 / scale, 1.0)
-    # `largest`: largest usual offset sd over `scale`, for mountings within a turn-on, for a single
+    # `largest`: largest usual offset sd / `scale`, for mountings within a turn-on, for a single
     # turn-on, and ('both') for several turn-ons or mountings that each begin with a turn-on. By
     # data sheets, the bias repeats to 0.3 .. 1 mg over turn-ons of tactical triads and to some mg
     # over turn-ons of MEMS, 10 to 20 times `scale`. The values of `largest` for turn-ons are
@@ -193,7 +193,7 @@ def _widened(
     is_of_means = np.mean(within**2, axis=0) < np.mean((regression.columns - within) ** 2, axis=0)
     weights = np.where(is_of_means, of_means.weights, state.weights)
     other = replace(of_means, weights=weights)
-    # Columns active only in the fit to the means need rows in the covariance: set a tiny sd.
+    # A tiny prior sd gives columns active only in the fit to the means rows in the covariance.
     is_used = other.weights.any(axis=1) & (prior.column_sd == 0.0)
     prior = replace(prior, column_sd=np.where(is_used, 1e-9, prior.column_sd))
     with_unseen = regression.solve(state, prior, n_steps=0)
@@ -215,8 +215,8 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
     groups, prior = np.array(regression.windows.groups), posterior.prior
     kelvins = regression.windows.kelvins
     active = groups[prior.column_sd.any(axis=0)]
-    # The columns considered are lags, curves (few temperatures do not determine all powers), and
-    # columns active in bias or scale (one attitude does not separate drifts of bias and scale).
+    # Add columns of lags and curves (few temperatures do not determine all powers), and columns
+    # active in only one of bias and scale (one attitude does not separate their drifts).
     curves = [PART if PART in active else CURVE]
     may = np.isin(groups, [*LAGS, *curves]) | prior.column_sd.any(axis=0)
     inactive = regression.inactive(posterior, may & typical.any(axis=0))
@@ -230,21 +230,21 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
         sd = np.where((sd > 0.0) & (regression.windows.lag >= 0), np.inf, sd)
     sd = np.where(is_of_lags, sd, np.minimum(sd, typical))
     if CURVE in active:
-        # A lag only delays the curve: limit the prior sd of its weight to the slope of the curve
-        # (RMS of the axes), plus the bounds of curve columns that the data do not exclude.
+        # A lag only delays the curve: limit the prior sd of a lag's weight to the slope of the
+        # curve (RMS of the axes), including the slopes that inactive curve columns may add.
         is_curve = (groups == CURVE) & (kelvins > 0.0)
         square = np.mean(posterior.state.weights**2, axis=1) + sd**2
         slopes = np.sqrt(np.sum(square[:, is_curve] / kelvins[is_curve] ** 2, axis=1))
         of_curve = np.outer(slopes, kelvins)
         typical = np.minimum(typical, of_curve)
-        # A curve column that the data do not determine changes the curve's slope by up to a half.
+        # A curve column that the data do not determine changes the curve's slope by up to 50 %.
         sd = np.where(groups == CURVE, np.minimum(sd, 0.5 * of_curve), sd)
     # n lags must not have more variance than one lag: each lag gets 1 / n of the variance.
     is_lag = is_of_lags & (sd > 0.0)
     share = np.sqrt(np.maximum(is_lag.sum(axis=1, keepdims=True), 1))
     sd = np.where(is_lag, np.minimum(sd, typical / share), sd)
     units = np.array([[1.0], [1.0 / (regression.gravity or 1.0)]])
-    # A column is nearly constant if its temperature change (`kelvins`) is below 1 % of t's change.
+    # A column is nearly constant if its `kelvins` are below 1 % of those of column t, the first.
     is_constant = kelvins < 0.01 * float(kelvins[0])
     ratio = np.where(is_constant, float(kelvins[0]) / np.maximum(kelvins, 1e-9), 1.0)
     matters = (sd > 0.0) & (sd * ratio > 2.0 * float(np.mean(prior.sigma)) * units)
@@ -266,8 +266,8 @@ def _over_mountings(
         return _fits(regression, posterior, priors)
 
     fits = fits_with(tried)
-    # With a large sd of mounting offsets attitudes absorb errors of the model, which raises the
-    # log evidence: count at most the rise of the log evidence of |f|, plus `CLEAR_GAIN`.
+    # A large sd of mounting offsets lets attitudes absorb errors of the model, so the log evidence
+    # of a fit rises: limit this rise to that of the log evidence of |f|, plus `CLEAR_GAIN`.
     of_data = np.array([fit.log_evidence for fit in fits])
     of_norms = _norm_evidence(regression, posterior, tried, fits[-1].root)
     nearest = int(np.argmin(np.abs(np.log(tried * n_rests**0.5 / prior.offset_sd))))
@@ -302,7 +302,7 @@ def _mixture(
 
 
 def _excess(covariance: Floats, other: Floats) -> Floats:
-    """Return ``covariance - other``, with negative eigenvalues, in sds of `other`, set to 0."""
+    """Return ``covariance - other``, scaled by sds of `other`, with eigenvalues < 0 set to 0."""
     sd = np.sqrt(np.diag(other))
     values, vectors = np.linalg.eigh((covariance - other) / np.outer(sd, sd))
     root = sd[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
@@ -383,7 +383,7 @@ def _ratios_to_noise(change: Floats, remaining: Floats) -> Floats:
     covariance of the fit of all windows is the unit matrix
     """
     shares, directions = np.linalg.eigh(remaining.T @ remaining)
-    # Use combinations about which the left-out windows have more than 1e-6 of the information.
+    # Use combinations of unknowns about which left-out windows have over 1e-6 of the information.
     is_measured = shares < 1.0 - 1e-6
     shares = np.maximum(shares[is_measured], 1e-12)
     return np.asarray((change @ directions[:, is_measured]) ** 2 * shares / (1.0 - shares))

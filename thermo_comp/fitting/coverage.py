@@ -61,9 +61,9 @@ def next_direction(covariance: Floats, sd: float, positions: Floats) -> Floats:
     Find the direction of a new position, of noise `sd` [g], that most reduces the variance of the
     force, averaged over all attitudes.
 
-    A face of a cube, the easiest to hold, is preferred if it reduces the variance of the force at
-    least half as much as the best direction, then an edge, then a corner. Directions closer than
-    20 degrees to a direction in `positions`, shape (n, 3), are not proposed.
+    The direction to a face of a cube, which is easiest to hold, is returned if it reduces the
+    variance at least half as much as the best direction; else that to an edge, else to a corner.
+    Directions within 20 degrees of a direction in `positions`, shape (n, 3), are not proposed.
     """
     columns = force_columns(_SPHERE)
     weight = np.einsum('nij,nik->jk', columns, columns) / len(columns)
@@ -204,7 +204,7 @@ class LeastKnown:
 
 
 def least_known(calibration: Calibration, up: Floats) -> LeastKnown | None:
-    """Find the attitude of largest sd of |f|, if known; `up`: attitudes of positions, (n, 3)."""
+    """Find the attitude of largest sd of |f|, None without covariance; `up`: positions, (n, 3)."""
     if calibration.posterior is None:
         return None
     layout = parameter_layout(calibration)

@@ -146,7 +146,7 @@ def _has_drift(windows: ThermalWindows) -> bool:
 
 
 def _ramp_rates(windows: ThermalWindows) -> Floats:
-    """Return T_board's rate [K/min], (n,), or 0 where T_board changes at under half this rate."""
+    """Return `windows.rate` [K/min], (n,); 0 where T_board's slope is less than half this rate."""
     rate, edges = windows.rate * 60.0, windows.data.edges
     for rows in map(slice, edges[:-1], edges[1:]):
         if rows.stop - rows.start > 1:
@@ -238,7 +238,7 @@ def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator
     Report the sd of mounting and turn-on offsets if the fit had to assume this sd.
 
     `offset_sd`: published sd of the bias offset of a mounting [m/s^2]. Nine constants explain |f|
-    in nine positions, whatever the offsets; drifts due to scale factors show only large offsets.
+    in nine positions with any mounting offsets; drifts of scale factors show only large offsets.
     """
     prior = fit.posterior.prior
     n, n_turn_ons = int(fit.windows.data.mounting[-1]) + 1, fit.windows.data.n_turn_ons
@@ -356,8 +356,8 @@ def judge_result(
     else:
         yield Finding('residual', 'good', text)
     alone = overall.two_sets.rms
-    # Without contradicting the prior, a new turn-on may shift the bias by 2 sd (2 `slow`), and
-    # initial lag states may explain the residual, which leaves `sigma` near the noise.
+    # These do not contradict the prior: a shift of the bias by up to 2 sd (2 `slow`) at a turn-on,
+    # and a residual due to initial lag states, with which `sigma` is near the noise.
     contradiction, sigma = '', float(np.mean(prior.sigma))
     is_above = overall.fitted.rms > np.hypot(1.5 * alone, 2.0 * slow) and sigma > 1.5 * alone
     if options.prior is not None and is_above:

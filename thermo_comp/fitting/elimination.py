@@ -56,8 +56,8 @@ def factored_with_prior(information: Floats, precision: Floats) -> Floats:
     Return the lower Cholesky factor of an information matrix plus the precision of a prior, (n,).
 
     The information matrix is a difference of larger matrices, so its smallest eigenvalues are
-    rounding errors. If no Cholesky factor exists for this reason, the matrix is scaled to a unit
-    diagonal, and its eigenvalues up to ten times the size of the most negative one are set to 0.
+    rounding errors. If the sum has no Cholesky factor, the information is scaled to a unit
+    diagonal, and eigenvalues up to ten times the size of the most negative one are set to 0.
     """
     places = np.diag_indices(len(information))
     hessian = information.copy()
@@ -153,7 +153,7 @@ class Reduced:
         return sum(block.log_determinant for block in blocks if block is not None)
 
     def with_prior_of_sum(self, total: Floats, variance: float) -> Reduced:
-        """Add a prior (mean 0, `variance`) of the sum of lag states over the bags, now `total`."""
+        """Add a prior (mean 0, `variance`) of the lag states' sum over bags (`total` now)."""
         r = len(total)
         cross = self.bags.solved[:, :r].sum(axis=0, keepdims=True)
         cross[..., -1] += total

@@ -229,8 +229,8 @@ def _points(
     order = np.argsort(temperature, kind='stable')
     for part in np.array_split(order[rows[order]], n_bins):
         mean = excess[part].mean(axis=0)
-        # Errors of neighbouring windows are correlated: ten windows count as one observation. An
-        # excess below two standard errors is set to 0.
+        # Errors of neighbouring windows are correlated: ten windows count as one observation. A
+        # mean excess below two standard errors is set to 0.
         error = excess[part].std(axis=0) / np.sqrt(max(len(part) / 10.0, 1.0))
         mean = np.where(mean > 2.0 * error, mean, 0.0)
         x, y, z = np.sqrt(mean + model_error[part].mean(axis=0)).tolist()

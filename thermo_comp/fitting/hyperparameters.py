@@ -4,8 +4,8 @@
 Owns the estimation of prior sd and noises, and the removal of columns of small log Bayes factor.
 
 Each column has one prior standard deviation of its weights in the bias of all axes and one in the
-scale. If not fixed, both sds follow from MacKay's fixed point [1]_ with a log-normal hyperprior of
-the sd, of centre sd0 and variance tau^2 of log sd. The mode of log evidence plus log hyperprior
+scale. Each sd that is not fixed is found by MacKay's fixed point [1]_ with a log-normal hyperprior
+of the sd, of centre sd0 and variance tau^2 of log sd. The mode of log evidence plus log hyperprior
 satisfies ``effective parameters + log(sd / sd0) / tau^2 = sum w^2 / sd^2``, w being the weights of
 the column on the three axes. If the data do not inform about a column, the sd stays at sd0.
 
@@ -78,7 +78,7 @@ def settle(
 def _updated(
     regression: Regression, posterior: PosteriorMode, candidates: Candidates
 ) -> tuple[Prior, float]:
-    """Move prior sds and noises towards their modes; return also the largest log ratio."""
+    """Move prior sds and noises towards their modes; return also the largest |log(new / old)|."""
     prior, layout, determined = posterior.prior, posterior.layout, posterior.determined
     sd, power = prior.column_sd, np.sum(posterior.state.weights**2, axis=1)
     moves = (sd > 0.0) & ~candidates.fixed
@@ -179,7 +179,7 @@ def _toward(
     slope: Floats | float,
     bend: Floats | float,
 ) -> Floats:
-    """Return Newton's step, within +-2, of log sd to ``power / sd^2 = effective + slope``."""
+    """Return Newton's step of log sd, within +-2, to solve power / sd^2 = effective + slope."""
     ratio = power / (sd * sd)
     gradient = ratio - effective - slope
     curvature = 2.0 * np.minimum(ratio, 2.0 * effective + 1.0) + 0.5 * effective + bend

@@ -69,8 +69,8 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     Fit the windows, with or without a prior calibration.
 
     Without a prior, if the positions are whole rests and temperature changes more between than
-    within positions, two fits are made: of the curve to the means of the positions, and with the
-    drifts. The fit to the means is used unless the fit with the drifts is better on left-out data.
+    within positions, two fits are made: of the curve to the means of the positions, and to all
+    windows. The fit to the means is returned unless the other fit is better on left-out data.
     """
     if problem.options.prior is not None:
         return _regress(windows, problem)
@@ -181,7 +181,7 @@ def _updating_priors(
 
 
 def initial_state(regression: Regression, start: ConstantCalibration, up: Floats) -> State:
-    """Return the state of a constant calibration."""
+    """Return the state of a calibration without effects of temperature."""
     inverse = np.asarray(np.linalg.inv(start.misalignment), dtype=np.float64)
     misalignment = inverse[[1, 2, 2], [0, 0, 1]]
     return regression.initial_state(start.bias / start.scale, misalignment, up)
@@ -223,11 +223,11 @@ def _initial_prior(windows: ThermalWindows, problem: Problem) -> Prior:
 def _with_faces(prior: Prior, up: Floats) -> Prior:
     """
     Return the prior with a smaller misalignment sd if a noisy sensor is only held on its faces,
-    where misalignments of some degrees would, to second order, explain any errors of |f|. The
-    published covariance keeps the sd of `prior`.
+    where misalignments of some degrees would, to second order, explain any errors of |f|. In
+    the published covariance the misalignment has the sd of `prior`.
     """
     by_element = up[:, [1, 2, 2]] * up[:, [0, 0, 1]]
-    # Smaller sd of an element of M [rad]: the cross-axis sensitivity of good consumer MEMS.
+    # Reduced sd of an element of M [rad]: the cross-axis sensitivity of good consumer MEMS.
     of_faces, sd = 2.5e-3, prior.misalignment_scale
     # The RMS product of two components of `up` is below 0.1 if the vertical is near the axes, and
     # 0.3 if the vertical is between two axes.
@@ -342,8 +342,8 @@ def _steepness(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool) -
         powers = np.vander(sizes / sizes.max(), 4)
         errors -= powers @ np.linalg.lstsq(powers, errors, rcond=None)[0]
     if is_at_rest:
-        # Constant bias and scale explain a part of the differences of |f|: divide the RMS error of
-        # |f| by the RMS change of |f| for unit slopes of bias and scale, less the explained part.
+        # Divide the RMS error of |f| by the RMS error of |f| that slopes of bias and scale of size
+        # 1 would cause. Constant bias and scale, which explain a part of both errors, are removed.
         constants = norm_columns(force / norms[:, None])[:, :6]
         celsius = windows.temperature[data.edges[:-1]]
         of_slopes = (celsius - celsius.mean())[:, None] * constants

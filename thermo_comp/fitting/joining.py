@@ -6,7 +6,7 @@ recorded one after the other while the unit is turned to the next attitude.
 
 Between the parts of a recording the unit may have stayed switched on, so the parts count as one
 turn-on: positions of one turn-on do not show how well the bias repeats from turn-on to turn-on.
-The lags do not restart, and a rest at the end of a part may continue in the next part.
+No lag restarts at the start of a part, and a rest may continue from one part to the next.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def joined(bags: Sequence[ReducedBag]) -> list[ReducedBag]:
     for bag in sorted(bags, key=lambda bag: bag.start_ns):
         before = [recording for recording in recordings if _continues(recording[-1], bag)]
         if before:
-            # Simulated recordings may have equal stamps: choose the one with the nearest readings.
+            # Simulated recordings may end at equal stamps: choose that with the nearest readings.
             min(before, key=lambda recording: _step(recording[-1], bag)).append(bag)
         else:
             recordings.append([bag])
@@ -44,8 +44,8 @@ def _continues(part: ReducedBag, bag: ReducedBag) -> bool:
     # A bag with known |f| is not joined, because times of |f| count from the start of the bag.
     is_at_1g = bag.source.force is None and part.source.force is None
     is_of_unit = bag.source.serial == part.source.serial
-    # Parts overlap by at most 3 s and a tenth of a part; recordings whose stamps all begin at 0
-    # overlap more. The gap between parts is at most 60 s, to turn the unit and restart the
+    # Parts overlap by at most 3 s, and by at most a tenth of a part; recordings whose stamps begin
+    # at 0 overlap more. The gap between parts is at most 60 s, to turn the unit and restart the
     # recorder, or two sample intervals if longer. If the unit is switched off and on in the gap,
     # the fit takes the offset of each turn-on for an offset of a mounting.
     overlap_s = min(3.0, 1e-10 * (part.end_ns - part.start_ns))
@@ -116,7 +116,7 @@ def _intervals(parts: Sequence[ReducedBag]) -> tuple[StillInterval, ...]:
         shift_s = 1e-9 * (part.start_ns - parts[0].start_ns)
         is_alike = abs(part.window_s - parts[0].window_s) < 0.01 * parts[0].window_s
         for number, rest in enumerate(part.intervals):
-            # Windows of another length than in the first part, as in a short part, are not whole.
+            # In a part whose window length differs from that of the first, no window is whole.
             n_whole = rest.n_whole if is_alike else 0
             shifted = replace(rest, time=rest.time + shift_s, n_whole=n_whole)
             is_first = bool(result) and number == 0
@@ -130,9 +130,9 @@ def _intervals(parts: Sequence[ReducedBag]) -> tuple[StillInterval, ...]:
 def _is_one_rest(before: StillInterval, after: StillInterval, window_s: float) -> bool:
     """
     Whether a rest continues in the next part. The gap between the parts is at most three windows
-    long. On each axis the step between the parts is at most five times the RMS step between
-    windows, or twice the largest step between windows (most may be 0 by rounding), in the 20
-    windows before the end of a part and the 20 windows after it; 10 steps must be known.
+    long. The step over the gap is, on each axis, at most five times the RMS step between the 20
+    windows before the gap and between the 20 windows after it, or twice the largest of these steps
+    (most steps may be 0 by rounding). At least 10 of these steps must be known.
     """
     gap_s = 1e-9 * (after.start_ns - before.end_ns)
     means = before.mean[: before.n_whole][-20:], after.mean[:20]

@@ -65,7 +65,7 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     Two rests are compared if the gap between them is at most 30 s or 250 samples, whichever is
     longer, and their directions differ by less than 10 degrees.
     """
-    # At a low sample rate gaps are long: a rest consists of cells, usually of 30 samples each.
+    # Rests are made of whole cells, usually of 30 samples, so a low sample rate makes long gaps.
     longest_ns = 1e9 * max(30.0, 250.0 * bag.cycle_s)
     margin_s = max(_MARGIN_S, 120.0 * bag.cycle_s)  # at least 120 samples
     means = [np.average(rest.mean, axis=0, weights=rest.count) for rest in bag.intervals]
@@ -116,7 +116,7 @@ def _margin(samples: Floats, quiet_sd: Floats) -> float:
 def _examine(
     samples: Floats, gap: tuple[float, float], sds: tuple[Floats, Floats], bag: ReducedBag
 ) -> Jump | None:
-    """Return the jump around a gap between two rests, or None; `sds`: of noise, of rounding."""
+    """Return the jump in a gap between two rests, or None; `sds`: sd of noise, sd of rounding."""
     quiet_sd, rounding_sd = sds
     time, accel, gyro = samples[:, 0], samples[:, 1:4], samples[:, 4:]
     before, after = time <= gap[0], time >= gap[1]
@@ -164,7 +164,7 @@ def _examine(
 
 
 def _correlation(residual: Floats, sd: Floats) -> Floats:
-    """Return the ratio, >= 1, of the sd of residuals' mean to its sd by white noise `sd`, (3,)."""
+    """Return the ratio, >= 1, of a mean residual's sd to its sd for white noise of `sd`, (3,)."""
     # A lag-1 correlation r of the means of 40 pieces multiplies the variance of the mean of all
     # pieces by (1 + r) / (1 - r).
     size = max(len(residual) // 40, 1)
@@ -254,7 +254,7 @@ def _trend(time: Floats, r: float) -> Floats:
 
 
 def _turn(time: Floats, gyro: Floats, at: int) -> float:
-    """Return the rotation within 1 s of a step [rad], by the rate less its median on each side."""
+    """Return the rotation within 1 s of a step [rad]; each side's median rate is subtracted."""
     about_level = [side - np.median(side, axis=0) for side in (gyro[:at], gyro[at:])]
     angles = np.concatenate(about_level)[1:] * np.diff(time)[:, None]
     return float(np.linalg.norm(angles[np.abs(time[1:] - time[at]) <= 1.0].sum(axis=0)))

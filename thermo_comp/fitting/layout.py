@@ -85,7 +85,7 @@ class Layout:
 
     @cached_property
     def unit(self) -> Ints:
-        """Indices of the unit's unknowns by axis, n_unit for the residual, (3, k)."""
+        """Indices of the unknowns of the unit and, the last, of the residual, by axis, (3, k)."""
         common = np.append(self.shared, self.n_unit)
         return np.hstack((self.axis, np.tile(common, (3, 1))))
 
@@ -232,8 +232,7 @@ class Tangent:
         place = self.place[first:]
         n, bias = len(place), slice(1, 1 + self.n_bias)
         scale = slice(bias.stop, bias.stop + self.n_scale)
-        # Sums, over the positions, of products of two base series; each product is multiplied by
-        # the power 0, 1 or 2 of the factor of the scale's weights.
+        # Sums, over the positions, of `products` times the power 0, 1 or 2 of `scale`.
         powers = np.stack([self.scale**k for k in range(3)])
         sums = np.tensordot(powers.transpose(2, 0, 1), products, 1)
         unit = np.empty((3, n, n))

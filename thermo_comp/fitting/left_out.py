@@ -13,7 +13,7 @@ does not depend on the attitude) and, if the other positions determine |f|, ``|f
 
 Model A is better than B if the error of A is smaller by more than the standard error over folds,
 both for positions and for sections of the program; `gain` lists exceptions. A model that describes
-only one recording fails on left-out positions, a model of one program on sections.
+only one recording fails on left-out positions; a model of only one program, on left-out sections.
 
 References
 ----------
@@ -153,7 +153,7 @@ class Score:
 
     @property
     def excess(self) -> float:
-        """RMS of the left-out drift in excess of noise and thermometer [m/s^2]; 0 if unknown."""
+        """RMS left-out drift in excess of noise and thermometer errors [m/s^2]; 0 if unknown."""
         square = self.rms**2 - self.noise**2 - self.by_thermometer**2
         return float(np.sqrt(square)) if square > 0.0 else 0.0
 
@@ -177,8 +177,8 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     left-out |f|, if this ratio exceeds two standard errors. `by_halves`: whether larger errors of
     left-out halves of the chamber program, a sign of too many columns, exclude a gain. Larger
     errors of left-out |f| exclude a gain; so does a larger expected error of the bias at settled
-    temperatures, unless noise explains the drift. The drift need not decrease if noise explains
-    it, because left-out bags of soaks contain no effects of ramps.
+    temperatures, unless noise explains the drift. A drift that noise explains need not
+    decrease, because the drift of left-out soaks contains no effects of ramps.
     """
     *drifts, norms = _beyond_thermometer(before, after)
     drift = [gain for gain in drifts if gain]
@@ -269,9 +269,9 @@ def settled_error(
 
     In bags that all begin at one temperature the lags change together with the board temperature,
     so the bias after the lags have settled is extrapolated from such bags. The expected error of
-    the settled bias is the root sum of squares of its posterior sd and of the left-out drift
-    beyond the noise, `excess` [m/s^2], times the ratio (if above 1) of this sd to the sd of the
-    bias in the windows. `settled`: columns at settled temperatures, shape (k, m).
+    the settled bias is the root sum of squares of its posterior sd and of ``excess * growth``;
+    `excess`: left-out drift beyond the noise [m/s^2]; growth: ratio of the posterior sd to the sd
+    of the bias in the windows, at least 1. `settled`: columns at settled temperatures, (k, m).
     """
     if not posterior.layout.used[0].any():
         return np.inf
@@ -296,7 +296,7 @@ def _sd_of_changes(posterior: PosteriorMode, columns: Floats) -> float:
 def _by_positions(
     regression: Regression, posterior: PosteriorMode
 ) -> tuple[Folds, Folds, Floats, Floats]:
-    """Leave out each mounting: return folds of drift and of |f|; force and drift of windows."""
+    """Leave out each mounting; return errors of drift and of |f|, force and drift of windows."""
     windows, share = regression.windows, regression.weight / regression.windows.weight
     point, edges = regression.at(posterior.state, posterior.prior), windows.edges
     counts = np.diff(edges).astype(np.float64)
@@ -328,7 +328,7 @@ def _is_drift_determined(
 ) -> bool:
     """
     Whether the fit without a position, of covariance ``root @ root.T``, determines the drift in
-    `rows`: the drift's variance is below ten times that of the fit of all positions plus noise.
+    `rows`: the drift's variance is below 10 (its variance by all positions + noise variance).
     """
     regression, sigma = point.regression, point.prior.sigma
     if not point.layout.used[0].any():
@@ -349,7 +349,7 @@ def _is_drift_determined(
 def _is_norm_determined(point: Point, posterior: PosteriorMode, root: Floats, p: int) -> bool:
     """
     Whether the fit without position `p`, of covariance ``root @ root.T``, determines |f| in `p`:
-    the variance of |f| is below ten times that of the fit of all positions plus offsets.
+    the variance of |f| is below 10 (its variance by all positions + variance of the offsets).
     """
     if not point.regression.gravity:
         return False

@@ -151,7 +151,7 @@ def prior_sd(kinds: Sequence[Kind], options: FitOptions) -> Floats:
 
 
 def starting_sd(forces: Forces, options: FitOptions) -> Floats:
-    """Return the prior sd of the first fit, with an sd of 0 for the odd square, shape (2 k,)."""
+    """Return the prior sds of the first fit, 0 for the term a |a| (`odd_square`), shape (2 k,)."""
     is_initial = np.array([kind != 'odd_square' for kind in forces.kinds] * 2)
     return np.asarray(prior_sd(forces.kinds, options) * is_initial)
 

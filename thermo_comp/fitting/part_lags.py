@@ -90,7 +90,7 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> list[Part
     Returns [] if the model with one lag per axis does not explain the drift of all axes, or if the
     data do not determine a time constant. If the residual of every shape exceeds the noise, a
     second stage may only describe slow noise or a tilt of the support: lags of one stage then come
-    first in the list, if on every axis they halve the RMS residual without a lag.
+    first, if the RMS residual of every axis is less than half of that without a lag.
     """
     data, columns = windows.data, windows.model.columns
     if not windows.has_temperature or not any(column.group == 'board' for column in columns):
@@ -185,7 +185,7 @@ class _PartCurves:
     def _is_of_use(
         self, lag: Part, axis: int, noise: float, most_noise: float = 3.0, reduction: float = 4.0
     ) -> bool:
-        """Whether the residual with `lag` is near the noise, or far below that without a lag."""
+        """Whether the residual with `lag` is near the noise, or far below that with lag 0 s."""
         typical = 1.4826 * np.median(np.abs(self._weighted(lag, axis) / self._root_weight[:, 0]))
         return bool(typical <= most_noise * noise or self.reduction(lag, axis) >= reduction)
 
@@ -206,7 +206,7 @@ class _PartCurves:
                 along = [self.one_stage(axis, share) for share in (0.3, 0.6, 0.9)]
                 starts.append(min(along, key=lambda lag: self._square(lag, axis)))
             if not any(self._is_of_use(near, axis, noise, 8.0, 1.5) for near in (best, *starts)):
-                # A second stage or another share would not reduce the residual enough.
+                # No second stage, or share of the gradient, would reduce the residual enough.
                 return best
             lags = [self._searched(axis, _in_two_stages(one_stage), (0.2, 0.4, 0.0, 0.0))]
             if best.lead_s:
@@ -228,8 +228,8 @@ class _PartCurves:
         Add a share of the gradient to a lag or, without a case thermometer, a positive lead time,
         if the residual then is significantly smaller.
 
-        The residual is linearised w.r.t. time constant and share (or lead). The sum of squared
-        residuals must decrease by a factor that white residuals reach with a probability of 1e-5.
+        The residual is linearised w.r.t. time constant and share of the gradient, or lead. Its sum
+        of squares must decrease by a factor that white residuals reach with a probability of 1e-5.
         """
         tau = lag.tau_s
         if not tau:
@@ -267,9 +267,9 @@ class _PartCurves:
         """
         Return the lag of the smallest RMS residual by the simplex method, from the lag `first`.
 
-        The coordinates are the logarithms of both time constants, the share of the gradient, and
-        the ratio of lead to first time constant. `steps`: first steps in the coordinates; 0 keeps
-        a coordinate constant. `accuracy`: half of the largest extent of the final simplex.
+        The search is over the logarithms of both time constants, the share of the gradient, and
+        lead / first time constant. `steps`: first steps in these coordinates; 0 keeps a coordinate
+        constant. `accuracy`: half of the largest extent of the final simplex.
         """
         tau, second, share, lead = first
         start = np.array([np.log(tau), np.log(second or 1.0), share, lead / tau])
@@ -311,8 +311,8 @@ class _PartCurves:
 
     def _is_determined(self, lag: Part, axis: int) -> bool:
         """
-        Whether a time constant `_TAU_RATIO` times longer or shorter (21 s for a lag of 0 s)
-        increases the RMS residual by over 5 %, and the lag decays to 10 % within the longest bag.
+        Whether time constants `_TAU_RATIO` times as long or short (21 s for a lag of 0 s) increase
+        the RMS residual by over 5 %, and the longest bag lasts at least ln(10) time constants.
         """
         tau, second, share, lead = lag
         if tau > float(self._age.max()) / np.log(10.0):
@@ -342,8 +342,8 @@ class _PartCurves:
         ratio = float(np.sqrt((square / noise**2).max()))
         x, y, z = (Part(*map(round, lag, (1, 1, 4, 1))) for lag in lags)
         # Other models are tried if the left-out drift is above `most_drift`: 2 sd of the noise, or
-        # 10 sd for a shape without stress whose residual noise explains, because the curves of
-        # this shape extrapolate badly to left-out data.
+        # 10 sd if noise explains the residual of a shape without stress, because such a shape
+        # extrapolates badly to left-out data.
         is_curve = ratio <= self._shape.most_noise and not self._shape.has_stress
         most_drift = (10.0 if is_curve else 2.0) * float(noise.mean())
         return Parts((x, y, z), factors, most_drift), ratio

@@ -160,7 +160,7 @@ def _with_common_scatter(deviations: Floats, layout: ParameterLayout, K: Floats)
 
 
 def _without_range(column: Column) -> Column:
-    """Return a column with constant `range` and `rest_k`, which differ between units of a type."""
+    """Replace `range` and `rest_k` of a column, which differ between units, by fixed values."""
     return replace(column, range=(0.0, 1.0), rest_k=0.0)
 
 

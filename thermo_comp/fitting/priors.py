@@ -107,7 +107,7 @@ def informative_priors(
             'calibration cannot be a prior'
         )
     # Pairs to try: sd of the ageing of biases [g] and of scale factors (0: as the user states);
-    # and `share`, the uncorrelated variances to add over the variances of the prior.
+    # and `share`, the ratio of the uncorrelated variances to add to the variances of the prior.
     tried = [(0.0, share) for share in (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)]
     # The fit begins with the last, widest prior: in a first fit with a narrow prior, the noise
     # would absorb changes of the unit.
@@ -119,8 +119,8 @@ def informative_priors(
         tried += [(ageing, 0.0) for ageing in (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)]
         # Priors for a unit whose effects of temperature have changed, too: `share` multiplies the
         # sd of the prior by 1.4, 30 and 1000, because the sd of an effect of temperature may be a
-        # thousandth of the effect. The sd of an effect is at most the effect: with a larger sd few
-        # rests would leave the effects at other temperatures unknown.
+        # thousandth of the effect. The sd of an effect of temperature is raised at most to the
+        # effect: with a larger sd, effects at temperatures without rests would be unknown.
         tried += [(ageing, share) for share in (1.0, 1e3, 1e6) for ageing in (3e-5, 3e-4, 3e-3)]
     K, places = constants_of(calibration).scale, parameter_layout(calibration)
     layout = regression.layout(regression.windows.parts)
@@ -160,9 +160,9 @@ def _root(covariance: Floats, share: float, sizes: Floats, to_file: Floats) -> F
     """
     Return the upper triangular root of the inverse covariance of the unit's unknowns.
 
-    `covariance`: of the file's parameters; each parameter's variance is increased by `share` times
-    this variance, at most by the variance or, if larger, by the square of its size in `sizes`;
-    `to_file`: derivatives of the file's parameters w.r.t. the unknowns
+    `covariance`: of the file's parameters; each variance v is increased by ``min(share * v, max(v,
+    size^2))``, with the parameter's size in `sizes`; `to_file`: derivatives of the file's
+    parameters w.r.t. the unknowns
     """
     diagonal = np.diag(covariance)
     floor = np.where(diagonal > 0.0, diagonal, np.min(diagonal[diagonal > 0.0], initial=1.0))

@@ -195,11 +195,11 @@ def reduce_source(
     Read one source in blocks and keep its sufficient statistics.
 
     `still_sd` is the largest sd of samples at rest [g]. Without `min_rest_s` a rest lasts at least
-    3 s, or at least 1 or 2 s if these shorter rests determine bias and scale better. The largest
-    variance of a rest is also chosen so that the rests determine bias and scale best. If the user
-    or the bag states |f|, the largest variance is fixed, and `min_rest_s` is by default 3 s. At a
-    low sample rate, cells of the usual number of samples are so long that drifts look like motions
-    and short rests are lost: cells of 10 or 5 samples are tried.
+    3 s, or at least 1 or 2 s if these shorter rests determine bias and scale better. The limit
+    of the variance in a rest is also chosen for the best bias and scale. If the user or the bag
+    states |f|, this limit is fixed, and `min_rest_s` is by default 3 s. At a low sample rate,
+    cells of the usual number of samples are so long that drifts look like motions and short rests
+    are lost: cells of 10 or 5 samples are tried.
     """
 
     def reduced(least: int) -> tuple[ReducedBag, float]:
@@ -319,14 +319,14 @@ def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
 
 def is_spike(value: Floats) -> Bools:
     """Return which readings are over 10 K from the median of five readings about them, (n,)."""
-    # A thermometer with a loose contact reads -127 or 85 degC for a moment. Thermometer noise is
-    # estimated without readings of a loose contact, which the tracker then rejects as outliers.
+    # A thermometer with a loose contact reads -127 or 85 degC for a moment. The noise is estimated
+    # without such readings, so that the tracker rejects them as outliers.
     far = np.zeros(len(value), dtype=bool)
     if len(value) > 4:
         middle = np.median(sliding_window_view(value, 5), axis=1)
         far[2:-2] = np.abs(value[2:-2] - middle) > 10.0
-        # The first reading, and the last, has neighbours on one side only. A large step at
-        # an end of the readings belongs to a ramp if the following step is similar.
+        # The first reading, and the last, has neighbours on one side only. A large step to its
+        # neighbour belongs to a ramp if the step from there to the next neighbour is similar.
         for place, nearest in ((0, value[:3]), (-1, value[:-4:-1])):
             step, after = np.abs(np.diff(nearest)).tolist()
             far[place] = step > 10.0 and after < CONTINUED_SHARE * step
@@ -334,7 +334,7 @@ def is_spike(value: Floats) -> Bools:
 
 
 def _max_abs(cells: Cells) -> float:
-    """Return the 99 % quantile, over the cells, of a cell's largest absolute mean plus 3 sd."""
+    """Return the 99 % quantile, over cells, of |mean| + 3 sd of the axis with the largest sum."""
     if not len(cells.count):
         return 0.0
     sizes = np.max(np.abs(cells.mean) + 3.0 * np.sqrt(cells.variance), axis=1)
@@ -344,7 +344,7 @@ def _max_abs(cells: Cells) -> float:
 def _rests(cells: Cells, min_rest_s: float | None, still_sd: float) -> list[tuple[int, int]]:
     """Find the rests, with the thresholds whose rests determine bias and scale best."""
     candidates: list[list[tuple[int, int]]] = []
-    # Values to try for the largest variance of a rest, relative to that of the quietest cells.
+    # Limits to try for the variance in a rest, divided by the variance in the quietest cells.
     ratios = tuple(stillness.VARIANCE_RATIO * 2.0**power for power in range(6))
     of_ratios = stillness.still_runs(cells, still_sd, ratios)
     for shortest_s in (3.0, 2.0, 1.0) if min_rest_s is None else (min_rest_s,):
@@ -426,7 +426,7 @@ def rounding_sd(variance: Floats, drift: Floats, quantum: Floats) -> Floats:
 
     `variance`: median variance of the rounded samples in a cell; above 0, the noise of the
     samples averages the rounding error to 0.
-    `drift`: range of the means; over n steps of the converter, n + 1 rounding errors average.
+    `drift`: range of the means; a drift over n steps of the converter divides the sd by n + 1.
     """
     steps = np.divide(drift, quantum, where=quantum > 0.0, out=np.zeros(3))
     return np.asarray(np.where(variance > 0.0, 0.0, quantum / 12.0**0.5 / (1.0 + steps)))

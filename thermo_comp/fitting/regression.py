@@ -189,7 +189,7 @@ class Point:
             precision = self.precision[:n]
             factor = factored_with_prior(information, precision)
             return solved(factor, gradient - precision * deviation), factor
-        # Unknowns are scaled by the root of the prior, which makes the equations well conditioned.
+        # Multiplying the unknowns by the root of the prior precision conditions the equations.
         root = self.prior.informative.root
         scaled = solve_triangular(root, information, trans='T')
         scaled = solve_triangular(root, scaled.T, trans='T')
@@ -230,11 +230,11 @@ class Point:
         """
         Take Gauss-Newton's step.
 
-        If the step increases the energy, fractions of the step are tried for the nonlinear
-        unknowns, which multiply others; for each fraction the linear unknowns are solved again.
+        If the step increases the energy, fractions of the step of the nonlinear unknowns (which
+        multiply other unknowns) are tried, each with a new step of the linear unknowns.
         """
-        # Compute the energy and the step here before the energy after the step, because the
-        # regression keeps only the last linearisation.
+        # The regression keeps only the last linearisation: compute `self.energy` and
+        # `self.solution` before the energy of the next point.
         energy, (step, _) = self.energy, self.solution
         result = self.with_step(step)
         if result.energy <= energy:

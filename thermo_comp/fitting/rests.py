@@ -52,8 +52,8 @@ def is_steady(windows: ThermalWindows) -> Bools:
     """
     Return which positions have constant temperatures, shape (n_positions,): in a position the
     board temperature and the lags change (RMS) by less than three sd of the estimated board
-    temperature. At three sd, noise is a ninth of the mean square change of temperature, so slopes
-    fitted to such changes would be a ninth too small.
+    temperature. Noise is a ninth of the mean square of a change of three sd, so slopes fitted to
+    such changes would be a ninth too small.
     """
     data, model = windows.data, windows.model
     lags = [column.group in LAGS and not column.power for column in model.columns]
@@ -73,8 +73,8 @@ def is_without_drift(data: Windows, scale: Floats) -> Bools:
 
 def constant_in(data: Windows, steady: Bools, settled: Bools) -> Windows:
     """
-    Set the columns constant in the positions of the mask `steady`, and the effects of initial lag
-    states, which would only fit noise, to 0 in those of `settled`; both masks: (n_positions,).
+    Set the columns constant in the positions of the mask `steady`. Set the effects of initial lag
+    states, which would only fit noise, to 0 in the positions of the mask `settled`.
     """
     in_steady = steady[data.position][:, np.newaxis]
     means = (data.columns - within_positions(data.columns, data.position))[data.edges[:-1]]

@@ -159,7 +159,7 @@ class Growth:
                 # mean squares to the mean square of the residual.
                 by_attitude = regression.gravity * state.from_pose
                 square += float(np.mean(state.offset**2) + np.mean(by_attitude**2))
-            # The typical weight of a new column explains the RMS residual.
+            # With its typical weight, a new column alone would explain the RMS residual.
             slope = np.sqrt(square) / (float(kelvins[0]) or 1.0)
             units = np.array([[1.0], [1.0 / (regression.gravity or 1.0)]])
             new = np.minimum(slope * units * kelvins, most)
@@ -331,8 +331,8 @@ def fit_all(
     informative: Sequence[InformativePrior] = (),
 ) -> Selected:
     """Fit all columns, with the prior of `informative` whose fit has the largest log density."""
-    # Offsets of mountings would explain |f| in few positions as well as an ageing of the
-    # unit, so the sd of these offsets is constant until an informative prior is chosen.
+    # In few positions, offsets of mountings and ageing of the unit explain |f| equally well,
+    # so the sd of these offsets is constant until an informative prior is chosen.
     scale = prior.offset_scale
     prior = replace(prior, offset_scale=0.0 if informative else scale)
     posterior = settle(regression, state, prior, candidates)

@@ -168,7 +168,7 @@ def _rate_histories(
 
 
 def _slowest_ramp(histories: Sequence[RateHistory], usual: float) -> float:
-    """Return 0.7 times the slowest ramp of > 10 min, from RAMP_K_MIN to `usual` [K/min]."""
+    """Return 0.7 times the slowest ramp of over 10 min, limited to RAMP_K_MIN..usual [K/min]."""
     slowest = usual / 0.7
     for history in histories:
         is_ramp = np.abs(history.rate) > max(history.least_ramp, 0.1 / 60.0)
@@ -185,7 +185,7 @@ def _ripple(histories: Sequence[RateHistory], lag_s: float, usual: float) -> flo
     rates = [np.zeros(0)]
     for history in histories:
         moving = np.abs(history.rate) > max(0.2 * history.fastest, history.least_ramp)
-        # A soak has no ramp within five minutes before and after a grid point.
+        # A grid point is in a soak if no ramp is within five minutes before or after it.
         rates.append(history.rate[np.convolve(moving, np.ones(61))[30:-30] < 0.5])
     resting = np.concatenate(rates)
     if len(resting) < 60:
@@ -193,8 +193,8 @@ def _ripple(histories: Sequence[RateHistory], lag_s: float, usual: float) -> flo
     noise = float(np.median([history.rate_sd for history in histories]))
     swing = float(np.quantile(np.abs(resting - np.median(resting)), 0.95))
     clean = float(np.sqrt(max(swing**2 - (2.0 * noise) ** 2, 0.0)))
-    # A ripple of up to 3 times the noise of the rates may be undetected: assume a ripple of this
-    # size, or of the default if the default is smaller.
+    # A ripple with rates of up to 3 sd of the noise of the rates may be undetected: assume such a
+    # ripple, but at most the `usual` ripple.
     hidden = min(usual, 3.0 * noise * lag_s)
     return float(np.clip(max(clean * lag_s, hidden), 0.02, 1.0))
 

@@ -13,8 +13,8 @@ stationary Gauss-Markov process of variance ``ratio sigma^2`` and correlation ti
 Annex B.4.3); a random walk is the limit for a long T. Flicker noise, the bias instability of a
 sensor, is the sum of Gauss-Markov processes of equal variance, with the correlation times T, 10 T,
 100 T and so on [2]_. The innovations of a Kalman filter for white plus Gauss-Markov noise, divided
-by their standard deviations, are white and have all information of the series. For means and
-columns replaced by innovations, ordinary least squares is the optimal estimator [1]_.
+by their standard deviations, are white and have all information of the series. With the
+innovations of means and columns, ordinary least squares is the optimal estimator [1]_.
 
 References
 ----------
@@ -120,7 +120,7 @@ class Whitener:
         Find the Gauss-Markov noise of residuals, shape (n, 3), by their profile likelihood.
 
         The axes have a common variance ratio and correlation time; the likelihood is maximised
-        over the white variance of each axis. The result is white noise unless slow noise raises
+        over the white variance of each axis. White noise is returned unless slow noise raises
         twice the log likelihood by 9.2, the 1 % point of a chi-square with two degrees of freedom.
         """
         # Ratios to try of the Gauss-Markov variance to the white variance of a window.
@@ -326,6 +326,6 @@ class Series:
         return result
 
     def products_at(self, products: Floats, state: State, base: Base) -> Floats:
-        """Convert sums of products, (n_positions, n_base, n_base), to initial lags of `state`."""
+        """Convert sums of products, (n_positions, n_base, n_base), to `state`'s initial lags."""
         half = self.at_starts(products, state, base)
         return self.at_starts(np.swapaxes(half, 1, 2), state, base)

@@ -56,8 +56,8 @@ def temperature_range(windows: ThermalWindows) -> Range:
 
 def soak_gradient(windows: ThermalWindows, known: Calibration | None) -> Range | None:
     """
-    Return the gradient of the first sensor in soaks and its robust scatter [K], if known those of
-    the prior calibration `known`; None without the sensor or without a soak.
+    Return the gradient of the first sensor in soaks and its robust scatter [K], both by the prior
+    calibration `known` if it has them, else by the windows; None without the sensor or a soak.
     """
     if known is not None and known.soak_gradient_k is not None:
         return known.soak_gradient_k
@@ -80,9 +80,9 @@ def rest_gradient_range(
     """
     Return the valid range of the first sensor's gradient at rate 0, ``gradient - lag_s * rate``.
 
-    The range of a prior calibration, `known`, is included. If the prior has no range, the result
-    is None if the sensor is missing, without ramps, which determine the lag, or if a value exceeds
-    100 K, as in bags that are too short for a rate.
+    The range of a prior calibration, `known`, is included. The windows have no range without the
+    sensor, without ramps (which determine the lag), or if a value exceeds 100 K, as in bags that
+    are too short for a rate. The result is None if neither prior nor windows have a range.
     """
     lower, upper = valid_range(windows.gradient - lag_s * windows.rate, 0.01)
     is_small = max(-lower, upper) < 100.0

@@ -146,9 +146,9 @@ class Windows:
     @cached_property
     def has_turn_ons(self) -> bool:
         """
-        Whether turn-on offsets are unknowns of the fit. Several turn-ons or a prior calibration
-        are needed (else the offset of a single turn-on is part of the bias), and on average two or
-        more mountings per turn-on, which separate turn-on offsets from mounting offsets.
+        Whether turn-on offsets are unknowns of the fit. Without a prior calibration the offset of
+        a single turn-on is part of the bias. On average, two or more mountings per turn-on are
+        needed to separate turn-on offsets from mounting offsets.
         """
         least = 1 if self.has_prior else 2
         return least <= self.n_turn_ons <= (int(self.mounting[-1]) + 1) / 2
@@ -192,7 +192,7 @@ class Noise(NamedTuple):
 
     @property
     def rate(self) -> float:
-        """Random walk at short times, in white-noise sds of a window [1/sqrt(s)]."""
+        """Random walk of slow noise at short times, divided by white noise [1/sqrt(s)]."""
         return math.sqrt(sum(2.0 * self.ratio / time_s for time_s in self.times_s))
 
 

@@ -121,7 +121,7 @@ class Model:
         The temperature of a part less the reference is ``x = t - m``, with the board temperature t
         and the part's lag m. x^p is a sum of t^p, t^(p-1) m, ..., m^p (binomial theorem), so one
         weight per power describes a curve over x. If all bags repeat one warm-up, m is a function
-        of t, and the data would not determine separate weights of these columns.
+        of t, and the data would not determine separate weights of t^p, t^(p-1) m, ..., m^p.
         """
         static, n_curves = self.sets.static, len(self.sets.groups)
         n_columns = n_curves + len(self.columns)
@@ -198,7 +198,7 @@ class ThermalWindows:
 
     @property
     def was_measured(self) -> bool:
-        """Whether a temperature was recorded, which may be constant over the bags."""
+        """Whether a temperature was recorded, even if it is constant over the bags."""
         return self.has_temperature or bool(self.data.columns[:, 0].any())
 
     @property
@@ -332,8 +332,8 @@ def _windows(
     tilt = np.column_stack((t, gradient, (t + gradient) ** 2))
     tilt_rms = np.sqrt(np.mean(tilt**2, axis=0))
     is_tilting = tilt_rms > 0.0
-    # Not in the scale: the level of the dynamic set (the relative scale is 1 at the reference
-    # temperature in both regimes), and columns of terms that act on the bias only (`has_scale`).
+    # The scale has no level of the dynamic set (the relative scale is 1 at the reference
+    # temperature in both regimes), and no columns of terms that act on the bias only, `has_scale`.
     in_scale = [True] * n_curves + [c.term.has_scale for c in columns] + [True] * len(sums)
     in_scale[model.sets.level] = False
     start = np.hstack((np.zeros((len(t), n_curves)), rows.start))
@@ -395,7 +395,7 @@ def _kelvins(model: Model, values: Floats, raw: Floats, t: Floats, gradient: Flo
     curves = model.sets.columns(grid, np.full_like(grid, 0.5))
     steepest = [float(np.abs(np.gradient(curve, grid)).max()) for curve in curves]
     rms = np.sqrt(np.mean(values**2, axis=0))
-    # The weight w of the dynamic set counts as changing by 1 per change of the RMS gradient [K].
+    # The largest slope of the dynamic set's weight w over temperature is set to 1 / RMS gradient.
     steepest[model.sets.level] = 1.0 / flow
     for column, series in zip(model.columns, raw.T, strict=True):
         steepest.append(column.term.steepest(column, series, flow) * farthest**column.power)
@@ -413,7 +413,7 @@ def _part_kelvins(values: Floats) -> Floats:
 
 
 def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
-    """Run the thermal tracker over the readings of a bag, with 5 states per window."""
+    """Run the thermal tracker over the readings of a bag; store its state 5 times per window."""
     spec = replace(spec, lags=(), plays=())
     if not len(bag.board.value):
         # Without readings, assume the reference temperature since 1e9 s, so that all lags are 0.
