@@ -6,9 +6,9 @@ not determine, and for effects that the model lacks.
 
 The standard deviation of mounting and turn-on offsets, unless the user states it, is marginalised:
 the covariance is that of a mixture of fits on a grid of this standard deviation. The weight of a
-fit in the mixture is its evidence, at most the evidence of |f| in the positions, times a prior of
-the offset sd (half-Student [1]_ without a prior calibration). An error of local gravity, included
-in the covariance, changes all scale factors by the same ratio.
+fit in the mixture is its evidence, limited by the evidence of |f| in the positions, times the
+prior density of the offset sd (half-Student [1]_ without a prior calibration). An error of local
+gravity, included in the covariance, changes all scale factors by the same ratio.
 
 If the model lacks an effect, the best weights differ between sections of the chamber program, and
 the error in another program is as large as these differences: a jackknife [2]_ estimates them.
@@ -204,13 +204,13 @@ def _widened(
 
 def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floats) -> Prior:
     """
-    Add columns that the data do not determine to the prior, so that their variance is not 0.
+    Add to the prior the columns that the data do not determine, so that their variance is not 0.
 
     The weight of an inactive column is consistent with 0, but the data bound it only to ``1 /
     sqrt(S)``, S being the information about the weight given the active columns. If the bound
-    exceeds two sd of a window's noise, the column enters the covariance with zero weight, and the
-    smaller of bound and prior sd as sd. For the comparison with the noise, the bound of a nearly
-    constant column is scaled to the RMS of the board temperature t [K].
+    exceeds two sd of a window's noise, the column enters the covariance with weight 0 and an sd
+    that is the smaller of bound and prior sd. Before it is compared with the noise, the bound of a
+    nearly constant column is scaled to the RMS of the board temperature t [K].
     """
     groups, prior = np.array(regression.windows.groups), posterior.prior
     kelvins = regression.windows.kelvins
@@ -237,7 +237,7 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
         slopes = np.sqrt(np.sum(square[:, is_curve] / kelvins[is_curve] ** 2, axis=1))
         of_curve = np.outer(slopes, kelvins)
         typical = np.minimum(typical, of_curve)
-        # A curve column that the data do not determine changes the curve's slope by up to 50 %.
+        # A curve column that the data do not determine may change the curve's slope by 50 %.
         sd = np.where(groups == CURVE, np.minimum(sd, 0.5 * of_curve), sd)
     # n lags must not have more variance than one lag: each lag gets 1 / n of the variance.
     is_lag = is_of_lags & (sd > 0.0)

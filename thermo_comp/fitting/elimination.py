@@ -186,7 +186,7 @@ class Reduced:
         return positions, starts
 
     def without(self, places: Ints, normal: Normal) -> Floats:
-        """Return `matrix` without the positions `places`, whose equations are `normal`."""
+        """Return `matrix` less the positions `places`; `normal`: equations of these positions."""
         bag, r = self.layout.bag, len(self.bags.root[0])
         at = np.unique(bag[places])
         others = (bag == at[:, None]) & ~np.isin(np.arange(len(bag)), places)

@@ -5,10 +5,10 @@ Owns the exclusion of bags that were recorded in another thermal environment (su
 than most bags or a prior, and the error that the calibration states for these bags.
 
 In still air the board temperature responds to the case temperature in another way than in a
-chamber with a fan. No thermometer is at the axes, so the bias as a function of the measured
-temperatures differs, too, and no set of coefficients describes two environments: a bag of still
-air would increase the error in a chamber with a fan. The error of the correction in an excluded
-bag is published as a lack of fit.
+chamber with a fan. No thermometer is at the axes, so the bias is another function of the measured
+temperatures in another environment. A bag of still air would increase the error of a calibration
+in a chamber with a fan. The error of the correction in an excluded bag is published as a lack of
+fit.
 """
 
 from __future__ import annotations

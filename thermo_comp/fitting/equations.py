@@ -251,8 +251,8 @@ class Equations(Series):
         result[layout.tilt] = prior.tilt_sd**-2
         result[layout.start] = 1.0 / prior.start_variance_ratio
         result[layout.turn_on] = prior.turn_on_sd**-2
-        # The prior of attitudes is flat: a precision of 0. An angular rate does not depend on the
-        # attitude: a precision of 1 of each attitude then prevents singular equations.
+        # The prior of attitudes is flat: a precision of 0. Angular rates depend on no attitude: in
+        # a fit of rates a precision of 1 of each attitude prevents singular equations.
         result[layout.up] = 0.0 if self.gravity else 1.0
         result[layout.posed] = prior.pose_sd**-2
         # The prior of a pose is almost flat: its sd is 1 rad.

@@ -140,8 +140,8 @@ def _start_variance_ratio(posterior: PosteriorMode) -> float:
     start, places = posterior.state.start, posterior.layout.start
     if not places.size:
         return posterior.prior.start_variance_ratio
-    # A lag state with the variance of the node's prior (a ratio of 1) is added to the data, so
-    # that the lag states of a single bag cannot make `start_variance_ratio` very small.
+    # The node's prior (a variance ratio of 1) counts as one more lag state, so that the lag states
+    # of a single bag cannot make `start_variance_ratio` very small.
     gamma = float(posterior.determined[places].sum())
     if gamma <= -1.0:
         raise np.linalg.LinAlgError('rounding errors exceed the information about lag states')

@@ -69,7 +69,7 @@ def constant_calibration(
             f'an axis ({axes}) reads the same in all positions: the axis is dead, or the unit was '
             'never turned about another axis'
         )
-    # If no axis was near the vertical both ways up, half ranges are below |f|: try also |f| / 1.3.
+    # If no axis pointed nearly up and nearly down, half ranges are below |f|: try also |f| / 1.3.
     scales = (float(np.max(half)) * spread / gravity for spread in (1.0, 1.3))
     starts = (np.where(half * 4.0 > np.max(half), scale, half / gravity) for scale in scales)
     tried = (_refine(means, gravity, bias, scale, misalignment_sd) for scale in starts)

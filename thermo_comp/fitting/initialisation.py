@@ -109,7 +109,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     if options.model == 'golovach' or is_bench or n_directions == 1 or data.n_poses:
         # No tilts are fitted: a tilt of the support is not separable from a drift of the unit in
         # one attitude, nor from a change of the attitude in a pose. In Golovach's model tilts
-        # would absorb errors of the two sets.
+        # would absorb errors of the static and the dynamic set.
         data = replace(data, tilt=data.tilt[:, :0])
     settled = data.settled if problem.is_by_settled else None
     data = replace(data, has_prior=known is not None, settled=settled)
@@ -172,8 +172,8 @@ def _updating_priors(
         least_sigma=max(least, prior.least_sigma),
     )
     if prior.offset_scale and (known_sd := offset_sd_of(known)):
-        # The prior calibration states the sd of the bias over mountings and turn-ons, to a factor
-        # of two: larger changes of |f| count as ageing of the unit.
+        # The sd of the bias over mountings and turn-ons is at most twice that of the prior
+        # calibration, so that larger changes of |f| count as ageing of the unit.
         scale = min(prior.offset_scale, 2.0 * known_sd)
         offset_sd = prior.offset_sd if data.has_turn_ons else known_sd
         prior = replace(prior, offset_sd=offset_sd, turn_on_sd=known_sd, offset_scale=scale)

@@ -125,7 +125,7 @@ def _examine(
     beside = before | after
     at, r = _place_and_colour(time, accel, quiet_sd)
     lasting, relative_sd, residual = _step(time[beside], accel[beside], time[at])
-    # Two levels are rounded, the level before and the level after the step.
+    # The step is the difference of two mean levels, each with an error of rounding.
     by_rounding = 2.0**0.5 * rounding_sd
     lasting_sd = np.hypot(quiet_sd * relative_sd * _correlation(residual, quiet_sd), by_rounding)
     step, relative_sd, residual = _step(time, accel, time[at], r)
@@ -216,8 +216,8 @@ def _place_of_step(time: Floats, accel: Floats, quiet_sd: Floats, r: float) -> i
     residual = residual - trend @ (trend.T @ residual)
     candidates = np.arange(_FEWEST_SAMPLES, n - _FEWEST_SAMPLES + 1)
     # A unit step at sample k, whitened for the lag-1 correlation r, is 1 at k and 1 - r after k:
-    # its product with a residual is a sum over the residuals from sample k on. The square of a
-    # whitened step without trend contains sums over the trend from sample k on.
+    # its product with a residual is a sum over the residuals from sample k on. Removing the trend
+    # from the whitened step subtracts squares of sums over the trend from sample k on.
     tail = _sums_behind(residual, r)[candidates]
     trend_tail = _sums_behind(trend, r)[candidates]
     square = 1.0 + (1.0 - r) ** 2 * (n - candidates - 1) - (trend_tail**2).sum(axis=1)

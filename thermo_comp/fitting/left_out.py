@@ -40,8 +40,8 @@ from .regression import Point, PosteriorMode, Regression
 _FEWEST_WINDOWS = 8
 # Largest log ratio of two mean square errors that count as equal: 5 % of an RMS error.
 _NEGLIGIBLE_LOG_RATIO = 0.1
-# Largest ratio of an RMS error to the white noise that noise explains: in a soak, unknown lags
-# behind temperature changes of hundredths of a kelvin add an error to the white noise.
+# Noise explains an RMS error of up to 1.7 times the white noise: in a soak, unknown lags behind
+# temperature changes of hundredths of a kelvin add an error to the white noise.
 _NOISE_RATIO = 1.7
 
 

@@ -6,9 +6,9 @@ Owns the search for the thermal lag of each axis.
 The bias and the scale factor of an axis are modelled as functions of ``x = t - m``, the
 temperature of one part of the unit less the reference temperature. t is the board temperature T
 less the reference temperature, and m = T - L(T + v G) is T less the temperature of the part, with
-L the lag operator and G = T_case - T_board the gradient. The part follows T + v G, a temperature
-between board and case, with a lag of one first-order stage or, for a part that is heated through
-another part, two stages in series. Without a case thermometer, the part may follow a temperature
+L the lag operator and G = T_case - T_board the gradient. The part follows a temperature T + v G
+between board and case with a lag of one first-order stage or, if it is heated through another
+part, of two stages in series. Without a case thermometer, the part may follow a temperature
 that leads T by a time, the lead. The time constants, the share v of the gradient and the lead
 minimise the RMS residual of a spline of the bias and a cubic of the scale over x.
 """

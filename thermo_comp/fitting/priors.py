@@ -109,8 +109,8 @@ def informative_priors(
     # Pairs to try: sd of the ageing of biases [g] and of scale factors (0: as the user states);
     # and `share`, the ratio of the uncorrelated variances to add to the variances of the prior.
     tried = [(0.0, share) for share in (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)]
-    # The fit begins with the last, widest prior: in a first fit with a narrow prior, the noise
-    # would absorb changes of the unit.
+    # The fit begins with the last, widest prior: in a first fit with a narrow prior, the
+    # estimated noise would absorb changes of the unit.
     if options.ageing_bias or options.ageing_scale:
         tried.append(tried[-1])
     else:

@@ -37,9 +37,9 @@ def is_bench(windows: ThermalWindows, up: Floats) -> bool:
 
 def _is_heated(windows: ThermalWindows) -> Bools:
     """
-    Return the heated or cooled positions, shape (n_positions,): their temperature changes by over
-    a tenth of the span of all temperatures, or differs from the median by as much; all positions
-    if there are none. Drifts of short rests in a room hardly separate bias and scale.
+    Return the heated or cooled positions, shape (n_positions,), or all positions if none are: the
+    temperature changes, or its mean differs from the median, by over a tenth of the span of all
+    temperatures. Drifts of short rests in a room hardly separate bias and scale.
     """
     t, edges, weight = windows.temperature, windows.data.edges[:-1], windows.data.weight
     mean = block_means(t[:, None], weight, edges)[:, 0]

@@ -319,7 +319,7 @@ class Series:
         initial lag states at the prior mean to columns with the initial lag states of `state`.
         """
         if not len(base.lagged):
-            return rows  # not a copy, whose memory layout would change the last bits of products
+            return rows  # a copy's memory layout would change the last bits of products
         result: Floats = rows.copy()
         starts = self.starts(state, base)[:, None]
         result[..., 1 + base.lagged] += starts * rows[..., base.at_start]
