@@ -172,7 +172,7 @@ def _updating_priors(
         least_sigma=max(least, prior.least_sigma),
     )
     if prior.offset_scale and (known_sd := offset_sd_of(known)):
-        # The sd of the bias over mountings and turn-ons is at most twice that of the prior
+        # The scale of the prior of offset sds is at most twice the offset sd of the prior
         # calibration, so that larger changes of |f| count as ageing of the unit.
         scale = min(prior.offset_scale, 2.0 * known_sd)
         offset_sd = prior.offset_sd if data.has_turn_ons else known_sd

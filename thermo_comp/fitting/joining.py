@@ -116,7 +116,7 @@ def _intervals(parts: Sequence[ReducedBag]) -> tuple[StillInterval, ...]:
         shift_s = 1e-9 * (part.start_ns - parts[0].start_ns)
         is_alike = abs(part.window_s - parts[0].window_s) < 0.01 * parts[0].window_s
         for number, rest in enumerate(part.intervals):
-            # In a part whose window length differs from that of the first, no window is whole.
+            # No window counts as whole if its length differs from that in the first part.
             n_whole = rest.n_whole if is_alike else 0
             shifted = replace(rest, time=rest.time + shift_s, n_whole=n_whole)
             is_first = bool(result) and number == 0

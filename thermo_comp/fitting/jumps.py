@@ -217,7 +217,7 @@ def _place_of_step(time: Floats, accel: Floats, quiet_sd: Floats, r: float) -> i
     candidates = np.arange(_FEWEST_SAMPLES, n - _FEWEST_SAMPLES + 1)
     # A unit step at sample k, whitened for the lag-1 correlation r, is 1 at k and 1 - r after k:
     # its product with a residual is a sum over the residuals from sample k on. Removing the trend
-    # from the whitened step subtracts squares of sums over the trend from sample k on.
+    # from the whitened step reduces its square by squares of sums over the trend from k on.
     tail = _sums_behind(residual, r)[candidates]
     trend_tail = _sums_behind(trend, r)[candidates]
     square = 1.0 + (1.0 - r) ** 2 * (n - candidates - 1) - (trend_tail**2).sum(axis=1)
