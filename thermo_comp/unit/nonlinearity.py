@@ -98,7 +98,7 @@ class Nonlinearity:
             raise ValueError(f'`terms` must be of {list(POWERS)}, at most one each, in this order')
 
     def check_slope(self, force: float, temperatures: Sequence[float]) -> None:
-        """Raise ValueError if the slope is too large up to |f| = `force` [m/s^2], at any t [K]."""
+        """Raise ValueError if the nonlinear terms are too steep up to |f| = `force` [m/s^2]."""
         for t in temperatures:
             k2, kq, k3 = np.abs(self.coefficients(np.array([t])))[..., 0]
             slope = float(np.max(2.0 * (k2 + kq) * force + 3.0 * k3 * force * force))
@@ -183,7 +183,7 @@ class BeyondForce(NamedTuple):
         self, x: Real, y: Real, z: Real,
         xx: Real, xy: Real, xz: Real, yy: Real, yz: Real, zz: Real,
     ) -> tuple[Real, Real, Real, Real, Real, Real, Real, Real, Real]:  # fmt: skip
-        """Add the unknown term's variance to the covariance xx, xy, xz, yy, yz, zz of a sample."""
+        """Add the variance of an unknown K2 term to the covariance xx, xy, ..., zz of a sample."""
         xx, yy, zz = xx + self._variance(x), yy + self._variance(y), zz + self._variance(z)
         return x, y, z, xx, xy, xz, yy, yz, zz
 

@@ -44,7 +44,7 @@ class Source:
 @dataclass(frozen=True)
 class ResidualSummary:
     """
-    ``|f| - g`` of the fitted data in one regime or both; raw: corrected with the constants alone.
+    ``|f| - g`` of fitted data in one regime or both; raw: with bias and scale at T_ref only.
     """
 
     section: str
