@@ -78,7 +78,7 @@ class JudgedWindows:
         return len(self.time)
 
     def select(self, rows: Bools) -> JudgedWindows:
-        """Return the windows of the given rows of all arrays."""
+        """Return some of the windows: the given rows of each array."""
         kept = {field.name: getattr(self, field.name)[rows] for field in fields(self)[2:]}
         return replace(self, **kept)
 
@@ -131,7 +131,7 @@ def corrected_windows(
         raw = constants.force(raw)
         along = force / np.linalg.norm(force, axis=1, keepdims=True) @ constants.misalignment
         noise = along**2 @ np.array(Correction(calibration).noise)
-        # The converter adds the remainder of rounding to the next sample: a mean has no rounding.
+        # A mean has no rounding noise: the converter adds the remainder to the next sample.
         white = along**2 @ np.square(calibration.noise_density_m_s2_sqrt_hz)
         mean_white = white / (calibration.unit.cycle_time_s * table['count'])
         variance = np.maximum(table['variance'] - noise, 0.0) + mean_white

@@ -133,7 +133,7 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
 
 
 def unclaimed_gravity_sd(evidence: Evidence, info: CertificateInfo) -> float | None:
-    """Return the uncertainty of gravity not in the covariance [m/s^2]; None if not stated."""
+    """Return the uncertainty of gravity that the covariance lacks [m/s^2]; None if not stated."""
     stated = info.gravity.standard_uncertainty_m_s2
     if stated is None:
         return 0.0 if evidence.gravity_sd else None
@@ -206,8 +206,8 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
         value, sd = evaluate(calibration, program, at)[2:]
         off = value - np.outer(at - calibration.reference_temperature_c, slope)
         value[:, :3] += bias_0 / MICRO_G
-        # If U is unknown only because gravity's uncertainty is not stated, U without it sets the
-        # digits; if the calibration states no uncertainty, the largest values have 4 digits.
+        # Without a stated sd of gravity the rest of the uncertainty sets the digits of value and
+        # deviation; if the calibration states no uncertainty, the largest values have 4 digits.
         largest = np.maximum(np.abs(value).max(axis=0), 1e-3)
         four_digits = 10.0 ** (np.floor(np.log10(largest)) - 2.0)
         digits = np.where(known * sd > 0.0, known * sd, four_digits)

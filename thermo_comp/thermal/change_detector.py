@@ -4,11 +4,11 @@
 Owns the detection of departures: a temperature's rate leaves the baseline, its rate in a soak.
 
 Two Kalman filters of temperature and rate, one with a long and one with a short memory, have white
-noise as second derivative. A rate has departed if it is farther from 0 than the
-baseline is, by more than the sum of swing, error of the baseline and k times the sd of the noise.
-The factor k follows from the permitted rate of false alarms (Rice's formula [1]_, docs/regime.md).
-If noise cannot move the readings of a quantized sensor across a cell of one quantum, the filters
-are not used: two edges of cells crossed in the same direction give the mean rate.
+noise as second derivative. A rate has departed if it exceeds the baseline, away from 0, by more
+than the sum of swing, error of the baseline and k times the sd of the noise. The factor k follows
+from the permitted rate of false alarms (Rice's formula [1]_, docs/regime.md). If noise cannot move
+the readings of a quantized sensor across a cell of one quantum, the filters are not used: two
+edges of cells crossed in the same direction give the mean rate.
 
 References
 ----------
@@ -25,7 +25,7 @@ from .thermometer import Thermometer
 
 # Second derivative for which a filter is tuned / second derivative at the slowest ramp's onset.
 BEND_SHARES = (1.0, 10.0)
-TUNING: Final = 1.45  # best memory / (noise sd / second derivative)^0.4, for readings at 1 Hz
+TUNING: Final = 1.45  # best memory of a filter / (noise sd / second derivative)^0.4, at 1 Hz
 # Noise variance of the rate / the filter's rate variance, if most noise is that of quantization.
 CELL_NOISE_SHARE: Final = 0.4
 SETTLING_MEMORIES: Final = 5.0  # age / memory of a filter at which the noise is stationary

@@ -34,7 +34,7 @@ GRADIENT_START_SD: Final = 1.0
 
 
 class Quantity:
-    """A quantity of the thermal state, from readings of the thermometer `input` and the board."""
+    """A quantity of the thermal state, from readings of `input` and, for a gradient, the board."""
 
     input: str
     #: Largest magnitude of the quantity that a calibration may contain.
@@ -82,7 +82,7 @@ class Lag(_Lag, Quantity):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """The names `input` and, for a part between board and sensor, `sensor`."""
+        """Thermometers of the lag: `input` and, for a part between board and sensor, `sensor`."""
         return (self.input, self.sensor) if self.sensor else (self.input,)
 
     @property
@@ -129,8 +129,8 @@ class _Play(NamedTuple):
 class Play(_Play, Quantity):
     """
     Output of a play of half-width `width_k` less its input [K]. The input is the lagged board
-    temperature, or the board temperature if `tau_s` is 0. This difference has no
-    variance, because an error of the input shifts input and output equally.
+    temperature, or the board temperature if `tau_s` is 0. This difference has no variance,
+    because an error of the input shifts input and output equally.
     """
 
     input = BOARD_INPUT
@@ -142,7 +142,7 @@ class Play(_Play, Quantity):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """The names of the board and, for a part between board and sensor, of the sensor."""
+        """Thermometers of the play: the board and, for a part between both, `sensor`."""
         return self.lag.inputs if self.lag else (self.input,)
 
 
@@ -188,7 +188,7 @@ def start_root(lags: Sequence[tuple[Any, ...]]) -> Floats:
     The factor exists even if the covariance is singular, as with two nearly equal lags. The
     input before the first reading is modelled as a random walk with ``D = 2 sd^2 / START_TAU_S``
     [K^2/s], so that ``P_kl = D tau_k tau_l / (tau_k + tau_l)`` for two lags of one input, and 0
-    for lags of different inputs. The covariance P_kl decays as ``exp(-dt / tau_k - dt / tau_l)``.
+    for lags of different inputs. P_kl decays with time dt as ``exp(-dt / tau_k - dt / tau_l)``.
     """
     all_lags = [Lag(*lag) for lag in lags]
     terms = first_order_lags(all_lags)

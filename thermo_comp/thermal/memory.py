@@ -19,8 +19,8 @@ import numpy as np
 from ..typing import Floats
 from .lags import BOARD_INPUT, Lag, MemorySpec, first_order_lags
 
-#: Interval between readings / time constant of a lag, above which the unknown time at which the
-#: input changed between the readings adds variance.
+#: Interval between readings / time constant of a lag above which variance is added, because the
+#: time at which the input changed between the readings is unknown.
 SPARSE_SHARE: Final = 0.1
 #: Smallest weight of an old input in `_recursion`: smaller weights are below double precision.
 _LEAST_WEIGHT: Final = 1e-18

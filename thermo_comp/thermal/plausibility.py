@@ -35,10 +35,10 @@ CONTINUED_SHARE: Final = 0.25
 STILL_READINGS: Final = 20
 STILL_S: Final = 5.0
 STILL_PROBABILITY: Final = 1e-9
-#: Number of equal readings in a row, of a quantum not far above the noise, that are doubtful.
+#: Number of equal readings in a row that are doubtful if the quantum is not far above the noise.
 DOUBTFUL_READINGS: Final = 4
 #: A sensor with constant readings counts as frozen if the other sensor's temperature changes by
-#: more than this and noise and quanta [K]; the second limit is for a quantum far above the noise.
+#: more than this plus noise and quanta [K]; the second limit is for a quantum far above the noise.
 OTHER_MOVED: Final = 0.3
 OTHER_MOVED_BEYOND_CELL: Final = 0.7
 #: Largest assumed error of a sensor with constant readings [K].
@@ -54,7 +54,7 @@ LEAD_SHARE: Final = 0.15
 LEAD_READINGS: Final = 5
 LEAD_RATE_SHARE: Final = 0.3
 DOUBTFUL_RATE_SHARE: Final = 0.03
-#: Number of changed readings in a row equal to the board's after which a sensor counts as a copy
+#: Number of changed readings in a row that equal the board's after which a sensor counts as a copy
 #: of the board's, and the largest time between two readings that are compared [ns].
 COPIED_READINGS: Final = 10
 _TOGETHER_NS: Final = 10_000_000

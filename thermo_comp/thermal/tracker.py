@@ -90,7 +90,7 @@ class ThermalTracker:
         usual_s = max(UNWATCHED_SHARE * lag_s, config.case_timeout_s)
         #: Time without a decision after which the regime is unknown [s].
         self._unwatched_s = min(usual_s, max(lag_s, self.settings.board.lag_s))
-        # Change the lag in a copy of the check: another tracker may share the original.
+        # Set the lag in a copy of the board's check: another tracker may share the original.
         self.checks = {**self.checks, BOARD_INPUT: copy(self.checks[BOARD_INPUT])}
         self.checks[BOARD_INPUT].lag_s = board_lag_s
 

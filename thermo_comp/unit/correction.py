@@ -278,9 +278,9 @@ class Correction:
         if is_beyond or outside.any() or parts_out.any():
             columns_out = np.where(self._is_present, self.table.excess(raw), 0.0)
             columns_out = columns_out.max(axis=1, initial=0.0)
-            # Outside the calibrated range the curves are extrapolated. One error is the slope
-            # at the edge of the range times the board's distance from the edge; a second error is
-            # the sd of the slopes in the range times the largest distance of board or part.
+            # Outside the calibrated range the curves are extrapolated. One error of the
+            # curves is their slope at the edge of the range times the board's distance from the
+            # edge; another is the sd of the slopes times the largest distance of board or part.
             v += self._spread(shares * excess * excess, slopes)
             bent = shares * np.maximum(excess * excess, parts_out * parts_out)
             bends = np.broadcast_to(self._bends, (4, *slopes.shape[1:]))

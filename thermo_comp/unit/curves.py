@@ -16,8 +16,7 @@ from .functions import TANGENT_SPANS, basis_slopes, hold
 
 class Curves:
     """
-    Bias and scale of both sets as functions of the board temperature; the static set is row 0 of a
-    result.
+    Bias and scale of the static set (row 0) and the dynamic set over the board temperature.
 
     Where only one set is within its range, the difference of the two sets is constant. Beyond both
     ranges the curves of the set whose range extends farther follow tangents for `TANGENT_SPANS`

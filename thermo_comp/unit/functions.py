@@ -28,9 +28,8 @@ from .schema import broken
 #: One temperature difference [K], or an array of temperature differences.
 Kelvins: TypeAlias = float | Floats
 
-#: Length of the tangent that continues a curve beyond its range / width of the range. A
-#: parabola is 16 times closer to this tangent at the tangent's outer end than at the other end of
-#: the range.
+#: Length of the tangent that continues a curve beyond its range / width of the range. A parabola
+#: is 16 times closer to this tangent at the tangent's outer end than at the range's other end.
 TANGENT_SPANS = 0.25
 #: Largest accepted error of a function's value at the reference temperature.
 NORMALISATION_TOLERANCE = 1e-9
@@ -225,7 +224,7 @@ TemperatureFunction = Polynomial | CubicSpline | Exponential
 
 
 def check_reference(name: str, function: TemperatureFunction, expected: float) -> None:
-    """Raise ValueError, with the key's name, if a function is not `expected` at t = 0."""
+    """Raise ValueError, with the key's name, if a function differs from `expected` at t = 0."""
     with np.errstate(all='ignore'):
         value = function.value(0.0)
     if not abs(value - expected) <= NORMALISATION_TOLERANCE:

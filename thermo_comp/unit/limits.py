@@ -5,7 +5,7 @@ Owns the limits of a calibration's bias and scale over its temperatures.
 
 The bias at the reference temperature, and its change over temperature, are each at most twice the
 full scale. The effect of a column on the bias, and of a parameter's sd on bias or scale, is at
-most a million times the limit of bias or scale: beyond any instrument, but without overflow.
+most a million times the limit of bias or scale: no instrument reaches this, no float overflows.
 """
 
 from __future__ import annotations

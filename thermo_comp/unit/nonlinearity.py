@@ -242,7 +242,7 @@ class ForceCorrection:
     ) -> Floats:
         """
         Return the contribution of the nonlinear terms to the coefficients of x^2 to x^6 in the
-        error variance of an axis, (5, n), at temperatures less the reference, (n,).
+        error variance of an axis, (5, n); `t`: T_board - T_ref, (n,) [K].
 
         `rows`, (2 k, rank), and `rest`: factor of the covariance of the coefficients of k terms,
         and variances added to its diagonal; `on_bias`, `on_scale`, (rank, n): bias and relative
