@@ -176,9 +176,9 @@ def evaluate(
 @dataclass(frozen=True)
 class Epoch:
     """
-    Constants of a calibration, shape (6,): bias of x, y, z [ug], then change of their scale since
-    the unit's first calibration [ppm], in a soak at the reference temperature of the first
-    calibration. An unknown sd is NaN.
+    Constants of a calibration in a soak at the reference temperature of the unit's first
+    calibration, shape (6,): bias of x, y, z [ug], then change of the scale of x, y, z since the
+    first calibration [ppm]. An unknown sd is NaN.
     """
 
     date: str

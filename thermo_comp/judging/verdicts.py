@@ -23,7 +23,7 @@ LARGEST_RATIO = 2.0
 WIDE_PART = 0.5
 # Smallest number of windows of a regime that is judged separately.
 _FEWEST_WINDOWS = 6
-# Windows share a section if their sorted known |f| increase by at most this ratio in each step.
+# Largest ratio of successive values of the known |f|, in rising order, in one section.
 _LEVEL_RATIO = 1.02
 
 SECTIONS = ('static', 'dynamic', 'all', 'outside')
@@ -71,7 +71,7 @@ class Section:
 
 
 class Sections(dict[str, Section]):
-    """Sections ``static``, ``dynamic``, ``all``, inside the calibrated ranges; and ``outside``."""
+    """The sections ``static``, ``dynamic``, ``all`` in the calibrated ranges, and ``outside``."""
 
     @property
     def regimes(self) -> list[Section]:

@@ -30,10 +30,10 @@ from ..unit.nonlinearity import AT_REST
 
 #: Default duration of a window of a judgement [s].
 WINDOW_S = 60.0
-# Largest sum of the distances outside the calibrated ranges [half ranges], due to noise of the
-# thermometers, at which a window counts as inside.
+# Largest sum of the distances of a window outside the calibrated ranges [half ranges] that counts
+# as noise of the thermometers, so that the window counts as inside.
 _RANGE_TOLERANCE = 0.02
-# Smallest number of samples of a used partial sum / median number of all partial sums.
+# A partial sum is used if it has at least this share of the median number of samples.
 _LEAST_FILLED = 0.9
 
 
@@ -78,7 +78,7 @@ class JudgedWindows:
         return len(self.time)
 
     def select(self, rows: Bools) -> JudgedWindows:
-        """Return the windows of some rows; all fields but `window_s` and `gravity` are arrays."""
+        """Return some of the windows: the given rows of each array."""
         kept = {field.name: getattr(self, field.name)[rows] for field in fields(self)[2:]}
         return replace(self, **kept)
 
@@ -131,7 +131,7 @@ def corrected_windows(
         raw = constants.force(raw)
         along = force / np.linalg.norm(force, axis=1, keepdims=True) @ constants.misalignment
         noise = along**2 @ np.array(Correction(calibration).noise)
-        # The converter adds the remainder of rounding to the next sample: a mean lacks this noise.
+        # A mean has no rounding noise: the converter adds the remainder to the next sample.
         white = along**2 @ np.square(calibration.noise_density_m_s2_sqrt_hz)
         mean_white = white / (calibration.unit.cycle_time_s * table['count'])
         variance = np.maximum(table['variance'] - noise, 0.0) + mean_white
@@ -261,7 +261,7 @@ def _correct(calibration: Calibration, bag: ReducedBag, sums: _Table) -> None:
     # The checks for stuck samples and gravity do not apply to means of samples.
     config = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
     compensator = Compensator(calibration, config)
-    # Accept any forward step of the stamps: the stamp of a partial sum is a mean of many samples.
+    # Accept any forward step of the stamps: a partial sum has the mean time of many samples.
     compensator.leap_ns = np.iinfo(np.int64).max
     thermal = compensator.thermal
     readings = iter(readings_in_order(bag, thermal.inputs))

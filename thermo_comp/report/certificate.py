@@ -86,8 +86,8 @@ class AxisOverTemperature(NamedTuple):
 
     Cells of a row, as rounded texts: soak or ramp; temperature [degC]; bias, its expanded
     uncertainty and its deviation [micro-g]; scale relative to that at the reference temperature,
-    its expanded uncertainty and its deviation [ppm]. A deviation is the bias or scale less a line
-    that has this slope and passes through the value in a soak at the reference temperature.
+    its expanded uncertainty and its deviation [ppm]. A deviation is the bias or scale less a
+    straight line of the fitted slope through the value in a soak at the reference temperature.
     """
 
     axis: str
@@ -107,7 +107,7 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
     claimed = noise
     if calibration.has_uncertainty:
         x, y, z = (windows.force / np.linalg.norm(windows.force, axis=1, keepdims=True)).T
-        # Derivatives of |f| = g w.r.t. M[1][0], M[2][0] and M[2][1].
+        # Derivatives of |f| = g by M[1][0], M[2][0] and M[2][1].
         by_element = np.stack((x * y, x * z, y * z)) * windows.gravity
         attitude = _rms(np.linalg.norm(by_element.T * calibration.misalignment_sd, axis=1))
         claimed = _rms(windows.claimed_sd)
@@ -133,7 +133,7 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
 
 
 def unclaimed_gravity_sd(evidence: Evidence, info: CertificateInfo) -> float | None:
-    """Return gravity's uncertainty beyond that in the covariance [m/s^2]; None if not stated."""
+    """Return the uncertainty of gravity that the covariance lacks [m/s^2]; None if not stated."""
     stated = info.gravity.standard_uncertainty_m_s2
     if stated is None:
         return 0.0 if evidence.gravity_sd else None
@@ -206,8 +206,8 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
         value, sd = evaluate(calibration, program, at)[2:]
         off = value - np.outer(at - calibration.reference_temperature_c, slope)
         value[:, :3] += bias_0 / MICRO_G
-        # U without gravity's part sets the digits of value and deviation if U is unknown; if the
-        # calibration states no uncertainty, the largest values are printed with 4 digits.
+        # Without a stated sd of gravity the rest of the uncertainty sets the digits of value and
+        # deviation; if the calibration states no uncertainty, the largest values have 4 digits.
         largest = np.maximum(np.abs(value).max(axis=0), 1e-3)
         four_digits = 10.0 ** (np.floor(np.log10(largest)) - 2.0)
         digits = np.where(known * sd > 0.0, known * sd, four_digits)
@@ -227,7 +227,7 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
 
 
 def _gravity_part(evidence: Evidence, info: CertificateInfo) -> float:
-    """Return the scale's relative uncertainty due to gravity; NaN if gravity's is not stated."""
+    """Return the scale's relative uncertainty due to gravity; NaN if gravity has no stated sd."""
     sd = unclaimed_gravity_sd(evidence, info)
     if sd is None or evidence.calibration is None:
         return np.nan

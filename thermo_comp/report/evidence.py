@@ -223,7 +223,7 @@ class Evidence:
         return text if n == n_rests else f'{text} ({counted(n_rests, "rest")})'
 
     def axis_residuals(self) -> dict[str, Floats]:
-        """Return the force less the known |f| along the position's mean direction, (n, 3)."""
+        """Return the force less the mean direction of the position times the known |f|, (n, 3)."""
         windows = self.windows
         if windows is None or self.gravity is None or not self.positions:
             return {}
@@ -282,7 +282,7 @@ def evidence_of_bags(
 
 
 def evidence_of_fit(result: FitResult, gravity_sd: float = 0.0) -> Evidence:
-    """Return the evidence of a fit on its bags; `gravity_sd`: given to the fit [m/s^2]."""
+    """Return the evidence of a fit on its bags; `gravity_sd`: sd of gravity in it [m/s^2]."""
     rests = [(bag.source.name, rest.start_ns) for bag in result.bags for rest in bag.intervals]
     left_out = {(place.source, place.start_ns): place.left_out_rms for place in result.positions}
     against = [f'{note.name}: {note.message}' for note in result.findings if _is_reservation(note)]

@@ -26,7 +26,7 @@ from .certificate import Curve, curves, slopes
 from .evidence import CHOSEN, LEFT_OUT, RAW, Evidence, Position, ShownBag, required
 from .style import minus, number
 
-# Length of the part at the start of a position whose mean reading counts as zero drift [s].
+# Time at the start of each position in which the mean reading counts as zero drift [s].
 _ZERO_S = 120.0
 _SHADE = '#E9E9E9'
 # Diameter of the ring of the position with the largest residual [pt].
@@ -184,7 +184,7 @@ def _draw_flag(axes: Axes, shown: ShownBag, unit: float) -> None:
         if stretch.regime == Regime.UNKNOWN:
             axes.axvspan(*span, fill=False, hatch='---', edgecolor='#999999', lw=0)
             continue
-        level = float(stretch.direction)  # 0 only in the static regime
+        level = float(stretch.direction)  # +1 heating, -1 cooling, 0 static regime
         times += span
         levels += [level, level]
         if level:

@@ -89,11 +89,11 @@ class FlowEffect(Effect):
     """
     Effect of the size of a heat flow between two parts, less its effect in the reference state.
 
-    With ``x = |T_hot - T_cold| / knee`` the first signal is ``x ** exponent`` times the deviation
-    of `cold` to the `power`. The exponent is 1.25 for convection in a gap, 1 for the load of a
-    heat pump, 2 for the losses of a heat pump. If `is_limited`, like the supply of a heat pump,
-    ``x ** exponent / (1 + x ** exponent)`` replaces ``x ** exponent``.
-    The second signal is the first signal times the deviation of `cold`.
+    With ``x = |T_hot - T_cold| / knee`` the first signal is ``x ** exponent * d ** power``, where
+    d is the deviation of `cold` from the reference state [K]. The exponent is 1.25 for convection
+    in a gap, 1 for the load of a heat pump, 2 for the losses of a heat pump. If `is_limited`, like
+    the supply of a heat pump, ``x ** exponent / (1 + x ** exponent)`` replaces ``x ** exponent``.
+    The second signal is the first signal times the deviation of `cold` [K].
     """
 
     hot: str

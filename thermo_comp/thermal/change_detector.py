@@ -4,9 +4,9 @@
 Owns the detection of departures: a temperature's rate leaves the baseline, its rate in a soak.
 
 Two Kalman filters of temperature and rate, one with a long and one with a short memory, have white
-noise as second derivative. A rate has departed if it differs from the baseline, away from 0, by
-more than the sum of swing, error of the baseline and k times the sd of the noise; k follows from
-the permitted rate of false alarms (Rice's formula [1]_, docs/regime.md). If noise cannot move
+noise as second derivative. A rate has departed if it exceeds the baseline, away from 0, by more
+than the sum of swing, error of the baseline and k times the sd of the noise. The factor k follows
+from the permitted rate of false alarms (Rice's formula [1]_, docs/regime.md). If noise cannot move
 the readings of a quantized sensor across a cell of one quantum, the filters are not used: two
 edges of cells crossed in the same direction give the mean rate.
 
@@ -25,7 +25,7 @@ from .thermometer import Thermometer
 
 # Second derivative for which a filter is tuned / second derivative at the slowest ramp's onset.
 BEND_SHARES = (1.0, 10.0)
-TUNING: Final = 1.45  # best memory / (noise sd / second derivative)^0.4, for readings at 1 Hz
+TUNING: Final = 1.45  # best memory of a filter / (noise sd / second derivative)^0.4, at 1 Hz
 # Noise variance of the rate / the filter's rate variance, if most noise is that of quantization.
 CELL_NOISE_SHARE: Final = 0.4
 SETTLING_MEMORIES: Final = 5.0  # age / memory of a filter at which the noise is stationary
@@ -53,8 +53,8 @@ class ChangeDetector:
         self._ripple_rate = min(ripple / sensor.lag_s, self._largest_swing)
         self._baseline_s = 0.5 * sensor.lag_s
         self._swing_memory_s = SWING_MEMORY_LAGS * sensor.lag_s
-        # Memory (1 / tracking frequency) of each filter [s]: the best memory, in readings at 1 Hz,
-        # to detect a second derivative of ``share * onset`` [K/s^2]. The memory determines the
+        # Memory (1 / tracking frequency) of each filter [s]: the best one to detect the second
+        # derivative ``share * onset`` [K/s^2] in readings at 1 Hz. The memory determines the
         # spectral density of the filter's process noise for any interval of readings.
         self._noise = sensor.noise_sd_c**2 + sensor.quantum_c**2 / 12.0
         onset = smallest_rate / sensor.lag_s
@@ -82,7 +82,7 @@ class ChangeDetector:
         """Begin a soak: the rate becomes the baseline, with at least the error `least_error`."""
         self._baseline = self.rate
         self._baseline_error = max(self.swing, least_error, 2.0 * sqrt(sensor.var_rate))
-        self._edge = nan  # an edge crossed in the ramp gives no rate of the soak
+        self._edge = nan  # last edge of a cell crossed in the soak: none yet
 
     def is_following(self, stamp_ns: int) -> bool:
         """Whether the filter of `rate` has used the reading with the stamp `stamp_ns`."""
@@ -143,7 +143,7 @@ class ChangeDetector:
         self._reading = sensor.reading
 
     def _tune(self, dt: float) -> None:
-        """Set the squared threshold of each filter, relative to the filter's rate variance."""
+        """Set for each filter the squared threshold of its rate / the variance of its rate."""
         self._dt = dt
         self._thresholds: list[float] = []
         for power in self._powers[::-1]:

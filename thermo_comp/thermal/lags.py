@@ -34,14 +34,14 @@ GRADIENT_START_SD: Final = 1.0
 
 
 class Quantity:
-    """A quantity of the thermal state, from readings of `input` (a gradient: and of the board)."""
+    """A quantity of the thermal state, from readings of `input` and, for a gradient, the board."""
 
     input: str
     #: Largest magnitude of the quantity that a calibration may contain.
     largest: ClassVar[float] = QUANTITIES['temperature span'].at_most or 0.0
     #: Typical change of the quantity per kelvin of temperature change.
     per_kelvin: ClassVar[float] = 1.0
-    #: Whether the quantity is computed with the lag of one part of the unit; the board's lag is 0.
+    #: Whether the quantity depends on the lag of one part of the unit (0 for the board itself).
     is_of_part: ClassVar[bool] = True
 
     @property
@@ -51,7 +51,7 @@ class Quantity:
 
     @property
     def by_board(self) -> float:
-        """Derivative w.r.t. the board temperature, with lags and other thermometers constant."""
+        """Derivative of the quantity w.r.t. T_board, with lags and other thermometers constant."""
         return float(self.input == BOARD_INPUT)
 
 
@@ -75,14 +75,14 @@ class Lag(_Lag, Quantity):
 
     @property
     def by_board(self) -> float:
-        """Derivative w.r.t. the board temperature, at constant first-order lags L."""
+        """Derivative of the quantity w.r.t. T_board, at constant first-order lags L."""
         if self.input != BOARD_INPUT:
             return 0.0
         return 1.0 if self.second_tau_s else self.shares[0]
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """The thermometer `input` and, for a part between board and sensor, `sensor`."""
+        """Thermometers of the lag: `input` and, for a part between board and sensor, `sensor`."""
         return (self.input, self.sensor) if self.sensor else (self.input,)
 
     @property
@@ -129,7 +129,7 @@ class _Play(NamedTuple):
 class Play(_Play, Quantity):
     """
     Output of a play of half-width `width_k` less its input [K]. The input is the lagged board
-    temperature, or the board temperature if `tau_s` is 0. Output less input has no variance,
+    temperature, or the board temperature if `tau_s` is 0. This difference has no variance,
     because an error of the input shifts input and output equally.
     """
 
@@ -142,7 +142,7 @@ class Play(_Play, Quantity):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """The board and, for a play of a part between board and sensor, `sensor`."""
+        """Thermometers of the play: the board and, for a part between both, `sensor`."""
         return self.lag.inputs if self.lag else (self.input,)
 
 
@@ -150,8 +150,8 @@ class Play(_Play, Quantity):
 class MemorySpec:
     """
     Contents of the thermal state of a tracker. `sensors`: names of the thermometers other than the
-    board's; the regime detector uses the first as the leading sensor.
-    `lags`: in the order of `inputs`. `rates`: sensors whose rate of change is in the state.
+    board's; the regime detector uses the first as the leading sensor. `lags`: lags of the board,
+    then lags of each sensor. `rates`: sensors whose rate of change is in the state.
     """
 
     sensors: tuple[str, ...] = ('case',)
@@ -165,7 +165,7 @@ class MemorySpec:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """The board and the sensors, in the order of their lags."""
+        """Names of the thermometers: the board, then `sensors`."""
         return (BOARD_INPUT, *self.sensors)
 
 
@@ -188,7 +188,7 @@ def start_root(lags: Sequence[tuple[Any, ...]]) -> Floats:
     The factor exists even if the covariance is singular, as with two nearly equal lags. The
     input before the first reading is modelled as a random walk with ``D = 2 sd^2 / START_TAU_S``
     [K^2/s], so that ``P_kl = D tau_k tau_l / (tau_k + tau_l)`` for two lags of one input, and 0
-    for lags of different inputs. Afterwards P_kl decays as ``exp(-dt / tau_k - dt / tau_l)``.
+    for lags of different inputs. P_kl decays with time dt as ``exp(-dt / tau_k - dt / tau_l)``.
     """
     all_lags = [Lag(*lag) for lag in lags]
     terms = first_order_lags(all_lags)

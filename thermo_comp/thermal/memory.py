@@ -19,8 +19,8 @@ import numpy as np
 from ..typing import Floats
 from .lags import BOARD_INPUT, Lag, MemorySpec, first_order_lags
 
-#: Interval between readings / time constant of a lag, above which the unknown time at which the
-#: input changed between the readings adds variance.
+#: Interval between readings / time constant of a lag above which variance is added, because the
+#: time at which the input changed between the readings is unknown.
 SPARSE_SHARE: Final = 0.1
 #: Smallest weight of an old input in `_recursion`: smaller weights are below double precision.
 _LEAST_WEIGHT: Final = 1e-18
@@ -70,8 +70,8 @@ class LagBank:
             if dt > SPARSE_SHARE * tau:
                 grown += (change * (1.0 - e)) ** 2
             if sd:
-                # The input has the same error in all steps, so the standard deviations of the
-                # steps add, not the variances.
+                # An error of the input is the same in all steps, so the standard deviations due
+                # to the steps add, not the variances.
                 grown = (math.sqrt(grown) + sd * (1.0 - e)) ** 2
             result.append(grown)
         self.extra = result
@@ -81,7 +81,7 @@ class LagBank:
         self.extra = [variance + change * change for variance in self.extra]
 
     def at(self, stamp_ns: int, value: float) -> tuple[list[float], list[float]]:
-        """Return ``u - L`` [K], u = `value`; its variance without that of the initial state."""
+        """Return each ``u - L`` [K] at u = `value`, and its variance but for the initial state."""
         seen_ns = self.stamp_ns
         if seen_ns is None or stamp_ns <= seen_ns or not self.taus:
             return self.lagging, self.extra
@@ -116,7 +116,7 @@ class ThermalMemory:
         terms = sorted(first_order_lags(spec.lags), key=lambda term: spec.inputs.index(term[0]))
 
         def weights(lag: Lag) -> list[tuple[int, float]]:
-            """Return index in `terms` and weight of the first-order lags of a lag."""
+            """Return index in `terms` and weight of each first-order lag in the sum `lag`."""
             return [(terms.index(term), w) for term, w in lag.first_order_weights.items()]
 
         #: The first-order lags of each input, by the input's name.
@@ -125,13 +125,13 @@ class ThermalMemory:
         }
         self.board = self.banks[BOARD_INPUT]
         self.is_empty = not spec.lags and not spec.plays
-        #: First-order lags of each lag; empty if all lags have order 1.
+        #: For each lag: index and weight of its first-order lags; [] if all lags have order 1.
         self._sums = [weights(lag) for lag in spec.lags]
         if self._sums == [[(k, 1.0)] for k in range(len(terms))]:
             self._sums = []
         #: For each play: index of the lag of its input, -1 for the board; half-width [K].
         self._inputs = [spec.lags.index(play.lag) if play.lag else -1 for play in spec.plays]
-        #: First-order lags of each play's lag; [] without a lag.
+        #: For each play: index and weight of the first-order lags of its input; [] if not lagged.
         self._followed = [weights(play.lag) if play.lag else [] for play in spec.plays]
         self._needs_sensors = any(play.inputs != (BOARD_INPUT,) for play in spec.plays)
         self._widths = [play.width_k for play in spec.plays]
@@ -217,7 +217,7 @@ class ThermalMemory:
     def _first_order(
         self, stamp_ns: int, board: float, gradients: Sequence[float]
     ) -> tuple[list[float], list[float]]:
-        """Return each first-order lag [K], and its variance without that of the initial state."""
+        """Return each first-order lag [K], and its variance but for the initial state."""
         values, extra = self.board.at(stamp_ns, board)
         for name, gradient in zip(self.spec.sensors, gradients, strict=True):
             if (bank := self.banks[name]).taus:

@@ -25,8 +25,8 @@ LARGEST_RATE: Final = 0.2
 #: may be wrong.
 SETTLED_READINGS: Final = 5
 
-#: A sensor's first reading is wrong if the change to the second is impossible, and the change from
-#: the second to the third, in K and in K/s, is below this share of the first change.
+#: A sensor's first reading is wrong if the second reading differs from it by an impossible step,
+#: and the change to the third reading is below this share of the step, in K and in K/s.
 CONTINUED_SHARE: Final = 0.25
 
 #: Smallest number of equal readings, and shortest time [s], after which a sensor counts as
@@ -35,10 +35,10 @@ CONTINUED_SHARE: Final = 0.25
 STILL_READINGS: Final = 20
 STILL_S: Final = 5.0
 STILL_PROBABILITY: Final = 1e-9
-#: Number of equal readings in a row from which, without cells, the temperature's variance grows.
+#: Number of equal readings in a row that are doubtful if the quantum is not far above the noise.
 DOUBTFUL_READINGS: Final = 4
 #: A sensor with constant readings counts as frozen if the other sensor's temperature changes by
-#: more than this, beyond noise and quanta [K]; larger value: for a quantum that exceeds the noise.
+#: more than this plus noise and quanta [K]; the second limit is for a quantum far above the noise.
 OTHER_MOVED: Final = 0.3
 OTHER_MOVED_BEYOND_CELL: Final = 0.7
 #: Largest assumed error of a sensor with constant readings [K].
@@ -49,12 +49,12 @@ LARGEST_ERROR: Final = 60.0
 LEAD_K: Final = 0.5
 LEAD_SHARE: Final = 0.15
 #: A sensor leads after `LEAD_READINGS` readings in a row at which the ratio of the slower to the
-#: faster rate exceeds `LEAD_RATE_SHARE`. From a ratio of `DOUBTFUL_RATE_SHARE` on, a lead of the
-#: board increases the variance of the board temperature.
+#: faster rate exceeds `LEAD_RATE_SHARE`. If the ratio exceeds `DOUBTFUL_RATE_SHARE` and the board
+#: leads, the variance of the board temperature is increased.
 LEAD_READINGS: Final = 5
 LEAD_RATE_SHARE: Final = 0.3
 DOUBTFUL_RATE_SHARE: Final = 0.03
-#: Number of changed readings in a row equal to the board's after which a sensor counts as a copy
+#: Number of changed readings in a row that equal the board's after which a sensor counts as a copy
 #: of the board's, and the largest time between two readings that are compared [ns].
 COPIED_READINGS: Final = 10
 _TOGETHER_NS: Final = 10_000_000
@@ -77,8 +77,8 @@ class Fault(Enum):
     #: A board temperature that differs from the case's by more than ramp and self-heating explain,
     #: as with a loose thermometer: its readings are used, with a larger variance.
     LOOSE = 'apart'
-    #: Readings equal to the board's, as if both inputs had one topic: they are used, but the
-    #: variance of the gradient includes the square of the gradient expected without the sensor.
+    #: Readings, used, that equal the board's, as if both inputs had one topic; the variance of the
+    #: gradient then includes the square of the gradient that is expected without the sensor.
     COPY = 'copy of the board'
 
 
@@ -116,7 +116,7 @@ class SensorCheck:
         self._first: list[tuple[int, float]] | None = []
 
     def forget_other(self) -> None:
-        """Forget the other sensor's past change; measure its change from its next reading on."""
+        """Measure the change of the other sensor anew, from the other sensor's next reading on."""
         self._other_then = nan
 
     def has_wrong_start(self, stamp_ns: int, celsius: float) -> bool:
@@ -195,7 +195,7 @@ class SensorCheck:
                 # Expect the judged sensor to follow the other sensor with a first-order lag.
                 self._expected += dt / (dt + self.lag_s) * (moved - self._expected)
         else:
-            # While this sensor is constant, the board may approach but not pass its temperature.
+            # The board may approach, but not pass, the temperature of a constant sensor.
             ahead = self.sensor.temperature - self._other_then
             self._expected = moved - min(max(moved, min(ahead, 0.0)), max(ahead, 0.0))
         self._seen_ns = now_ns
@@ -254,15 +254,14 @@ def still_readings(settings: ThermometerSettings) -> int:
 class CopyCheck:
     """
     Finds out whether a sensor repeats the readings of the board, as when one topic is given for
-    both. The gradient of such a sensor would be 0 even in a ramp.
+    both: the gradient would be 0 even in a ramp.
     """
 
     def __init__(self) -> None:
         self.is_copy = False
         self._n_equal = 0
         self._compared = nan
-        #: The last reading [degC] and its stamp [ns] that has not been compared, and whether it is
-        #: the board's.
+        #: The reading that waits for a comparison: whether of the board, stamp [ns], value [degC].
         self._waiting: tuple[bool, int, float] | None = None
 
     def update(self, is_board: bool, stamp_ns: int, celsius: float) -> None:
@@ -283,11 +282,11 @@ class LeadCheck:
     """
     Finds out whether the case or the board temperature changes first (leads) in a ramp.
 
-    The temperature changes since the last constant temperature are compared while both sensors
-    change in the same direction. Heat from outside changes the case temperature first. If the
+    While case and board temperature change in the same direction, their changes since the last
+    time of low rates are compared. Heat from outside changes the case temperature first. If the
     board leads, the topics of case and board are swapped or the heat comes from inside; either
-    way the gradient terms are wrong. `extra_variance` [K^2]: square of the temperature change of
-    board less case in a ramp in which the board may lead, else 0.
+    way the gradient terms are wrong. `extra_variance` [K^2]: if the board may lead, the square of
+    the difference between the changes of board and case temperature, else 0.
     """
 
     def __init__(self, case: Thermometer, board: Thermometer, calm_k_min: float) -> None:

@@ -5,8 +5,8 @@ Owns the causal decision between static and dynamic regime; the only clock is th
 
 The dynamic state *begins* when the rate of the leading sensor has left the baseline of the soak
 (`change_detector`), or when the rate of any sensor is clearly that of a ramp. The dynamic state is
-*held* while the rate of the case or of the board, at present or predicted half a lag ahead, may
-exceed the relaxed rate, and so throughout a ramp of constant rate. With `end_condition` = 'case'
+*held* while the rate of the case or of the board, at present or half a lag ahead, may exceed
+`relaxed_rate_k_min`, and so throughout a ramp of constant rate. With `end_condition` = 'case'
 (the paper's rule) only the rate of the case is tested; the board's is tested while the case gives
 no readings (docs/regime.md).
 
@@ -119,7 +119,7 @@ class RegimeDetector:
         return self.regime
 
     def _turn(self, stamp_ns: int, direction: int) -> None:
-        """Reverse the direction after half a dwell time: coarse quanta may flip a rate's sign."""
+        """Reverse the direction once a rate's new sign lasts: coarse quanta may flip the sign."""
         if direction == self.direction or not direction:
             self._turning_ns = None
         elif self._turning_ns is None:
@@ -153,9 +153,9 @@ class _Watch:
         self._relaxed = settings.relaxed_rate_k_min / 60.0
         self._memory_s = 0.25 * sensor.lag_s
         self._stale_ns = round(0.5e9 * sensor.lag_s)
-        # An unchanged reading proves a low rate if it lasts longer than the relaxed rate takes to
-        # cross a cell (one quantum), and longer than the temperature stays in one cell while the
-        # smallest ramp reverses.
+        # An unchanged reading proves a low rate if it lasts longer than two times: that in which
+        # the relaxed rate crosses a cell (one quantum), and that for which a temperature stays in
+        # one cell while the smallest ramp reverses.
         quantum, bend = sensor.quantum_c, settings.smallest_ramp_k_min / 60.0 / sensor.lag_s
         still_s = max(quantum / self._relaxed, 2.0 * sqrt(2.0 * quantum / bend))
         self._still_ns = round(1e9 * still_s)

@@ -225,8 +225,8 @@ class Thermometer:
         rate = self.rate
         unknown = 0.0
         if not -horizon <= ahead <= horizon:
-            # After the extrapolation horizon the temperature is held constant. Its variance grows
-            # by the square of the change that the present rate, or an unseen ramp, would cause.
+            # After the extrapolation horizon the temperature is held constant, with a variance
+            # that grows by the square of the change that its rate or an unseen ramp would cause.
             dt = horizon if ahead > 0.0 else -horizon
             beyond = ahead - dt
             unseen = min(0.5 * self._bend * abs(beyond), self._rate_sd)
@@ -270,7 +270,7 @@ class Thermometer:
         noise = self._noise
         if variance < 4.0 * noise:
             # The sd of the prediction is less than twice the noise: match the moments of the
-            # prediction truncated to the cell. Readings that flicker show where the edge is.
+            # prediction truncated to the cell. Readings that flicker show the edge of a cell.
             spread = variance + noise
             sd = sqrt(spread)
             low = (reading - half - expected) / sd
@@ -295,8 +295,8 @@ class Thermometer:
         box = half * half / 3.0
         if variance > box:
             return reading, variance * box / (variance - box)
-        # If the estimate is outside the cell, all readings during a predicted change by one sd of
-        # the estimate weigh together as one measurement of the edge of the cell.
+        # An estimate outside the cell is corrected towards the edge of the cell: all readings in
+        # the time of a predicted change by one sd have together the weight of one measurement.
         if abs(expected - reading) > half:
             edge = reading + (half if expected > reading else -half)
             return edge, variance * max(1.0, sqrt(variance) / (abs(move) + 1e-30))

@@ -90,7 +90,7 @@ class ThermalTracker:
         usual_s = max(UNWATCHED_SHARE * lag_s, config.case_timeout_s)
         #: Time without a decision after which the regime is unknown [s].
         self._unwatched_s = min(usual_s, max(lag_s, self.settings.board.lag_s))
-        # The check of the board's readings is copied: another tracker may share the original.
+        # Set the lag in a copy of the board's check: another tracker may share the original.
         self.checks = {**self.checks, BOARD_INPUT: copy(self.checks[BOARD_INPUT])}
         self.checks[BOARD_INPUT].lag_s = board_lag_s
 
@@ -152,7 +152,7 @@ class ThermalTracker:
     def _use(
         self, name: str, sensor: Thermometer, check: SensorCheck, stamp_ns: int, celsius: float
     ) -> bool:
-        """Update a thermometer, and the memory after a jump or gap; False: reading not used."""
+        """Update a thermometer and, after a jump or gap, the lags; False: reading not used."""
         if check.has_wrong_start(stamp_ns, celsius):
             self._begin_again(name, sensor)
         before_ns, before, n_restarts = sensor.stamp_ns, sensor.temperature, sensor.n_restarts
@@ -300,7 +300,7 @@ class ThermalTracker:
         is_known = name == self.spec.sensors[0] and upper < inf
         usual = 0.5 * (lower + upper) if is_known else 0.0
         gradient = self._rest_gradients.get(name, usual) + lag * rate
-        # Largest change of the case temperature since the board is no longer extrapolated [K].
+        # Largest change of the case temperature since the end of the board's extrapolation [K].
         unseen = self.settings.case.fastest_ramp_k_min / 60.0 * self.board.beyond(stamp_ns)
         variance = (
             (LOST_GRADIENT_RELATIVE_SD * gradient) ** 2
@@ -310,7 +310,7 @@ class ThermalTracker:
         return gradient, variance
 
     def is_settled(self, stamp_ns: int) -> bool:
-        """Whether the effect of temperatures before the first reading on the lags has decayed."""
+        """Whether the lags hardly depend on the temperatures before the first reading."""
         state = self.sample(stamp_ns)
         gradients = list(state[GRADIENT : GRADIENT + 2 * len(self.spec.sensors) : 2])
         lags = self.memory.at(stamp_ns, state[BOARD], gradients)[: 2 * len(self.spec.lags)]

@@ -131,7 +131,7 @@ class LackOfFit:
 class RegimeSet:
     """
     The curves of one regime. Outside `temperature_range_c` the covariance of the force grows, and
-    each curve is the other regime's curve plus a constant. Outside the ranges of both regimes each
+    each curve runs parallel to the other regime's curve. Outside the ranges of both regimes each
     curve continues along a tangent for a quarter of the range, and is constant from there on.
     """
 
@@ -218,13 +218,13 @@ class Calibration:
     ] = 900.0
     rest_gradient_range_k: Annotated[
         tuple[_Kelvin, _Kelvin] | None,
-        'Range in the bags of T_s - T_board - board_lag_s * dT_board/dt, s the first sensor; '
-        'null: unknown. A value far outside this range (loose sensor) adds to the sd of T_board.',
+        'Range in the bags of T_s - T_board - board_lag_s * dT_board/dt of the first sensor s; '
+        'null: unknown. A difference far outside (loose sensor) adds to the sd of T_board.',
     ] = None
     soak_gradient_k: Annotated[
         tuple[_Kelvin, _Kelvin] | None,
-        'T_s - T_board in a soak, due to self-heating, and its sd, s the first sensor; null: '
-        'unknown, taken as 0. Certificates and exported files use this gradient.',
+        'T_s - T_board of the first sensor s in a soak, due to self-heating, and its sd; null: '
+        'unknown, taken as 0. Certificates and exported files include this self-heating.',
     ] = None
     detector: Annotated[
         DetectorSettings, 'Settings of the thermometers and of the regime detector.'

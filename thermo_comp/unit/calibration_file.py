@@ -22,8 +22,8 @@ from .schema import SchemaError, build, fields_of, plain
 #: and a posterior of full rank, takes 3.3 MB with one thermometer beside the board, 6 MB with two.
 SIZE_LIMIT = 1 << 23
 
-#: First line of a written file. A file with this first line is complete only if its last line is
-#: `_END`; otherwise a file that is cut between two keys would be read as valid.
+#: First line of a written file. A file with this first line is refused if its last line is not
+#: `_END`, because a file that is cut between two keys could be read as valid.
 _HEADER = '# written by thermo_comp: the last line of a complete file is "..."'
 _END = '...'
 

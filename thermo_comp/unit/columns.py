@@ -75,7 +75,7 @@ class Part(NamedTuple):
 
     @property
     def of_gradient(self) -> 'Part':
-        """The part's time constants alone: a lag of a gradient has no share and no lead."""
+        """The lag of a gradient: the time constants alone, without `sensor_share` and `lead_s`."""
         return Part(self.tau_s, self.second_tau_s)
 
 
@@ -151,7 +151,7 @@ class Column:
 
     @property
     def part(self) -> Part:
-        """The lag of the part that the value is computed from."""
+        """The lag of the part of the unit whose temperature determines the value."""
         return Part(self.tau_s, self.second_tau_s, self.sensor_share, self.lead_s)
 
     @property
@@ -220,7 +220,7 @@ def _family(
     lags: Sequence[Part] = (Part(0.0),),
     widths: Sequence[float] = (0.0,),
 ) -> list[Column]:
-    """Return the columns of a group: one for each combination of the listed values."""
+    """Return the columns of a group, one per combination of sensor, kind, power, lag, width."""
     ranges = {kind: TERMS[kind].bounds or UNBOUNDED for kind in kinds}
     return [
         Column(group, kind, sensor, *part, width, power=power, range=ranges[kind])
@@ -251,7 +251,7 @@ _DURING: Final = ('always', 'static', 'dynamic')
 
 
 class ColumnTable:
-    """Evaluates columns at thermal states (width, n), each state by itself: (n_columns, n)."""
+    """Evaluates columns, (n_columns, n), at each of n thermal states, (width, n), by itself."""
 
     def __init__(
         self,
@@ -325,8 +325,8 @@ class ColumnTable:
 
     def slopes(self, states: Floats) -> tuple[Floats, Floats | None]:
         """
-        Return two derivatives of u, not limited to its range: w.r.t. the quantity that u is
-        computed from, and w.r.t. T_board at constant lag (None without functions of t - lag).
+        Differentiate u, not limited to its range, by the quantity that u is computed from and, at
+        constant lag, by T_board (None if no column is a function of t - lag).
         """
         slopes, scaled = np.ones((len(self._places), states.shape[1])), self._scaled(states)
         for rows, term in self._terms:

@@ -190,10 +190,10 @@ class Correction:
         Evaluate the correction in segments of 1 s, linear in time between the states at the ends.
 
         `slow` is the slowly varying error covariance, shape (n_slow, n), see
-        `SlowUncertainty.at`. Returns (52,) or (52, n): by axis bias and its change over the
-        segment (1 s), scale and its change, then the coefficients of the covariance, including the
-        noise of a sample, see `covariance.covariance_at`. A nonlinearity adds 15 rows to `slow`,
-        and to the result K2, Kq, K3 by axis, then coefficients of x^3 to x^6 of each variance.
+        `SlowUncertainty.at`. Returns (52,) or (52, n): by axis bias, change of the bias over the
+        segment, scale and its change; then the coefficients for `covariance.covariance_at`, noise
+        of a sample included. With a nonlinearity `slow` has 15 more rows, and the result ends with
+        K2, Kq, K3 by axis and the coefficients of x^3 to x^6 in the variance of each axis.
         """
         ends = np.array((start, end), dtype=np.float64)
         n = ends[0, 0].size
@@ -254,14 +254,14 @@ class Correction:
         static_weight, beyond_range = 1.0 - weight, raw - held
         excess, _, relative, by_rate = self.curves.excess(states)
         if not self._has_lags:
-            # With lags in columns their excess (`columns_out`) counts instead of the rate's.
+            # If columns have lags, the excess of the columns (`columns_out`) replaces the rate's.
             relative = relative + by_rate
         outside = static_weight * relative[0] + weight * relative[1]
         shares = np.array([static_weight + unknown * weight, weight + unknown * static_weight])
         variances = (shares * states[VAR_BOARD], states[self.layout.variances])
         by_source, direct = self.table.slopes(states)
         by_pair = self.by_pairs(by_source * factors[0])
-        # Derivative w.r.t. the board temperature, on which t^power, gradients and lags depend.
+        # Derivative of the columns by T_board, on which t^power, gradients and lags depend.
         on_board = raw * factors[1]
         if direct is not None:
             on_board = on_board + direct * factors[0]
@@ -278,9 +278,9 @@ class Correction:
         if is_beyond or outside.any() or parts_out.any():
             columns_out = np.where(self._is_present, self.table.excess(raw), 0.0)
             columns_out = columns_out.max(axis=1, initial=0.0)
-            # Outside the calibrated range the curves are extrapolated. Add two errors: the slope
-            # at the edge of the range times the board's distance from the edge; the sd of the
-            # slopes within the range times the largest distance of the board or of a part.
+            # Outside the calibrated range the curves are extrapolated. One error of the
+            # curves is their slope at the edge of the range times the board's distance from the
+            # edge; another is the sd of the slopes times the largest distance of board or part.
             v += self._spread(shares * excess * excess, slopes)
             bent = shares * np.maximum(excess * excess, parts_out * parts_out)
             bends = np.broadcast_to(self._bends, (4, *slopes.shape[1:]))

@@ -68,7 +68,7 @@ class CovarianceMap:
         factors = sums[:, u, w]
         # The row b of an axis is twice the covariance of its constant error and its scale error.
         factors[:, 1:9:3] /= 2.0
-        # Each coefficient is a weighted sum of few rows: keep the indices and weights of those.
+        # Each coefficient is a weighted sum of few rows: keep indices and weights of these rows.
         n = int((factors != 0.0).sum(axis=1).max())
         self._places = np.argsort(factors == 0.0, axis=1, kind='stable')[:, :n]
         self._factors = np.take_along_axis(factors, self._places, axis=1)[:, :, np.newaxis]
@@ -88,7 +88,7 @@ def grown(between: Floats, growth: Floats) -> Floats:
 def rows_between(errors: Floats, misalignment_variances: Floats) -> Floats:
     """
     Return the rows `BETWEEN`, (36, n), of the covariance of u. `errors`, (9, p, n): u due to each
-    of p independent causes; `misalignment_variances`, (3,): added to those of the misalignment.
+    of p independent causes; `misalignment_variances`, (3,): variances due to further causes.
     """
     # Products and sums are explicit, because results of BLAS depend on the arrays' alignment.
     result = in_order(errors[_FIRST] * errors[_SECOND], 1)
@@ -97,7 +97,7 @@ def rows_between(errors: Floats, misalignment_variances: Floats) -> Floats:
 
 
 def misalignment_variances(between: Floats) -> Floats:
-    """Return the variances of the elements of the misalignment, (3, n), in rows `BETWEEN`."""
+    """Return the variances of the three elements of the misalignment, (3, n), from `between`."""
     return between[_OF_M]
 
 

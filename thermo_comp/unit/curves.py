@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the curves of static and dynamic set over board temperature, within and beyond their ranges.
+Owns bias and scale of both regimes over the board temperature, within and beyond their ranges.
 
 n thermal states are the columns of an array; results have the rows bias x, y, z, scale x, y, z.
 """
@@ -16,12 +16,11 @@ from .functions import TANGENT_SPANS, basis_slopes, hold
 
 class Curves:
     """
-    Bias and scale of both sets as functions of the board temperature; the static set is row 0 of a
-    result.
+    Bias and scale of the static set (row 0) and the dynamic set over the board temperature.
 
     Where only one set is within its range, the difference of the two sets is constant. Beyond both
-    ranges the set whose range extends farther continues along its tangents for `TANGENT_SPANS`
-    times the width of its range, and is constant from there on; the other set changes equally.
+    ranges the curves of the set whose range extends farther follow tangents for `TANGENT_SPANS`
+    times the width of the range, then are constant; the other set's curves run parallel to them.
     """
 
     def __init__(self, calibration: Calibration) -> None:
@@ -50,7 +49,7 @@ class Curves:
         self._lacks = [np.array(points).reshape(-1, 4).T for points in lacks]
 
     def excess(self, states: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Return by set T_board [K] and rate [K/s] beyond the range, then both in half ranges."""
+        """Return how far T_board [K] and rate [K/s] are out of range, and both in half ranges."""
         t, rate = states[BOARD] - self._reference, states[RATE]
         over, too_fast = t - hold(t, *self._t_range), rate - hold(rate, *self._rate_range)
         span, rate_span = (edges[1] - edges[0] for edges in (self._t_range, self._rate_range))
@@ -100,7 +99,7 @@ class Curves:
         return result
 
     def slopes(self, board: Floats) -> Floats:
-        """Differentiate bias and scale of both sets w.r.t. T_board [per K], (2, 6, n)."""
+        """Differentiate bias and scale of both sets by T_board [per K], shape (2, 6, n)."""
         held = hold(board - self._reference, *self._t_range)
         return self._evaluate(held, 'slope')
 
@@ -122,7 +121,7 @@ class Curves:
         return result
 
     def _followed(self, regime: int, place: int, t: Floats, shares: Floats) -> Floats:
-        """Differentiate values beyond the ranges w.r.t. free coefficients, (n_free, n)."""
+        """Differentiate bias or scale beyond the ranges by free coefficients, (n_free, n)."""
         # Beyond its range a curve is a constant plus either a tangent or the other set's curve.
         function = self._rows[regime][place]
         own_range, other_range = self._t_range[:, regime], self._t_range[:, 1 - regime]

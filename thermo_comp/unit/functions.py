@@ -28,9 +28,8 @@ from .schema import broken
 #: One temperature difference [K], or an array of temperature differences.
 Kelvins: TypeAlias = float | Floats
 
-#: Length of the tangent that continues a curve beyond its range / width of the range. At the outer
-#: end of this tangent a parabola deviates from the tangent by 1/16 of its deviation at the other
-#: end of the range.
+#: Length of the tangent that continues a curve beyond its range / width of the range. A parabola
+#: is 16 times closer to this tangent at the tangent's outer end than at the range's other end.
 TANGENT_SPANS = 0.25
 #: Largest accepted error of a function's value at the reference temperature.
 NORMALISATION_TOLERANCE = 1e-9
@@ -145,7 +144,7 @@ class CubicSpline(_Family):
         return tuple(v - self.values[at] for v in self.values[:at] + self.values[at + 1 :])
 
     def with_free(self, values: tuple[float, ...], at_reference: float) -> CubicSpline:
-        """Return a spline on `knots_k` through `at_reference` plus `values` (0 at t = 0)."""
+        """Return a spline: `at_reference` at t = 0, plus `values` at the other knots."""
         at = self.knots_k.index(0.0)
         moved = (*values[:at], 0.0, *values[at:])
         return replace(self, values=tuple(at_reference + v for v in moved))
@@ -225,7 +224,7 @@ TemperatureFunction = Polynomial | CubicSpline | Exponential
 
 
 def check_reference(name: str, function: TemperatureFunction, expected: float) -> None:
-    """Raise ValueError, with the key's name, if a function is not `expected` at t = 0."""
+    """Raise ValueError, with the key's name, if a function differs from `expected` at t = 0."""
     with np.errstate(all='ignore'):
         value = function.value(0.0)
     if not abs(value - expected) <= NORMALISATION_TOLERANCE:

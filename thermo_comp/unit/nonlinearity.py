@@ -98,7 +98,7 @@ class Nonlinearity:
             raise ValueError(f'`terms` must be of {list(POWERS)}, at most one each, in this order')
 
     def check_slope(self, force: float, temperatures: Sequence[float]) -> None:
-        """Raise ValueError if the slope is too large up to |f| = `force` [m/s^2], at any t [K]."""
+        """Raise ValueError if the nonlinear terms are too steep up to |f| = `force` [m/s^2]."""
         for t in temperatures:
             k2, kq, k3 = np.abs(self.coefficients(np.array([t])))[..., 0]
             slope = float(np.max(2.0 * (k2 + kq) * force + 3.0 * k3 * force * force))
@@ -183,7 +183,7 @@ class BeyondForce(NamedTuple):
         self, x: Real, y: Real, z: Real,
         xx: Real, xy: Real, xz: Real, yy: Real, yz: Real, zz: Real,
     ) -> tuple[Real, Real, Real, Real, Real, Real, Real, Real, Real]:  # fmt: skip
-        """Add the unknown term's variance to the covariance xx, xy, xz, yy, yz, zz of a sample."""
+        """Add the variance of an unknown K2 term to the covariance xx, xy, ..., zz of a sample."""
         xx, yy, zz = xx + self._variance(x), yy + self._variance(y), zz + self._variance(z)
         return x, y, z, xx, xy, xz, yy, yz, zz
 
@@ -242,7 +242,7 @@ class ForceCorrection:
     ) -> Floats:
         """
         Return the contribution of the nonlinear terms to the coefficients of x^2 to x^6 in the
-        error variance of an axis, (5, n), at temperatures less the reference, (n,).
+        error variance of an axis, (5, n); `t`: T_board - T_ref, (n,) [K].
 
         `rows`, (2 k, rank), and `rest`: factor of the covariance of the coefficients of k terms,
         and variances added to its diagonal; `on_bias`, `on_scale`, (rank, n): bias and relative

@@ -83,8 +83,8 @@ class Posterior:
 class Block(NamedTuple):
     """
     Indices of the parameters of an axis' bias or scale in the posterior. `static`, `dynamic`:
-    index of the set's level; the coefficients of the set's function follow. `response`: index of
-    the first weight of the columns; `end`: index after the last weight of the columns.
+    index of the regime's value at T_ref, before the other coefficients of the regime. `response`:
+    index of the first weight of the columns; `end`: index after the last weight of the columns.
     """
 
     static: int
@@ -101,7 +101,7 @@ class Block(NamedTuple):
 def lay_out(
     pairs: Iterable[tuple[TemperatureFunction, TemperatureFunction]], n_columns: int
 ) -> list[Block]:
-    """List the blocks of parameters for pairs of a static and a dynamic function."""
+    """Return a block of parameters for each pair of a static and a dynamic function."""
     blocks = [Block(0, 0, 0, 0)]
     for static, dynamic in pairs:
         begin = blocks[-1].end
@@ -113,9 +113,9 @@ def lay_out(
 
 class ParameterLayout(NamedTuple):
     """
-    The order of a calibration's parameters in its posterior. For each axis: bias [input units],
-    then scale [relative]. From `nonlinear` on, for each axis: the nonlinear coefficients, then
-    their changes per kelvin. From `misalignment` on: M[1][0], M[2][0], M[2][1].
+    The order of a calibration's parameters in its posterior: for each axis bias [input units],
+    then scale [relative]; from the index `nonlinear` on, for each axis nonlinear coefficients,
+    then their changes per kelvin; from `misalignment` on M[1][0], M[2][0], M[2][1].
     """
 
     bias: list[Block]

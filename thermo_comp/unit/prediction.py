@@ -65,8 +65,8 @@ class SlowUncertainty:
         (width, n). `start_shares`, (n_lags, n): share of each lag's initial state that remains;
         `start_rates`, (n,): largest board rate since the start, if above the present rate [K/s].
         Returns `Correction.n_slow` rows: a, b, c of each axis' error variance ``v(x) = a + b x + c
-        x^2`` [m^2/s^4], then the rows between axes and misalignment, then the contribution of a
-        nonlinearity to the coefficients of x^2 to x^6 of each axis' variance.
+        x^2`` [m^2/s^4], then the covariances `BETWEEN` errors of different axes and of the
+        misalignment, then what a nonlinearity adds to the coefficients of x^2 to x^6 of v(x).
         """
         cuts = range(_CHUNK, states.shape[1], _CHUNK)
         rates = np.abs(states[RATE])

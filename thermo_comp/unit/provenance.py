@@ -26,8 +26,8 @@ class GroupEvidence:
     log_evidence_change: Annotated[
         float,
         QUANTITIES['log evidence'],
-        'Loss of log evidence without the group; in a fit with a prior: with the weights of the '
-        'group at the mean of the prior.',
+        'Loss of log evidence if the group is left out or, in a fit with a prior, if the weights '
+        'of the group keep the mean of the prior.',
     ]
     prior_sd: Annotated[tuple[_WeightSd, ...], "Prior sd of the group's weights."]
 
@@ -44,7 +44,7 @@ class Source:
 @dataclass(frozen=True)
 class ResidualSummary:
     """
-    ``|f| - g`` of the fitted data in one regime or both; raw: corrected with the constants alone.
+    ``|f| - g`` of fitted data in one regime or both; raw: with bias and scale at T_ref only.
     """
 
     section: str

@@ -4,11 +4,11 @@
 Owns the table of the kinds of regressors of the thermal response.
 
 The value of a column is ``u = form.value(x)``, ``x = (n - centre) / width``; n is a quantity of
-the thermal state (`source`) or, if `is_temperature`, ``t - source``, the temperature less T_ref of
-a part that lags the board. Notation: ``t = T_board - T_ref``, ``g_s = T_s - T_board`` of a sensor
-s, and ``q_s = g_s - rest``. The constant `rest` is 0, or the gradient in a soak if self-heating
-warms the board above the case. Even functions of q_s have the same value for heating and for
-cooling at the same rate.
+the thermal state (`source`) or, if `is_temperature`, ``t - source``: the temperature of a part
+that lags the board by `source`, less T_ref. Notation: ``t = T_board - T_ref``, ``g_s = T_s -
+T_board`` of a sensor s, and ``q_s = g_s - rest``. The constant `rest` is 0, or the gradient in a
+soak if self-heating warms the board above the case. Even functions of q_s have the same value for
+heating and for cooling at the same rate.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class Term:
         return (column.source.largest + abs(self.centre(column))) ** self.order
 
     def steepest(self, column: Column, raw: Floats, flow_k: float) -> float:
-        """Return the largest slope [1/K] of values u; `flow_k` is the RMS of the gradient [K]."""
+        """Return the largest change of u per kelvin [1/K]; `flow_k` is the RMS of the gradient."""
         if self.bounds is not None:
             return 1.0 / flow_k
         largest = float(np.abs(raw).max(initial=0.0)) ** (1.0 / self.order)
