@@ -105,7 +105,7 @@ class RestFinder:
             if self._n_windows % spacing == 0:
                 rests.append(self._window())
             self._n_windows += 1
-            # The first cell of the next window is compared with the last cell of this window.
+            # The next window's first cell is compared with the finished window's last cell.
             self._run, self._last = [], [cell]
         if not is_followed:
             self._forget()

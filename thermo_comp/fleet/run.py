@@ -33,7 +33,7 @@ _FORMAT = 3  # version of the format of `RESULT`
 _LONGEST_NAME = 100  # longest name of a folder of results [characters]
 # Largest number of units listed on the page of the fleet; fleet.csv lists all units.
 _MOST_ROWS = 60
-# Verdicts on tests whose bags contradict their fit: a fit with a prior would hide the fault.
+# Verdicts on tests whose bags contradict the fit; a new fit with a prior would hide the fault.
 _CONTRADICTIONS = tuple(
     kind.value for kind in (Verdict.RECALIBRATE, Verdict.NO_BETTER, Verdict.SWAPPED)
 )

@@ -246,7 +246,7 @@ def with_stamps(block: Block, last_ns: int) -> tuple[Block, int]:
     """
     Give each reading without a stamp the newest stamp of the samples before it, because its log
     time depends on the speed of a playback; drop such readings before the first sample. `last_ns`:
-    newest stamp before the block. Return the block and the newest stamp up to the block's end.
+    newest stamp before the block. Return the block and the newest stamp at the block's end.
     """
     samples = np.concatenate(([last_ns], block.accel_stamp_ns))
     jumps = np.flatnonzero(np.diff(samples) < -_JUMP_NS) + 1

@@ -254,7 +254,7 @@ def _candidates(
         if len(only) == 1:
             yield key, only[0]
         if of_type and key == 'imu':
-            return  # with several Imu topics, do not choose counts instead
+            return  # the choice between several Imu topics is left to the user: do not try counts
 
 
 def of_kind(present: Present, kind: str) -> list[str]:

@@ -33,7 +33,7 @@ _HEADER = struct.Struct('<4siI4x')
 _PASSED = 8 * 25
 _NO_GYRO = struct.Struct('<25d').pack(*[0.0] * 3, 1.0, -1.0, *[0.0] * 11, -1.0, *[0.0] * 8)
 #: Offset of the angular rate in the `_PASSED` bytes; formats of the rate with the first element of
-#: its covariance, and with all elements.
+#: its covariance, and with all nine elements.
 _RATE_AT = 8 * 13
 _RATE_IN, _RATE_OUT = struct.Struct('<4d'), struct.Struct('<12d')
 _CELSIUS = struct.Struct('<d')
