@@ -88,7 +88,7 @@ def run(arguments: list[str]) -> int:
     except _UsageMistake as mistake:
         context = getattr(mistake, 'ctx', None)
         command = 'thermo_comp' if context is None else context.command_path
-        if message := mistake.format_message():  # if it is empty, typer has printed the help
+        if message := mistake.format_message():  # '' if typer has printed the help instead
             output.error(f'{_plain(message, arguments)} (see: {command} --help)')
         return int(mistake.exit_code)
     except typer.Abort:

@@ -278,7 +278,7 @@ def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
 
 def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
     """
-    Return the number of the group of each window; the at most 60 consecutive windows of a group
+    Return the number of the group of each window; up to 60 consecutive windows form a group, and
     are averaged to one rest.
 
     The windows of a group belong to one start of the node, and differ from the first window of the
@@ -331,7 +331,7 @@ def _uncertainty(
 
 
 def _variance_along(correction: Correction, slow: SlowUncertainty, at: _Geometry) -> Floats:
-    """Return the variance of |f| that the correction claims, less that of noise, (n,)."""
+    """Return the variance of |f| due to `slow`, without the noise of a sample, (n,)."""
     columns, x = at.states.T, at.x.T
     line = list(correction.line(columns, columns, slow.at(columns, at.shares.T), 0.0))
     if correction.of_force is None:

@@ -203,8 +203,8 @@ def _forecasts(
     walk = of_levels * np.repeat([ageing.bias, ageing.scale], 3)
     bias, scale = (float((part**2).sum()) for part in np.split(walk, 2, axis=1))
     # The offsets of the starts add to the error, so their variance is subtracted from the square
-    # of the limit. The ageing model may overestimate this variance after an earlier disturbance,
-    # so the variance of the recent rests is used if it is smaller.
+    # of the limit. After a disturbance the ageing model may overestimate the offsets' variance:
+    # use the variance of |f| - g at the recent rests instead, if this variance is smaller.
     scatter = ageing.turn_on**2 * float((of_levels[:, :3] ** 2).sum()) + ageing.rest**2
     left = recent.residual - recent.by_parameter @ solution.shift
     scatter = min(scatter, float(share @ left**2))

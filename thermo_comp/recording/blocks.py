@@ -295,7 +295,7 @@ def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
     """
     Turn a jump of the stamps by over an hour, forwards or backwards, into a gap of an hour.
     A clock that is set during a recording can leave a gap of years, too long for a time grid. A
-    gap of an hour suffices: it makes the thermal state unknown. RecordingError for more than
+    gap of an hour suffices to make the thermal state unknown. RecordingError for more than
     `_MOST_JUMPS` jumps, or if the recording is too sparse (`_SPARSE_NS`, `_SPARSEST_NS`).
     """
     last_ns: int | None = None

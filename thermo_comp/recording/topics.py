@@ -176,7 +176,7 @@ def shown(name: str) -> str:
 
 
 def choice_note(name: str, key: str, wanted: str, among: str) -> str:
-    """Return the note that a topic was chosen by its type; '' if it has the wanted name."""
+    """Return the note that a topic was chosen by its type; '' if its name is the wanted one."""
     if is_called(name, split_field(wanted)[0]):
         return ''
     return f'{shown(name)}, its {among} {_TYPES[key].rpartition("/")[2]}, is taken for {key}'

@@ -66,7 +66,7 @@ class RestLog:
         self._thread.start()
 
     def put(self, stamp_ns: int, start: bytes, rest: bytes) -> None:
-        """Queue the line of a rest; `start` precedes it in a new file or after a changed start."""
+        """Queue the line of a rest, after that of its `start` if the file or the start is new."""
         day = np.datetime64(stamp_ns, 'ns').astype('datetime64[D]')
         try:
             self._lines.put_nowait((str(day), start, rest))
