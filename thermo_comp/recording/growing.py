@@ -48,7 +48,7 @@ def growing_blocks(
         try:
             reader = open_recording(path, topics, require=())
         except RecordingError:
-            # A recorder creates a file before it writes records: wait if the file is empty or grows.
+            # A recorder creates a file before writing records: wait if the file is empty or grows.
             files = path.iterdir() if path.is_dir() else [path]
             before, size = size, sum(file.stat().st_size for file in files)
             if n_seen or 0 < size == before:
