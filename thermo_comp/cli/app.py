@@ -129,7 +129,7 @@ def _plain(message: str, arguments: list[str]) -> str:
 
 
 def split_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:
-    """Return the command's arguments, and those for ROS (from ``--ros-args`` up to ``--``)."""
+    """Return the command's arguments, and ROS arguments (from ``--ros-args`` up to ``--``)."""
     for_command: list[str] = []
     for_ros: list[str] = []
     target = for_command

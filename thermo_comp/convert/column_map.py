@@ -4,10 +4,10 @@
 Owns column maps of tables: the content and unit of each column, and the message that it becomes.
 
 A map is a small YAML file; config/columns/ has examples. Without a map the columns are recognised
-by their headings (see `headings`). The map of a table without headings, ``[t] ax ay az [wx wy
-wz]`` as for imu_tk, is guessed: the times must rise in most rows, and the unit of acceleration
-is that in which the norm of samples at rest is gravity. An angular rate is taken to be in deg/s if
-its numbers, as rad/s, would be faster than a turn by hand.
+by their headings (see `headings`). A table without headings must have the columns ``[t] ax ay az
+[wx wy wz]``, as for imu_tk. Times of unstated unit must rise in most rows. An unstated unit of
+acceleration is the unit in which the norm of samples at rest is gravity; an unstated unit of
+angular rate is deg/s if the numbers, as rad/s, would be faster than a turn by hand.
 """
 
 from collections.abc import Sequence
@@ -36,8 +36,8 @@ _STEPS_S = (5e-5, 0.5)
 #: still blocks (`_BLOCK` samples, sd below `_QUIET` [g]): with times in ms, too fast for a hand.
 _SLOW_S, _BLOCK, _TURN, _QUIET = 2.0, 12, 0.5, 0.02
 _FASTEST_RAD_S = 20.0  # largest angular rate of a unit that is turned by hand [rad/s]
-#: Stamps of the years 2000 to 2038, and their largest interval [s]. A count of us since power-up,
-#: read as seconds, may be a date of these years, but it rises by over 60 s from row to row.
+#: Stamps of the years 2000 to 2038, and their largest interval [s]. A time since power-up in us,
+#: read as seconds, may be a date of these years, but rises by over 60 s from row to row.
 _SINCE_1970_S, _SINCE_1970_STEP_S = (946_684_800.0, 2_147_483_648.0), 60.0
 #: Largest ratio of the range of temperatures in a log to the duration of the log [K/s]; a hair
 #: dryer warms a board by some 0.1 K/s.

@@ -36,7 +36,7 @@ from .series import RestSeries
 _WALK_SHARE, _SCATTER_SHARE, _LOG_SD = 0.5, 0.3, 1.6
 #: Smallest prior median of the turn-on offset's sd [m/s^2].
 _LEAST_TURN_ON = 5.0 * MICRO_G
-#: Prior standard deviations tried for a jump of the levels, or of gravity [m/s^2].
+#: Prior sds tried for a jump of biases and scales (times g), or of gravity [m/s^2].
 _JUMPS = (50.0 * MICRO_G, 500.0 * MICRO_G, 5000.0 * MICRO_G)
 #: Prior sd of a jump in the three biases, and in the three scales times g, relative to `_JUMPS`: a
 #: shock changes a scale times g less than a bias.
@@ -104,7 +104,7 @@ class Change:
 class Rows:
     """
     Equations of the rests in the order of the node's starts, at most `_ROWS` per start: orthogonal
-    combinations of the rests of a start, with all information of the rests about the six levels.
+    combinations of the rests of a start, with all information of the rests about bias and scale.
 
     y, `by_...`, lack: combinations of ``|f| - g`` [m/s^2] and of the fields of `RestSeries`
     noise, scatter: variance of the noise of a row, and factor of the scatter variance in a row
