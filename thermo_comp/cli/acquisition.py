@@ -61,8 +61,8 @@ class Account:
     State of a test, and the missing data.
     The last of `positions` is unfinished. `worst_sd_g` is the sd of the corrected force in the
     attitude with the largest sd, `constants_sd` the sds of bias [g], scale and misalignment [rad].
-    `next_up` is the direction recommended for the next position, at an angle of `next_deg` to
-    `now`, the direction of the newest sample (NaN without samples); `farthest_up` is the direction
+    `now` is the direction of the newest sample, NaN without samples. `next_up` is the direction
+    recommended for the next position, `next_deg` away from `now`. `farthest_up` is the direction
     farthest (by `farthest_deg`) from all positions. `findings` are texts about missing data.
     """
 

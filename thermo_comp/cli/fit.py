@@ -245,7 +245,7 @@ def _behind_s(parts: Sequence['Part']) -> list[float]:
 
 
 def _text_of(parts: Sequence['Part']) -> str:
-    """Describe the part on whose temperature an axis depends: its lag, and what it lags."""
+    """Describe, for each axis, the lag of the part that determines bias and scale."""
     lags = ', '.join(f'{behind_s:.0f}' for behind_s in _behind_s(parts))
     text = f'lags the board by {lags} s (x, y, z)'
     if any(part.sensor_share for part in parts):
@@ -332,9 +332,9 @@ def _print_rates(out: Output, result: 'FitResult', gyroscope: 'Gyroscope') -> No
 def _print_models(out: Output, trials: Sequence['Trial']) -> None:
     """Print a table of the error of each model on data left out of the fit, and its legend."""
     columns = {
-        'positions': 'drift of an axis in a position left out',
-        'sections': 'drift of an axis in a section of the program left out',
-        'norm': '|f| - g in a position left out',
+        'positions': 'drift of an axis in a left-out position',
+        'sections': 'drift of an axis in a left-out section of the temperature program',
+        'norm': '|f| - g in a left-out position',
     }
     left = [[micro_g(folds.rms) for folds in trial.score.kinds] for trial in trials]
     kept = [k for k in range(len(columns)) if any(row[k] for row in left)]
@@ -384,7 +384,7 @@ def _of_axes(values: Iterable[float], shown: Callable[[float], str | None]) -> s
 def _steps(
     rows: Iterable[Any], steps: Iterable[str], shown: Callable[[float], str | None], axes: int = 1
 ) -> list[tuple[Cell, ...]]:
-    """Return a table row per section: its number of windows, and an RMS residual for each step."""
+    """Return a table row per section: its number of windows, and the RMS of each of `steps`."""
     return [
         (row.section, row.fitted.n // axes, *(shown(getattr(row, x).rms) for x in steps))
         for row in rows

@@ -122,7 +122,7 @@ def _read_earlier(
 def _accounts(
     out: Output, news: Iterable['News | None'], test: 'Acquisition', bags: 'PositionBags'
 ) -> Iterator['Account']:
-    """Write blocks until test or bag ends; yield the test's state at each None in `news`."""
+    """Write blocks until test or bag ends; each None in `news` yields the state of the test."""
     chosen: str | None = None
     for new in news:
         if new is not None:
@@ -199,7 +199,7 @@ def _duration(text: str) -> float:
 def _print_account(
     out: Output, account: 'Account', problems: Sequence[str], last: dict[str, str]
 ) -> None:
-    """Print the texts on the test that differ from those printed last (`last`, by name)."""
+    """Print the texts on the test that have changed; `last`: texts printed last, by name."""
     news = {'problem': ', '.join(problems)} if problems else {}
     if not problems:
         last.pop('problem', None)

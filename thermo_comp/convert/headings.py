@@ -45,8 +45,8 @@ _OUTSIDE = re.compile('case|air|amb|baro|bmp|aht|room|hous|env')
 # Unit of a temperature at the end of a heading; words in headings that are not of a temperature.
 _DEGREES_END = re.compile('(^|_)(deg_?[cfk]|kelvin|fahrenheit)$')
 _NO_READING = re.compile('(^|_)(raw|adc|counts?|lsb|id|rev|status|valid|voltage|volts?|mv)(_|$)')
-# A heading that ends in a letter for the unit, or only names a place, is taken for the heading of
-# a thermometer only if the values in the column can be temperatures.
+# A heading like `magnet_c` (ends in the unit's letter) or `board` (a place alone) is that of a
+# thermometer only if the values in its column can be temperatures.
 _LETTER = re.compile('_[ck]$|^(board|case|imu|die|chip)_f$')
 _PLACE = re.compile('board|case|imu|die|chip')
 # Units as written in the brackets of a heading or, with underscores, at the end of a heading.

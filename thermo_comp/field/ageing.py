@@ -36,13 +36,13 @@ from .series import RestSeries
 _WALK_SHARE, _SCATTER_SHARE, _LOG_SD = 0.5, 0.3, 1.6
 #: Smallest prior median of the turn-on offset's sd [m/s^2].
 _LEAST_TURN_ON = 5.0 * MICRO_G
-#: Prior standard deviations tried for a jump of the levels, or of gravity [m/s^2].
+#: Prior sds tried for a jump of biases and scales (times g), or of gravity [m/s^2].
 _JUMPS = (50.0 * MICRO_G, 500.0 * MICRO_G, 5000.0 * MICRO_G)
 #: Prior sd of a jump in the three biases, and in the three scales times g, relative to `_JUMPS`: a
 #: shock changes a scale times g less than a bias.
 _JUMP_SHARES = np.repeat([1.0, 0.1], 3)
 #: Smallest log Bayes factor at which a change is added to the model (odds 150:1), and smallest log
-#: Bayes factor of a jump of gravity against a jump of the levels (odds 20:1).
+#: Bayes factor of a jump of gravity against any other change (odds 20:1).
 _LEAST_GAIN, _LEAST_LEAD = 5.0, 3.0
 #: Prior standard deviations tried for a change of a curve's slope [m/s^2 per K].
 _BENDS = (1.0 * MICRO_G, 10.0 * MICRO_G)
@@ -93,7 +93,7 @@ class Change:
     may_be_gravity: bool = False
 
     def columns(self, rows: Rows) -> Floats:
-        """Return derivatives of rows by levels (n, 6), gravity (n, 1) or bias slopes (n, 3)."""
+        """Return derivatives of `rows.y`: by levels (n, 6), gravity (n, 1) or slopes (n, 3)."""
         if self.time is None:
             return rows.by_slope
         of_jump = rows.by_jump[:, 6:] if self.kind == 'gravity' else rows.by_jump[:, :6]
@@ -104,7 +104,7 @@ class Change:
 class Rows:
     """
     Equations of the rests in the order of the node's starts, at most `_ROWS` per start: orthogonal
-    combinations of the rests of a start, with all information of the rests about the six levels.
+    combinations of the rests of a start, with all information of the rests about bias and scale.
 
     y, `by_...`, lack: combinations of ``|f| - g`` [m/s^2] and of the fields of `RestSeries`
     noise, scatter: variance of the noise of a row, and factor of the scatter variance in a row
@@ -150,7 +150,7 @@ def rows_of(series: RestSeries, scatter: float) -> Rows:
         Q = np.eye(len(at))
         if len(at) > _ROWS:
             Q = np.linalg.svd(series.by_level[at] * weight[:, np.newaxis], full_matrices=False)[0]
-        # The columns of Q are orthonormal: a row made of n equal rests is sqrt(n) times one rest.
+        # The columns of Q are orthonormal: n equal rests become sqrt(n) times the equation of one.
         Q = Q * weight[:, np.newaxis]
         n, warmth = Q.shape[1], series.temperature[at].mean() - series.reference_temperature
         # A change of gravity changes |f| by the same value in all attitudes.
@@ -168,7 +168,7 @@ def rows_of(series: RestSeries, scatter: float) -> Rows:
 
 
 class Model:
-    """Covariance of rows as a function of `Ageing`; random walks begin at the day `since`."""
+    """Covariance of `rows.y` as a function of `Ageing`; random walks begin at day `since`."""
 
     def __init__(
         self, rows: Rows, calibration: Calibration, since: float, changes: Sequence[Change] = ()
@@ -207,7 +207,7 @@ class Model:
         return result
 
     def fitted(self, centre: Ageing) -> tuple[Ageing, Floats]:
-        """Return the sds that maximise the posterior, and the inverse covariance of rows."""
+        """Return the sds of largest posterior density, and the inverse covariance of `rows.y`."""
         middle = np.log(list(vars(centre).values()))
 
         def loss(logs: Floats) -> tuple[float, Floats]:
@@ -266,8 +266,8 @@ def learn(
     """
     Estimate the ageing model by evidence, without starts that contradict all other starts.
 
-    At most four changes are added, each with a log Bayes factor of at least `_LEAST_GAIN`. A start
-    of the node is left out if an equation of its rests (a row) is more than 5 sd from the
+    At most four `Change`s are added, each with a log Bayes factor of at least `_LEAST_GAIN`. A
+    start of the node is left out if an equation of its rests (a row) is more than 5 sd from the
     prediction by all other rows. Returns the sds, the model of the used rests, and these rests.
     """
     centre = usual(calibration)
@@ -300,7 +300,7 @@ def learn(
 def _best(candidates: Iterable[Change], is_gravity_certain: bool) -> Change | None:
     """
     Return the most probable change, or None if no log Bayes factor reaches `_LEAST_GAIN`. The
-    log Bayes factor of a gravity jump must also exceed those of other kinds by `_LEAST_LEAD`.
+    log Bayes factor of a gravity jump must exceed that of any other change by `_LEAST_LEAD`.
     """
     every = list(candidates)
     of_gravity = [change for change in every if change.kind == 'gravity']

@@ -178,8 +178,8 @@ def rests_of(
     """
     Decode several files into rests without duplicates, sorted by start, then by stamp.
 
-    The node's starts are sorted by the stamp of their last rest: `start_ns` and their first stamps
-    may be from the time before the computer set its clock.
+    The node's starts are sorted by the stamp of their last rest: `start_ns` and the first stamps
+    of a start may be from the time before the computer set its clock.
     """
     everything: dict[tuple[int, int], tuple[Start, Rest]] = {}
     n_damaged = 0

@@ -207,7 +207,7 @@ def series_of(
     rests: Sequence[tuple[Start, Rest]], calibration: Calibration, gravity: float | None = None
 ) -> RestSeries:
     """
-    Compute ``|f| - g`` and its derivatives at rests, with the logged g or with `gravity`. Raises
+    Compute ``|f| - g`` and its derivatives at rests; `gravity` replaces the logged g. Raises
     RecordingError if the log does not have the lags of the calibration.
     """
     correction = Correction(calibration)
@@ -264,7 +264,7 @@ def series_of(
 
 
 def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
-    """Return the indices in `memory` of the state elements, and of the lags, of `wanted`."""
+    """Return the indices in `memory` of the state elements and of the lags of `wanted`."""
     try:
         logged, target = StateLayout(memory).numbers, StateLayout(wanted).numbers
         places = np.array([logged.index(number) for number in target], np.int64)
@@ -278,12 +278,12 @@ def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
 
 def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
     """
-    Return the number of the group of each window; the at most 60 consecutive windows of a group
+    Return the number of the group of each window; up to 60 consecutive windows form a group, and
     are averaged to one rest.
 
-    The windows of a group belong to one start of the node. The unit vector of the force differs by
-    less than 1e-3 in each component, and the temperature by less than 1 K, from the first window.
-    The mean of unit vectors that are an angle a apart has a norm of at least 1 - a^2 / 2.
+    The windows of a group belong to one start of the node, and differ from the first window of the
+    group by less than 1e-3 in each component of the force's unit vector, and by less than 1 K.
+    The mean of unit vectors at angles of up to a to each other has a norm of 1 - a^2 / 2 or more.
     """
     direction = force / np.sqrt((force**2).sum(axis=1, keepdims=True))
     group = np.zeros(len(start), dtype=np.int64)
@@ -321,8 +321,8 @@ def _uncertainty(
     weight, unknown = at.states[:, WEIGHT], at.states[:, UNKNOWN]
     regimes = np.array([1.0 - weight, weight])
     unexplained = correction.curves.unexplained(at.states[:, BOARD])
-    # The ageing model has separate terms for the residual sd and the lack of fit: subtract both
-    # variances here, and if the regime is unknown, also the variances of the other set.
+    # The ageing model has separate terms for the residual sd and the lack of fit: subtract the
+    # variances of both from `slow`, in an unknown regime those of the static and dynamic sets.
     of_sets = regimes + unknown * regimes[::-1]
     slow -= (at.v.T**2 * (of_sets[:, np.newaxis] * unexplained).sum(axis=0)).sum(axis=0)
     residual = [[a.residual_sd_m_s2**2 for a in part.axes()] for part in calibration.regime_sets()]
@@ -331,7 +331,7 @@ def _uncertainty(
 
 
 def _variance_along(correction: Correction, slow: SlowUncertainty, at: _Geometry) -> Floats:
-    """Return the variance of the error along u without the noise of a sample, (n,)."""
+    """Return the variance of |f| due to `slow`, without the noise of a sample, (n,)."""
     columns, x = at.states.T, at.x.T
     line = list(correction.line(columns, columns, slow.at(columns, at.shares.T), 0.0))
     if correction.of_force is None:

@@ -4,8 +4,8 @@
 Owns the update of a calibration from rests in the field, and its score on left-out rests.
 
 A rest determines the error along gravity alone, so rests in few attitudes leave axes undetermined.
-An axis is updated only if the rests reduce the sd of a combination of its bias and scale to 0.6
-times the sd (with ageing) before the update or less. Other axes keep their values with larger sds.
+An axis is updated only if the rests reduce the sd of a combination of its bias and scale by 40 %
+or more (from the sd that includes ageing). Other axes keep their values with larger sds.
 """
 
 from collections.abc import Sequence
@@ -139,14 +139,14 @@ def update(
     _, aged, is_update = valid_since(calibration)
     first, last = float(series.time.min()), float(series.time.max())
     # The covariance includes ageing up to the time `aged`. The random walks begin at `aged` if it
-    # is before the first rest (for an updated file, the last rest), else at the first rest.
+    # is before the first rest (before the last rest for an updated file), else at the first rest.
     since = aged if -np.inf < aged < (last if is_update else first) else first
     ageing, model, used = learn(series, calibration, since, is_gravity_certain=is_gravity_certain)
     solution = solve(model, ageing, *_derivatives(calibration), ahead)
     determined, by_axis = _axis_changes(used, calibration, model, solution, ageing)
     judged = _judged(used, model, solution, determined)
     shift, kept = solution.shift * determined, solution.shift * ~determined
-    # The estimated shift of parameters that are not updated is an error of their old values.
+    # Parameters that are not updated keep the estimated shift as an error: add its square.
     covariance = solution.posterior + solution.future + np.outer(kept, kept)
     turn_on = float(np.hypot(ageing.turn_on, ageing.rest))
     new = _shifted(calibration, shift, covariance)
@@ -226,7 +226,7 @@ def _axis_changes(
         ratio = eigh(posterior[:2, :2], prior[:2, :2] + jitter, eigvals_only=True)[0]
         is_determined = bool(ratio <= 0.6**2)
         determined[bias.static : scale.end] = is_determined
-        # The estimated shift is an error of the old calibration.
+        # Mean square error of the old calibration: posterior variance plus the shift squared.
         error = posterior[3, 3] + float(rows[3] @ solution.shift) ** 2
         residual = calibration.static.axes()[axis].residual_sd_m_s2
         scatter = float(np.hypot(ageing.turn_on, ageing.rest))

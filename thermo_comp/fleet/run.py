@@ -33,7 +33,7 @@ _FORMAT = 3  # version of the format of `RESULT`
 _LONGEST_NAME = 100  # longest name of a folder of results [characters]
 # Largest number of units listed on the page of the fleet; fleet.csv lists all units.
 _MOST_ROWS = 60
-# Verdicts on tests whose bags contradict their fit: a fit with a prior would hide the fault.
+# Verdicts on tests whose bags contradict the fit; a new fit with a prior would hide the fault.
 _CONTRADICTIONS = tuple(
     kind.value for kind in (Verdict.RECALIBRATE, Verdict.NO_BETTER, Verdict.SWAPPED)
 )
@@ -212,7 +212,7 @@ class Results:
             raise ThermoCompError(f'{folder}: cannot be created: {error.strerror}') from error
 
     def folder_of(self, name: str, with_prior: object = False) -> Path:
-        """Return the folder of a unit's files; it is inside the folder of results for any name."""
+        """Return the folder of a unit's files, whatever its name, inside the folder of results."""
         kind = 'with_prior' if with_prior else 'units'
         return self.folder.joinpath(kind, *map(_safe, name.split('/')))
 

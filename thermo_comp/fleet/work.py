@@ -166,7 +166,7 @@ def dask_setup(_worker: object) -> None:
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Make workers started in the context ignore Ctrl-C; raise KeyboardInterrupt at its end."""
+    """Make workers started in the `with` block ignore Ctrl-C; raise a Ctrl-C after the block."""
     heard: list[int] = []
     # Workers inherit the ignored SIGINT (Ctrl-C) from the fork server.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)

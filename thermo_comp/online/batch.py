@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the correction of arrays of samples, with the same bits as that of single samples.
+Owns the correction of arrays of samples; the result equals that of single samples bit for bit.
 
-The compensator uses the temperature readings one by one. The segments between the readings are
-collected, evaluated together and applied to all samples with the arithmetic of single samples.
+Temperature readings are applied one by one. The segments between readings are collected and
+evaluated together; then all samples are corrected by the same operations as single samples.
 """
 
 from collections.abc import Callable, Sequence
@@ -124,8 +124,8 @@ def _push(
     while arrivals and arrivals[-1][0] <= place:
         _, _, name, stamp_ns, celsius = arrivals.pop()
         if len(thermal.queue) >= PENDING_LIMIT:
-            # The node applies waiting readings while no samples come. A batch with a full queue
-            # applies old readings; after a sample, only readings up to the next sample's stamp.
+            # The node applies waiting readings while no samples come. Here a full queue applies
+            # old readings; once a sample has come, only readings stamped up to the next sample.
             limit_ns = NEVER_NS if compensator.now_ns is None else due_ns
             thermal.flush(min(limit_ns, stamp_ns - DISORDER_NS))
         thermal.push(name, stamp_ns, celsius)
@@ -224,7 +224,7 @@ def _lines(model: Model, segments: Segments) -> tuple[Floats, Floats, Bools]:
 def _corrected(
     evaluate: _Arithmetic, table: Floats, segments: Segments, stamps: Stamps, samples: Floats
 ) -> Floats:
-    """Correct the samples of segments, whose `Correction.line` results are columns of `table`."""
+    """Correct the samples of segments; column k of `table`: `Correction.line` of segment k."""
     start_ns = np.array([segment.start_ns for segment, _ in segments], dtype=np.int64)
     ends = np.cumsum([count for _, count in segments])
     n, parts = len(stamps), []

@@ -28,8 +28,8 @@ STUCK_SAMPLES: Final = 50
 #: change in a turn by 1.2 degrees, above the noise and the steps of a converter at rest.
 MOTION: Final = 0.2
 #: An axis that repeats its reading at rest is stuck if the other axes change `NOISY_CHANGES` times
-#: by `NOISY_SDS` sd of their noise from sample to sample, and if the sd of its own noise is at
-#: least `VISIBLE_SDS` steps of the converter, so that the noise would show.
+#: by `NOISY_SDS` sd of their noise from sample to sample. Its own noise must have an sd of at
+#: least `VISIBLE_SDS` steps of the converter: smaller noise would not change the reading.
 NOISY_CHANGES: Final = 20
 NOISY_SDS: Final = 1.5
 VISIBLE_SDS: Final = 2.0
@@ -177,18 +177,18 @@ class StuckCheck:
         self, run: Run, columns: Floats, here: slice, equal: Ints, axis: int
     ) -> tuple[Floats, Ints, Floats]:
         """
-        Return `moved`, `n_noisy`, `step` of a `Run` after each of the samples `here` of `columns`;
+        Return `moved`, `n_noisy`, `step` of a `Run` after each sample of `columns[:, here]`;
         `equal`: number of repeats of the first reading of the run up to each sample.
         """
         first, _, moved, n_noisy, step = run
-        # Include the sample before `here`, which the first difference needs.
+        # The first difference needs the sample before the slice `here`.
         before = self.last[:3] if here.start == 0 else columns[:, here.start - 1]
         values = np.column_stack([before, columns[:, here]])[[axis - 2, axis - 1]]
         with np.errstate(invalid='ignore'):
             moved_by = np.abs(values[:, 1:].T - np.take(first[:3], [axis - 2, axis - 1]))
             changes = np.abs(np.diff(values))
         most = np.fmax.accumulate(np.append(moved, moved_by.min(axis=1)))[1:]
-        # As in `_continued`, changes up to the `STUCK_SAMPLES`th repeat do not count.
+        # Like `_continued`, ignore changes up to the `STUCK_SAMPLES`th repeat of a reading.
         changes[:, equal <= STUCK_SAMPLES] = 0.0
         noisy = np.take(self._noisy, [axis - 2, axis - 1])[:, np.newaxis]
         counts = n_noisy + np.cumsum(np.sum(changes >= noisy, axis=0))
@@ -296,7 +296,7 @@ class GravityCheck:
         if self.is_refuted or not (self._off or rests):
             self._off, self._is_resting = [], False
             return
-        # Largest difference of two samples at rest: `LARGEST_CHANGE` plus four sd of its noise.
+        # Largest difference of two samples at rest: `LARGEST_CHANGE` + 4 sd of the difference.
         near = LARGEST_CHANGE + 4.0 * math.sqrt(2.0 * noise / 3.0)
         was_resting, reference = self._is_resting, (self._off or [self._last_mean or ()])[0]
         is_near = max(abs(a - b) for a, b in zip(force, reference, strict=True)) <= near
@@ -326,7 +326,7 @@ class GravityCheck:
         squares = [(v - m) ** 2 for values, m in zip(axes, mean, strict=True) for v in values]
         scatter = math.fsum(squares) / (n - 1)
         last, self._last_mean = self._last_mean or [math.inf] * 3, mean
-        # Largest difference of two means at rest: `LARGEST_CHANGE` plus four sd of its noise.
+        # Largest difference of two means at rest: `LARGEST_CHANGE` plus 4 sd of the difference.
         change = LARGEST_CHANGE + 4.0 * math.sqrt(2.0 * noise_variance / (3.0 * n))
         largest = max(abs(a - b) for a, b in zip(mean, last, strict=True))
         if not (scatter <= SCATTER_FACTOR**2 * noise_variance and largest <= change):

@@ -203,7 +203,7 @@ class Compensator:
         fresh_ns = thermal.fresh_until_ns
         if stamp_ns > fresh_ns:
             thermal.count_unmeasured(1)
-            # Until a temperature arrives, each sample takes this path and is counted as dropped.
+            # Each sample is counted as dropped here until a board temperature arrives.
             self.event_ns = EVER_NS
             self.last_ns = stamp_ns
             return None
@@ -215,7 +215,7 @@ class Compensator:
         line, rate_line, is_good = thermal.model.lines(start, end, slow, excess)
         self.rate_line = rate_line.tolist()
         if not is_good:
-            # While the correction is not finite, each sample takes this path and is dropped.
+            # Each sample is dropped here while the correction is not finite.
             counters.n_unsound += 1
             self.event_ns, self.last_ns = EVER_NS, stamp_ns
             return None
@@ -242,7 +242,7 @@ class Compensator:
         is_far = self.last_ns != EVER_NS and max(self.last_ns, self.reading_ns) < near_ns
         if is_far and (leapt_ns is None or stamp_ns <= leapt_ns):
             self.leapt_ns = stamp_ns
-            self.event_ns = EVER_NS  # `is_leap` also checks the next sample
+            self.event_ns = EVER_NS  # the next sample is checked by `is_leap`, too
             return True
         return False
 

@@ -4,9 +4,9 @@
 Owns the segments: time intervals between temperature readings, with a correction linear in time.
 
 A segment ends at a temperature reading, or after one second. The correction is evaluated at both
-ends of a segment and interpolated, so a sample takes a few operations, the output has no steps
-between two readings, and a batch needs one evaluation per segment. The slowly varying variance due
-to parameters and initial lag states is evaluated every 10 s; soon after a start, in each segment.
+ends of a segment and interpolated, so a sample costs a few operations, and the output has no steps
+between two readings. The slowly varying variance due to parameters and initial lag states is
+evaluated every 10 s; soon after a start, in each segment.
 """
 
 from collections.abc import Sequence
@@ -84,7 +84,7 @@ class Model:
         self.inputs = (BOARD_INPUT, *calibration.sensors)
 
     def slow_rows(self, held: Sequence[SlowState]) -> Floats:
-        """Evaluate slowly varying variances, (rows, n): `n_slow` rows of force, then of rate."""
+        """Evaluate the slowly varying variances, (rows, n): of force (`n_slow` rows), of rate."""
         states, shares, rates = (np.array(part).T for part in zip(*held, strict=True))
         return np.concatenate([part.at(states, shares, rates) for part in self.uncertainty])
 
@@ -149,7 +149,7 @@ class ThermalSide:
         unit, rate = self.calibration.unit, copy(self.rate)
         self._use(model, config)
         if self.calibration.unit == unit:
-            # If the rate check has stopped the output of the same unit, the output stays stopped.
+            # A new calibration of the same unit does not end a stop of output by the rate check.
             self.rate = rate
         self.queue.keep(lambda entry: entry[2] in self.inputs)
         is_same = self.calibration.detector == old.settings
@@ -206,7 +206,7 @@ class ThermalSide:
         return not self.model.needs_temperature and self.tracker.board.stamp_ns is None
 
     def sample(self, stamp_ns: int) -> tuple[float, ...]:
-        """Return the thermal state at a stamp; if `is_unmeasured`, of a soak at T_ref."""
+        """Return the thermal state at a stamp, or if `is_unmeasured`, that of a soak at T_ref."""
         if self.is_unmeasured:
             gradients = (0.0, 0.0) * len(self.calibration.sensors)
             reference = self.calibration.reference_temperature_c
@@ -215,7 +215,7 @@ class ThermalSide:
 
     @property
     def fresh_until_ns(self) -> int:
-        """Last stamp with a valid board temperature; NEVER_NS: not needed, EVER_NS: not read."""
+        """Last stamp with a valid board temperature; NEVER_NS: none needed, EVER_NS: none yet."""
         if not self.model.needs_temperature:
             return NEVER_NS
         board_ns = self.tracker.board.stamp_ns
@@ -246,7 +246,7 @@ class ThermalSide:
         return Segment(start_ns, is_new, rate.is_too_fast, rate.noise_excess, start, end, slow)
 
     def bias_sd(self, correction: Correction, variances: Sequence[float]) -> tuple[float, ...]:
-        """Return the bias sd of each axis: the root of the variance without a sample's noise."""
+        """Return each axis' bias sd: the root of the output's variance less that of the noise."""
         excess = 1.0 + self.rate.noise_excess
         pairs = zip(variances, correction.noise, strict=False)
         return tuple(sqrt(max(0.0, whole - excess * noise)) for whole, noise in pairs)
@@ -259,7 +259,7 @@ class ThermalSide:
         return self._slow_rows
 
     def _slow_at(self, start_ns: int, end_state: tuple[float, ...]) -> SlowState:
-        """Return the arguments of the slowly varying variance, renewed after `SLOW_NS` at most."""
+        """Return the arguments of the slowly varying variance; they are at most `SLOW_NS` old."""
         # The unknown initial lag states depend on the board's rate, which the first readings after
         # a start do not determine: evaluate the variance in each segment.
         is_young = self.tracker.board.n_in_row < YOUNG_READINGS

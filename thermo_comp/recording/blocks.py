@@ -246,7 +246,7 @@ def with_stamps(block: Block, last_ns: int) -> tuple[Block, int]:
     """
     Give each reading without a stamp the newest stamp of the samples before it, because its log
     time depends on the speed of a playback; drop such readings before the first sample. `last_ns`:
-    newest stamp before the block. Return the block and the newest stamp up to the block's end.
+    newest stamp before the block. Return the block and the newest stamp at the block's end.
     """
     samples = np.concatenate(([last_ns], block.accel_stamp_ns))
     jumps = np.flatnonzero(np.diff(samples) < -_JUMP_NS) + 1
@@ -295,7 +295,7 @@ def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
     """
     Turn a jump of the stamps by over an hour, forwards or backwards, into a gap of an hour.
     A clock that is set during a recording can leave a gap of years, too long for a time grid. A
-    gap of an hour suffices: it makes the thermal state unknown. RecordingError for more than
+    gap of an hour suffices to make the thermal state unknown. RecordingError for more than
     `_MOST_JUMPS` jumps, or if the recording is too sparse (`_SPARSE_NS`, `_SPARSEST_NS`).
     """
     last_ns: int | None = None

@@ -200,7 +200,7 @@ class _Clock:
         self.longest_gap_s = max(self.longest_gap_s, float(np.max(gaps, initial=0)) * 1e-9)
 
     def findings(self) -> list[str]:
-        """List the kinds of stamps that do not rise, and the gaps."""
+        """List the gaps between samples, and the numbers of stamps that do not rise."""
         texts = {
             f'samples with a stamp not later than an earlier stamp: {self.n_backwards}; these '
             'samples are left out': self.n_backwards,

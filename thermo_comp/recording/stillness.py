@@ -35,8 +35,8 @@ _ROTATION_S = 10.0
 _STEP_SDS = 8.0
 # Number of steps between cells whose median is the drift; largest drift [g/s].
 _DRIFT_STEPS, _DRIFT = 9, 5e-5
-# Number of samples searched for a quantum; smallest number of changes that show the quantum if all
-# are whole multiples of the smallest change.
+# Number of samples searched for a quantum; smallest number of changes from sample to sample that
+# show a quantum if all changes are whole multiples of the smallest change.
 _QUANTUM_SAMPLES, _STEPS_NEEDED = 20000, 10
 STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # numbers of windows a cell may fill at low sample rates
 _LONGEST_CELL_NS = 86400e9  # limit of a cell's length, for wrong stamps [ns]
@@ -164,7 +164,7 @@ class CellAccumulator:
     def cells(self) -> Cells:
         """Return all cells so far, including the unfinished last cell."""
         sums = np.concatenate(self._sums)
-        self._sums = [sums]  # the next call need not join these sums again
+        self._sums = [sums]  # later calls then join only new sums
         index, count = sums[:, 0].astype(np.int64), sums[:, 1]
         total, square = np.split(sums[:, 3:-6], 2, axis=1)
         n_free = np.maximum(count[:, None] - 1.0, 1.0)
@@ -200,8 +200,8 @@ class CellAccumulator:
         step, between = float(np.median(steps)), 0.0
         gaps = steps[steps > 10.0 * step]
         if gaps.sum() > 0.5 * steps.sum():
-            # A polled buffer gives bursts of samples at a constant interval below 5 s; a cell then
-            # has two bursts. Pauses between positions held by hand are irregular or above 5 s.
+            # A driver that polls a buffer sends bursts at a constant interval below 5 s: use cells
+            # of two bursts. Pauses between positions held by hand are irregular or above 5 s.
             usual = float(np.median(gaps))
             is_regular = np.mean(np.abs(gaps - usual) < 0.2 * usual) > 0.9
             if is_regular and usual < 5e9:
@@ -270,7 +270,7 @@ def _quantum_of(samples: Floats, few: list[Floats]) -> Floats:
         if len(changes) < 3:
             continue
         # Changes by the same multiple of the quantum differ by rounding only. The smallest change
-        # is the quantum if all changes are equal, have few values, or are whole multiples of it.
+        # is the quantum if all changes are its whole multiples, or take only a few values.
         n_levels = 1 + int(np.sum(np.diff(changes) > 0.1 * changes[0]))
         steps = changes / changes[0]
         is_whole = len(changes) >= _STEPS_NEEDED and (np.abs(steps - np.rint(steps)) < 0.1).all()

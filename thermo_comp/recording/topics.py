@@ -176,7 +176,7 @@ def shown(name: str) -> str:
 
 
 def choice_note(name: str, key: str, wanted: str, among: str) -> str:
-    """Return the note that a topic was chosen by its type; '' if it has the wanted name."""
+    """Return the note that a topic was chosen by its type; '' if its name is the wanted one."""
     if is_called(name, split_field(wanted)[0]):
         return ''
     return f'{shown(name)}, its {among} {_TYPES[key].rpartition("/")[2]}, is taken for {key}'
@@ -254,7 +254,7 @@ def _candidates(
         if len(only) == 1:
             yield key, only[0]
         if of_type and key == 'imu':
-            return  # with several Imu topics, do not choose counts instead
+            return  # the choice between several Imu topics is left to the user: do not try counts
 
 
 def of_kind(present: Present, kind: str) -> list[str]:
@@ -287,7 +287,7 @@ def _text_of_unnamed(present: Present, board: str, taken: Collection[str]) -> st
 def _further(
     present: Present, topics: Topics, topics_of: Mapping[Role, str], *, is_read: bool
 ) -> dict[str, str]:
-    """Find the thermometers `topics.further`, and those in the namespace of board or case."""
+    """Find `topics.further`, and further thermometers in the namespace of board or case."""
     both = {}
     for sensor, wanted in topics.further.items():
         name = _match(present, wanted, thermometer(sensor))

@@ -152,7 +152,7 @@ def encode_stamped(
     head = pack('<BBHiII', 0, 1, 0, 0, 0, len(text)) + text
     body = 4 + (len(head) + 3) // 8 * 8
     row = np.frombuffer(bytearray(head.ljust(body, b'\0') + bytes(8 * n_numbers)), np.uint8)
-    # `row` is copied for each message, so write values equal in all messages into `row` once.
+    # Values that are equal in all messages are written once, into `row`, before `row` is copied.
     for column, values in pieces:
         if values.ndim == 1:
             row[body:].view('<f8')[column : column + len(values)] = values

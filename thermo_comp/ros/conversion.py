@@ -18,7 +18,7 @@ from typing import Any
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu, Temperature
 
-#: Compensates a sample: from stamp [ns], x, y, z to force and covariance; None if it is dropped.
+#: Compensates a sample: from stamp [ns], x, y, z to force and covariance; None: sample dropped.
 Process = Callable[[int, float, float, float], 'tuple[float, ...] | None']
 #: Corrects the angular rate of a sample: from stamp [ns], x, y, z to rate and its variances.
 CorrectRate = Callable[[int, float, float, float], 'tuple[float, ...]']
@@ -33,7 +33,7 @@ _HEADER = struct.Struct('<4siI4x')
 _PASSED = 8 * 25
 _NO_GYRO = struct.Struct('<25d').pack(*[0.0] * 3, 1.0, -1.0, *[0.0] * 11, -1.0, *[0.0] * 8)
 #: Offset of the angular rate in the `_PASSED` bytes; formats of the rate with the first element of
-#: its covariance, and with all elements.
+#: its covariance, and with all nine elements.
 _RATE_AT = 8 * 13
 _RATE_IN, _RATE_OUT = struct.Struct('<4d'), struct.Struct('<12d')
 _CELSIUS = struct.Struct('<d')
@@ -131,7 +131,7 @@ def read_temperature(data: bytes) -> tuple[int, float] | None:
 
 
 def _values_at(data: bytes, size: int) -> int:
-    """Return the offset of a message's `size` bytes of numbers; 0 if it is not plain CDR."""
+    """Return the offset of the `size` bytes of numbers in a message; 0 unless in plain CDR."""
     if not 16 < len(data) <= _LONGEST_MESSAGE or data[:4] != _ENCAPSULATION:
         return 0
     length = int.from_bytes(data[12:16], 'little')

@@ -63,8 +63,8 @@ _FAULTS = {
     Fault.STILL: 'stands still (equal readings), its standard deviation grows',
     Fault.FROZEN: 'frozen (equal readings) while the other temperature changes: not used',
     Fault.STEP: 'jumped by {:+.2f} K; its readings are not used',
-    Fault.COPY: 'repeats the readings of the board: is one topic given for both?',
-    Fault.LOOSE: 'is {:.1f} K farther from that of the case than in the fit: thermometer loose?',
+    Fault.COPY: "repeats the board thermometer's readings: do both read one topic?",
+    Fault.LOOSE: 'is {:.1f} K farther from the case temperature than in the fit: loose sensor?',
 }
 
 Finding = tuple[int, str]  # level and text

@@ -127,7 +127,7 @@ class NodeConfig:
     diagnostics_period: float = _parameter(1.0, 'Period of /diagnostics [s].', (0.01, 60.0))
 
     def compensator_config(self) -> CompensatorConfig:
-        """Return the settings of the compensator, whose names end in the unit."""
+        """Build the compensator's settings; their names are the parameters' plus a unit."""
         names = [field.name for field in fields(CompensatorConfig)]
         values = (getattr(self, name.removesuffix('_m_s2').removesuffix('_s')) for name in names)
         return CompensatorConfig(**dict(zip(names, values, strict=True)))
@@ -275,7 +275,7 @@ class ParameterRequests:
                 future = (self._slow if waits else self._quick).submit(self._read, group)
                 future.add_done_callback(lambda done: self._loop.call_soon(partial(end, done)))
             return
-        # The number of results is limited: to write a result takes as long as to read a parameter.
+        # At most `PARAMETERS_LIMIT` results: writing one takes as long as reading a parameter.
         results += [_refusal(reason)] * min(len(groups), PARAMETERS_LIMIT)
         respond()
 

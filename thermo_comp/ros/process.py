@@ -33,9 +33,9 @@ def use_profile() -> None:
 
 class SignalWatch:
     """
-    Calls a stop function at the first signal; a second signal ends the process. The object must be
-    used in the main thread. `os._exit` ends a process that still runs `ending_s` [s] after the
-    stop function has returned.
+    Calls a stop function at the first signal; a second signal ends the process. A `SignalWatch`
+    must be used in the main thread. `os._exit` ends a process that still runs `ending_s` [s] after
+    the stop function has returned.
     """
 
     # A separate thread calls the stop function, because the interpreter runs no signal handlers

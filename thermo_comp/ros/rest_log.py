@@ -66,7 +66,7 @@ class RestLog:
         self._thread.start()
 
     def put(self, stamp_ns: int, start: bytes, rest: bytes) -> None:
-        """Queue the line of a rest; `start` precedes it in a new file or after a changed start."""
+        """Queue the line of a rest, after that of its `start` if the file or the start is new."""
         day = np.datetime64(stamp_ns, 'ns').astype('datetime64[D]')
         try:
             self._lines.put_nowait((str(day), start, rest))
@@ -154,8 +154,8 @@ class RestKeeper:
         self, messages: list[bytes], loaded: LoadedCalibration, compensator: Compensator
     ) -> None:
         """Sum messages that the compensator has processed; queue the rests that they complete."""
-        # All messages are summed with the present calibration, although those that arrived before
-        # a reload were corrected with the old calibration.
+        # All messages are summed with the present calibration, also messages that were corrected
+        # with the old calibration before a reload.
         self._use(loaded, compensator)
         stamps, samples = samples_of(messages, is_imu=loaded.calibration.unit.input != 'counts')
         if not len(stamps):
@@ -209,7 +209,7 @@ class RestKeeper:
 
 
 def samples_of(messages: Sequence[bytes], *, is_imu: bool) -> tuple[Stamps, Floats]:
-    """Read stamps [ns] and samples of little-endian messages of the last message's length."""
+    """Read stamps [ns] and samples of the little-endian messages as long as the last one."""
     size = len(messages[-1]) if messages else 0
     # A message shorter than one with an empty frame_id is malformed.
     if size < _SHORTEST[is_imu]:
