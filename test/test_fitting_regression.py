@@ -188,8 +188,8 @@ def test_covariance_and_evidence_agree_with_dense_linear_algebra(solved):
             mode.covariance / np.outer(sd[:n], sd[:n]), covariance, atol=1e-4
         )
         assert np.diag(covariance) == pytest.approx(1.0, rel=1e-4)
-        # Laplace: -2 ln Z = misfit + ln det(noise), ln det(prior), ln det(Hessian). Directions of
-        # the attitudes have no prior.
+        # Laplace: -2 ln Z = misfit + ln det(noise) + ln det(prior) + ln det(Hessian). Directions
+        # of the attitudes have no prior.
         precision = regression.precision(wide, mode.layout)
         known = np.log(precision[precision > 0.0]).sum()
         determinants = dense.determinant + np.linalg.slogdet(hessian)[1] - known
