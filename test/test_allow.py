@@ -56,7 +56,7 @@ def swapped(source, rest):
         ('units', as_it_is, COUNTS, 1),
         ('jump', jumped, FORCE, 1),
         ('jump', jumped, FORCE, 7),
-        # For this name the test replaces the readings by those of the function `swapped`.
+        # The case 'swapped' replaces the readings by the function `swapped`.
         ('swapped', as_it_is, FORCE, 7),
         ('compensated', compensated, FORCE, 12),
     ],

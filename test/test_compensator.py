@@ -111,8 +111,8 @@ def at_seconds(*events):
     ]
 
 
-# In the explicit examples the step of the stamp from a reading that was already applied, or that
-# is a day ahead, to the next reading shows whether both are from one clock.
+# In the explicit examples a stamp is below that of a reading which is a day ahead, or was already
+# applied; only after a fall by over 5 s earlier readings count as readings of another clock.
 @given(event_lists, st.integers(3, 30), st.sampled_from([0.0, 5.0]))
 @example(at_seconds('A', 3, 'A', 0, 'B', 2, 'B', 86_400, 'C', 0, 'A', 0), 5, 0.0)
 @example(at_seconds('B', 26, 'B', 21, 'A', 23, 'B', 16.5), 1, 0.0)
@@ -180,7 +180,7 @@ def test_a_sample_with_a_stamp_20_s_ahead_is_dropped_unless_the_next_stamp_agree
         (np.insert(usual, 2, usual[2] + leap), [0, 1, 3, 4, 5]),
         # After a gap of 20 s the first sample is dropped, and the samples after it are used.
         (np.where(np.arange(5) < 2, usual, usual + leap), [0, 1, 3, 4]),
-        # Samples with wrong stamps are dropped: two apart, or two in falling order.
+        # Two samples stamped 20 s ahead are dropped if others lie between, or their stamps fall.
         (np.insert(usual, [1, 3], usual[[1, 3]] + leap), [0, 2, 3, 5, 6]),
         (np.array([1, 2 + leap, 1 + leap, 3, 4]), [0, 3, 4]),
     ):
@@ -356,7 +356,7 @@ def test_a_switch_of_sets_causes_no_step():
 
 @pytest.mark.parametrize(
     ('delta', 'given_s', 'expected_s'),
-    # The blend is limited to 1 ug/s: 102 s for sets that differ by 0.3 counts = 102 ug.
+    # The output changes by at most 1 ug/s: in 102 s for sets that differ by 0.3 counts = 102 ug.
     [(0.01, 30.0, 30.0), (0.3, 30.0, 1e-3 / 9.80665e-6), (0.3, 5.0, 50.0), (0.3, 0.0, 0.0)],
 )
 def test_a_transition_time_above_0_limits_the_change_to_1_ug_per_s(delta, given_s, expected_s):

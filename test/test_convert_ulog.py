@@ -122,7 +122,7 @@ def test_a_log_without_sample_times_is_read(tmp_path, rng):
     read = read_autopilot(path)
     np.testing.assert_array_equal(read.accel, force)
     assert 'case' not in read.temperatures
-    # A constant temperature is written every 10 s, so in this log of 6 s once.
+    # A constant temperature is written every 10 s, so once in this log of 6 s.
     np.testing.assert_array_equal(read.temperatures['board'].celsius, [31.5])
 
 

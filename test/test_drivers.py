@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""With each file of config/drivers the commands read a bag with that driver's topics and types."""
+"""With a driver's file in config/drivers commands read bags with the topics of this driver."""
 
 import csv
 import re

@@ -392,7 +392,7 @@ def test_kalibr_files_without_bias_and_with_several_imus_are_read():
 
 
 def test_px4_rate_polynomials_of_different_degree_are_imported(cubic):
-    # WHY: an axis without a third power had too few coefficients, and the import failed.
+    # WHY: the import failed for an axis whose rate polynomial has no third power.
     rows = [(1e-3, 0.0, 0.0, 0.0), (2e-3, 1e-4, 0.0, 0.0), (0.0, 1e-4, -2e-6, 3e-8)]
     lines = [f'TC_G0_X{p}_{axis}={row[p]!r}' for axis, row in enumerate(rows) for p in range(4)]
     lines += ['TC_G_ENABLE=1', 'TC_G0_TREF=31', 'TC_G0_TMIN=0', 'TC_G0_TMAX=50']

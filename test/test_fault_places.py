@@ -3,8 +3,8 @@
 """
 The published covariance covers faults at any time of a ramp (tested without DDS).
 
-WHY: the covariance covered the error by a fault in the middle of a ramp, but not by the same fault
-at the start of a ramp, nor by a fault during which the temperature of the sensor changed.
+WHY: the covariance covered faults in the middle of a ramp, but not faults at its start, and no
+faults during which the temperature of the sensor changed.
 Every published sample must have an error below five claimed standard deviations.
 """
 

@@ -161,7 +161,7 @@ def test_many_reloads_at_1_khz_lose_no_sample(tmp_path):
     path = tmp_path / 'fast.yaml'
     fast = unit(unit=Unit('F-1', 'counts', 8388607.0, 1e-3))
     save_calibration(fast, path)
-    # Reloads and samples end at the last answer, before all 60 s of samples have been sent.
+    # Sending ends at the answer to the last reload, before all 60 s of samples have been sent.
     events = bag(rate_hz=1000.0, duration_s=60.0)
     n_reloads = 100
     with bench(path) as node:

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 For each row of the fault table the output of compensator and diagnostics is compared with the
-truth. Rows about the order of arrival are also sent over DDS to a node process, whose output must
-equal the output without DDS.
+truth. Rows that depend on the order of arrival of messages are also sent over DDS to a node
+process, whose output must equal the output without DDS.
 """
 
 from copy import deepcopy

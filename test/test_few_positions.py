@@ -135,7 +135,7 @@ def test_one_position_leaves_the_scale_at_its_prior(one_position):
 
 
 def test_after_soaks_in_one_position_the_drift_error_is_within_three_claimed_sd(rng):
-    # WHY: norms in one attitude do not separate bias and scale. The fit attributed the drift to
+    # WHY: |f| in one attitude does not separate bias and scale. The fit attributed the drift to
     # the scale; the bias drift was wrong on two axes, with a claimed sd of 0.
     slope = 0.1 * SLOPE
     bags = []
@@ -150,7 +150,7 @@ def test_after_soaks_in_one_position_the_drift_error_is_within_three_claimed_sd(
 @pytest.mark.slow
 def test_rests_at_three_temperatures_give_the_bias_slope_despite_a_warm_up_of_the_board(rng):
     # WHY: the sensor does not follow the warm-up of the board. The fit found a bias slope of 0,
-    # and took differences between the norms of rests for mounting offsets.
+    # and attributed differences of |f| between rests to mounting offsets.
     bags = []
     for celsius in (5.0, 20.0, 35.0):
         for up in positions(8, 3):
@@ -165,8 +165,8 @@ def test_rests_at_three_temperatures_give_the_bias_slope_despite_a_warm_up_of_th
     # the sensor in a rest is uncertain by 0.1 K.
     np.testing.assert_allclose(slopes, 0.1 * MG * SLOPE, atol=0.002 * MG)
     assert 'misfit' not in names_of(result)
-    # Soaks do not determine the weights of lags; their claimed sd is between half of the bias
-    # slope and the bias slope, the largest possible weight.
+    # Soaks do not determine the weights of lags. The largest possible weight is the bias slope;
+    # the claimed sd of the weights is between half of this slope and the slope.
     variance, layout = np.diag(calibration.posterior.covariance()), parameter_layout(calibration)
     of_lags = [variance[block.response : block.end].sum() for block in layout.bias]
     assert 0.5 < np.sqrt(np.mean(of_lags) / np.mean(slopes**2)) < 1.0
@@ -175,7 +175,7 @@ def test_rests_at_three_temperatures_give_the_bias_slope_despite_a_warm_up_of_th
 @pytest.mark.slow
 def test_the_drift_error_of_a_sensor_that_follows_half_of_a_warm_up_is_within_three_claimed_sd():
     # WHY: a curve fitted to the drifts within rests was wrong by 7 claimed sd over the range of
-    # temperatures. Seed 2 gives an error above the sd of the curve fitted to drifts.
+    # temperatures. With seed 2 the error of this curve exceeds its sd.
     rng, slopes, bags = np.random.default_rng(2), 0.1 * MG * SLOPE, []
     for celsius in (5.0, 20.0, 35.0):
         for up in positions(6, 3):
@@ -202,8 +202,8 @@ def test_tilts_of_two_supports_are_not_taken_for_a_scale_slope_of_a_level_axis(r
     at = np.array([0.0, 10.0])
     # 15000 samples (noise 0.1 mg) determine the mean bias slope of the two rests to 1 ug/K.
     assert np.diff(z.bias_function.value(at))[0] == pytest.approx(MG, abs=0.01 * MG)
-    # With a force of 0.03 g, an error of 1 ug/K is 33 ppm/K of the scale factor, and the
-    # difference of two rests with such errors is 47 ppm/K; the limit is 470 ppm/K.
+    # At 0.03 g an error of 1 ug/K is a scale slope of 33 ppm/K. The difference of two rests with
+    # such errors is 47 ppm/K; the limit is ten times 47 ppm/K.
     assert abs(np.diff(z.scale_function.value(at))[0]) < 10.0 * 47e-6
 
 
@@ -234,7 +234,7 @@ def test_positions_without_a_thermometer_give_constants_and_wide_temperature_slo
 
 
 def test_a_fit_that_cannot_determine_the_repeatability_of_mountings_reports_its_assumption(rng):
-    # The nine constants of a triad fit nine norms exactly, so nine norms show no mounting offset.
+    # The nine constants of a triad fit nine |f| exactly, so |f| shows no mounting offset.
     assert 'mountings' in names_of(tumbled(9))
     stated = fit([turned(rng, positions(9, 3))], replace(OPTIONS, mounting_sd=1e-3))
     assert 'mountings' not in names_of(stated)
@@ -258,7 +258,7 @@ def test_the_bias_sd_of_one_recording_contains_the_sd_of_a_turn_on(rng):
     # WHY: the claimed bias sd was 1/6 of the error, as if each position had a separate turn-on.
     offsets = 5e-3 * rng.standard_normal((8, 3))
     ups = positions(12, 3)
-    # `least`: prior sd of turn-ons for a noise of 0.02 m/s^2 at 100 Hz, and the stated sd [m/s^2].
+    # `least`: sd of turn-ons [m/s^2], by prior for a noise of 0.02 m/s^2 at 100 Hz, or stated.
     stated = fit([turned(rng, ups)], replace(OPTIONS, mounting_sd=5e-3))
     for result, least in ((tumbled(12), 1e-3), (stated, 5e-3)):
         calibration = result.calibration
@@ -273,8 +273,8 @@ def test_the_bias_sd_of_one_recording_contains_the_sd_of_a_turn_on(rng):
 
 @pytest.mark.slow
 def test_the_claimed_variance_of_a_curve_contains_that_of_turn_ons_at_each_temperature(rng):
-    # WHY: the claimed variance was 1.6 to 1.9 times the variance of a turn-on, because turn-ons at
-    # three temperatures were counted as an error of the mean bias, not of the curve.
+    # WHY: turn-ons at three temperatures counted as errors of the mean bias, not of the curve, so
+    # the claimed variance was only 1.6 to 1.9 times the variance of a turn-on.
     turn_on, ups, dwell = 5e-3, positions(9, 3), 600
     bags = []
     for celsius in (-15.0, 20.0, 55.0):
@@ -287,9 +287,9 @@ def test_the_claimed_variance_of_a_curve_contains_that_of_turn_ons_at_each_tempe
     unit = tc.fit(bags, gravity=GRAVITY, input='m/s^2', mounting_sd=turn_on)
     for bag in (bags[0], bags[2]):
         out = unit.correct(bag.time_s, bag.counts, board=bag.temperatures['board'])
-        # V: variance of a turn-on. At the ends of the range a line through three equidistant
-        # points has the variance 5/6 V, a parabola V; the next turn-on adds V. Nine independent
-        # mountings with an sd of `mounting_sd` add V / 3 by the bias, and V / 3 by the scale.
+        # The variance V of a turn-on gives a line through three equidistant points the variance
+        # 5/6 V at the ends, a parabola V; the next turn-on adds V. Nine mountings, with an sd of
+        # `mounting_sd` each, add a variance of V / 3 by the bias, and of V / 3 by the scale.
         variance = np.diagonal(out.covariance[-dwell:].mean(axis=0)) - 1e-3**2
         assert ((1.0 + 5.0 / 6.0) * turn_on**2 < variance).all()
         assert (variance < (1.0 + 1.0 + 2.0 / 3.0) * turn_on**2).all()
@@ -299,10 +299,10 @@ def test_rests_of_one_mounting_do_not_show_how_well_mountings_repeat(rng):
     # WHY: if each position had several rests, the fitted mounting sd was 1/20 of the true sd.
     whole, cut = tumbled(9), fit([turned(rng, np.repeat(positions(9, 3), 5, axis=0))], OPTIONS)
     sd, sd_cut = (done.calibration.static.x.residual_sd_m_s2 for done in (whole, cut))
-    # Nine norms do not determine the mounting sd, which stays at its prior in both fits.
+    # Nine values of |f| do not determine the mounting sd, which stays at its prior in both fits.
     assert sd_cut == pytest.approx(sd, rel=0.1)
     assert 'mountings' in names_of(cut)
-    # All rests of a mounting are left out together, so nine mountings have nine left-out norms.
+    # All rests of a mounting are left out together: nine mountings give nine left-out |f|.
     assert len(cut.fit.selected.score.norms.square) == 9
 
 
@@ -402,7 +402,7 @@ def test_turn_ons_between_six_faces_are_not_taken_for_a_misalignment(rng, size):
 
 
 def test_the_claimed_sd_from_six_faces_contains_the_cross_axis_sensitivity_of_a_mems(rng):
-    # The norms of six faces do not show the cross-axis sensitivities of 0.8, -0.6 and 0.5 %.
+    # |f| on six faces does not show the cross-axis sensitivities of 0.8, -0.6 and 0.5 %.
     M = np.array([[1.0, 0.0, 0.0], [8e-3, 1.0, 0.0], [-6e-3, 5e-3, 1.0]])
     sensed = np.linalg.inv(M)
     faces = np.vstack((np.eye(3), -np.eye(3)))

@@ -72,7 +72,7 @@ def test_an_update_with_the_true_variances_equals_a_kalman_filter():
     series = series_of(history.rests, unit)
     best = field_units.BestFilter(process)
     for k in range(len(series)):
-        # The Kalman filter takes the rests that `series_of` averages to row k, as one measurement.
+        # The Kalman filter gets the mean of the rests of row k of `series` as one measurement.
         first = int(series.n_windows[:k].sum())
         windows = [r for _, r in history.rests[first : first + int(series.n_windows[k])]]
         mean = np.mean([window.mean for window in windows], axis=0) / field_units.K
@@ -186,7 +186,7 @@ def test_the_sd_of_an_old_calibration_aged_to_the_last_rest_includes_the_random_
     # half and all of the variance of the random walk to the biases of x and y.
     for axis in (x, y):
         assert 0.5 < axis.present_sd / (329.0 * MICRO_G) < 1.5
-    # The present sd of z must equal the change of z within 40 ug, two sd of a turn-on offset.
+    # The sd of z at the last rest must equal the walk of z within 40 ug, two sd of a turn-on.
     assert z.present_sd == pytest.approx(abs(walk[-1, 2]), abs=40.0 * MICRO_G)
 
 
@@ -415,7 +415,7 @@ def with_shares(logged, share):
 
 
 def test_derivatives_of_a_rest_by_initial_lag_states_agree_with_finite_differences():
-    # At a turn-on the states of lags are unknown; expected derivatives are differences of |f|.
+    # At a turn-on the states of lags are unknown; expected derivatives: finite differences of |f|.
     unit, share, step = rich_calibration(), 0.6, 1e-4
     logged = with_shares(rests(unit, in_any_attitude, no_error, days=4, rate=0.5 / 60.0), share)
     series, layout = series_of(logged, unit), StateLayout(Correction(unit).memory)

@@ -135,6 +135,6 @@ def test_a_bag_of_another_environment_is_excluded_and_increases_the_claimed_sd()
         # The variance added because of bag r4 covers the bias error in r4, up to 1.1 mg.
         more = sd_of_a_correction(unit) ** 2 - sd_of_a_correction(alone) ** 2
         assert 0.5 < true_error / np.sqrt(more.mean()) < 1.5
-    # A new bag whose bias slope is that of the first four bags gives no note on its environment.
+    # A new bag with the bias slope of the first four bags gives no note `environment`.
     again = tc.fit(columns_of([SLOPE] * 5)[-1:], gravity=G, input='m/s^2', prior=alone)
     assert not [note for note in again.provenance.notes if note.startswith('environment')]

@@ -183,7 +183,7 @@ def test_six_faces_leave_misalignment_at_its_prior():
 
 
 def test_the_claimed_sd_of_nine_positions_includes_turn_on_offsets(rng):
-    # WHY: nine constants fit nine norms exactly, whatever the offsets, and the claimed sd of the
+    # WHY: nine constants fit nine |f| exactly, whatever the offsets, and the claimed sd of the
     # constants was 3 to 5 times too small.
     turn_ons = PLAIN.scale_factor * rng.normal(0.0, 50e-6 * STANDARD_GRAVITY, (9, 3))
     records = records_of(PLAIN, positions(9, 1), 1)
@@ -261,7 +261,7 @@ def test_counts_of_24_bits_that_a_driver_averages_are_fitted(n_averaged, rng):
 
 @pytest.mark.slow
 def test_misalignments_of_a_mems_unit_are_determined_by_nine_positions():
-    # WHY: mounting offsets of 5 mg fit nine positions' norms as well as misalignments do.
+    # WHY: mounting offsets of 5 mg fit |f| in nine positions as well as misalignments do.
     unit = unit_preset('mems', 0).with_thermometers(rate_hz=0.25)
     records = arrays(unit, plan('chamber-9'), 0, rate_hz=1.0)
     # A fit with only the groups of the simulated unit takes half the time.

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Even effects of T_case - T_board are symmetric about its value in a soak (self-heating)."""
+"""Effects even in T_case - T_board are symmetric about its value in a soak (self-heating)."""
 
 from itertools import pairwise
 

@@ -161,9 +161,9 @@ def score(drift, norms=(), by_thermometer=0.0):
 
 
 def test_few_norms_that_both_models_predict_do_not_select_the_model():
-    # WHY: a MEMS was recorded in six faces at three temperatures. Only four left-out values of |f|
-    # could be predicted both with and without a curve over temperature. As the curve reduced the
-    # four errors by less than two standard errors, the fit rejected it: the force error was 7 mg.
+    # WHY: for a MEMS in six faces at three temperatures only four left-out values of |f| could be
+    # predicted both with and without a curve over temperature. The fit rejected the curve, which
+    # reduced the four errors of |f| by less than two standard errors: the force error was 7 mg.
     constants = score(20.0, [22.4, 457.7, 54.6, 26.1])
     curve = score(20.0, [16.8, 21.0, 22.5, 25.2])
     assert not is_better(constants, curve)
@@ -179,11 +179,11 @@ def test_a_larger_model_must_not_explain_the_errors_of_a_coarse_thermometer():
     curve, parts, bends = (score(drift, (), by_thermometer) for drift in (120.0, 46.0, 20.0))
     assert is_better(curve, parts)
     assert not is_better(parts, bends)
-    # The curve is chosen if it reduces errors of |f| larger than the thermometer's, 49 ug.
+    # The curve is chosen if it reduces errors of |f| above those by the thermometer, 49 ug.
     flat, curved = (score(46.0, size * np.ones(9), by_thermometer) for size in (3000.0, 60.0))
     assert is_better(flat, curved)
     assert not is_better(curved, score(20.0, 30.0 * np.ones(9), by_thermometer))
-    # If the thermometer causes 5 ug, a fall of the left-out drift from 46 to 20 ug is significant.
+    # For thermometer errors of 5 ug a fall of the left-out drift from 46 to 20 ug is significant.
     assert is_better(score(46.0, (), 5.0), score(20.0, (), 5.0))
 
 

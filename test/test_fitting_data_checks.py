@@ -123,7 +123,7 @@ def test_rests_at_room_temperature_are_sufficient_with_a_prior_of_the_unit(good)
     warm = replace(desk, temperature=desk.temperature + 20.0)
     advised = findings_of(warm, up, prior=prior)['span']
     assert (advised.level, 'the bags reach 42 to 4' in advised.message) == ('advice', True)
-    # With a prior of the type of unit, not of this unit, a chamber test is advised.
+    # If the prior is from other units of the type, not from this unit, a chamber test is advised.
     of_type = replace(prior, provenance=replace(prior.provenance, model='population'))
     assert {'span', 'ramps'} <= {*findings_of(desk, up, prior=of_type)}
 
@@ -148,7 +148,7 @@ def test_six_faces_do_not_determine_the_misalignment(good):
 
 
 def test_geometry_is_the_largest_sd_of_nine_parameters_per_sd_of_the_norm(rng):
-    # Expected: sd of nine parameters fitted by least squares to norms with noise of 1 (1 sd).
+    # Expected: sd of nine parameters fitted by least squares to values of |f| with an sd of 1.
     up = positions(12, 5)
     x, y, z = up.T
     jacobian = np.column_stack((x, y, z, x * x, y * y, z * z, x * y, x * z, y * z))

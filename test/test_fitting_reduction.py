@@ -64,7 +64,7 @@ def test_the_reduction_does_not_depend_on_how_samples_are_divided_into_blocks(rn
         other = reduced(split(whole, n_parts))
         for a, b in zip(at_once.intervals, other.intervals, strict=True):
             np.testing.assert_array_equal(a.count, b.count)
-            # The order of additions, and therefore the rounding, depends on the blocks.
+            # The order of additions, and so the rounding, depends on the size of the blocks.
             np.testing.assert_allclose(a.mean, b.mean, rtol=1e-13, atol=1e-11)
             np.testing.assert_allclose(a.time, b.time, rtol=1e-12)
         np.testing.assert_array_equal(at_once.board.value, other.board.value)
@@ -297,7 +297,7 @@ def test_a_gravity_not_found_on_earth_is_refused(gravity):
 
 
 def soak_ramp_soak(quantum, noise, rng):
-    # Three hours at 1 Hz: a soak, a ramp of 1 K/min after a lag of 300 s, and a soak.
+    # A thermometer lags the air by 300 s: 3 h at 1 Hz, a soak, a ramp of 1 K/min, a soak.
     time = np.arange(0.0, 10800.0)
     air = np.interp(time, [0.0, 3600.0, 5400.0], [5.0, 5.0, 35.0])
     celsius = np.empty_like(air)

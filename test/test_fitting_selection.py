@@ -38,7 +38,7 @@ IDLE = np.array(GROUPS) == 'idle'
 
 
 def constants(truth):
-    """Return an initial prior without columns, whose noise parameters are not the true ones."""
+    """Return an initial prior with wrong noise parameters, in which all columns have sd 0."""
     return prior_of(
         truth, (), offset_sd=MICRO, offset_scale=30.0 * MICRO, sigma=np.full(3, 5.0 * MICRO),
         noise=Noise(), misalignment_sd=1e-3,
@@ -179,7 +179,7 @@ def test_rounding_removes_no_correlation_time_from_the_search():
 
 def test_the_estimated_prior_sd_of_a_column_is_the_rms_of_its_true_weights(calm):
     # Prior variance of a column: sum of its squared weights / 3 effective parameters. A hyperprior
-    # with an sd of ln 10 moves ln sd to its centre by 1 / (2 x 3 x 5.3) of the distance.
+    # of variance (ln 10)^2 = 5.3 moves ln sd 1 / (2 x 3 x 5.3) of the way to its centre.
     regression, chosen, truth = calm
     true = np.sqrt(np.mean((truth.on_bias * regression.rms) ** 2, axis=0))
     np.testing.assert_allclose(chosen.posterior.prior.column_sd[0, :4], true[:4], rtol=0.25)
@@ -213,7 +213,7 @@ def test_errors_of_fitted_parameters_in_claimed_sd_have_an_rms_near_1(noisy):
 
 
 def test_the_bayes_factor_of_a_group_is_the_loss_of_evidence_if_the_group_is_removed():
-    # In linear problems the Savage-Dickey ratio is the loss of evidence; directions are nonlinear.
+    # The Savage-Dickey ratio equals the loss of evidence, but for the nonlinearity of attitudes.
     truth = Truth()
     windows, up = table_of(truth, 12, np.random.default_rng(8))
     regression, state = begin(without_starts(windows), up)
@@ -378,7 +378,7 @@ def test_thermal_tilts_of_supports_are_separated_from_the_drift_of_the_unit():
     chosen, left = drift_left(windows)
     # 12 positions with 2 angles and 2 columns each determine the sd of tilts to 10 %.
     assert 0.7 < chosen.posterior.prior.tilt_sd / truth.tilt_sd < 1.3
-    # A tilt of 5 urad changes a level axis by 5 ug; 720 windows give weights to 0.1 ug.
+    # A tilt of 5 urad changes a level axis by 5 ug; 720 windows determine the drift to 0.1 ug.
     assert left < 0.5 * MICRO
     assert drift_left(stiff)[1] > 1.0 * MICRO
 
@@ -416,7 +416,7 @@ def test_the_sd_of_gravity_adds_a_common_error_to_all_scale_factors():
 
 
 def test_the_drift_of_scale_factors_determines_the_sd_of_turn_on_offsets():
-    # WHY: nine constants fit the norms of nine positions exactly, so the estimated offset sd was
+    # WHY: nine constants fit |f| of nine positions exactly, so the estimated offset sd was
     # 5 ug instead of 300 ug, and the constants were wrong by 75 claimed sd.
     truth = Truth(
         offset_sd=300.0 * MICRO,
@@ -428,8 +428,8 @@ def test_the_drift_of_scale_factors_determines_the_sd_of_turn_on_offsets():
     candidates = candidates_of(windows, ('curve', 'board'))
     candidates = replace(candidates, typical=candidates.typical * ~IDLE)
     posterior = select(regression, state, constants(truth), candidates).posterior
-    # The drift of |f| with the scale factors determines 18 of 27 combinations of offsets; 9 equal
-    # changes of constants. 18 numbers determine their sd to 1 / sqrt(2 * 18), 17 %.
+    # As scale factors change, |f| determines 18 of 27 combinations of offsets; 9 act like changes
+    # of the nine constants. 18 numbers determine their sd to 1 / sqrt(2 * 18), 17 %.
     assert posterior.prior.offset_sd == pytest.approx(300.0 * MICRO, rel=0.5)
     for errors in truth.errors(regression, posterior).values():
         # The RMS of three standard normal errors exceeds 2 with a probability of 0.7 %.

@@ -123,8 +123,8 @@ def test_columns_of_sets_and_of_initial_lag_states_agree_with_formulas(bags):
     np.testing.assert_allclose(data.columns[:, 1], t * t, atol=0.3)
     np.testing.assert_allclose(data.columns[:, 3], w, atol=1e-9)
     assert data.in_scale[:6].tolist() == [True, True, True, False, True, True]
-    # An initial state of a lag decays with the time constant of the lag; the column of a product
-    # with t decays as t times the same function.
+    # An initial lag state decays with the time constant of the lag, the column of a product of
+    # this lag and t as t times the same exponential.
     taus = [lag.tau_s for lag in memory_of(bank()).lags]
     for k, column in enumerate(bank(), start=6):
         lag = data.lag[k]
@@ -297,7 +297,7 @@ def test_sections_and_kelvins_of_columns_agree_with_formulas(bags):
         assert (np.diff(section) >= 0).all()
         assert np.ptp(np.bincount(section, minlength=N_SECTIONS)) <= 2
     rms = np.sqrt(np.mean(data.columns**2, axis=0))
-    # `kelvins`: RMS of a column / its largest slope over t (slope of t: 1, of t^2: 2 max |t|).
+    # `kelvins`: RMS of a column divided by its largest slope over t: 1 for t, 2 max |t| for t^2.
     lines = [0, *(k for k, column in enumerate(bank(), start=6) if column.group == 'board')]
     np.testing.assert_allclose(data.kelvins[lines], rms[lines], rtol=1e-6)
     assert data.kelvins[1] == pytest.approx(rms[1] / (2.0 * np.abs(t).max()), rel=0.02)

@@ -17,7 +17,7 @@ TAUS = (60.0, 900.0, 7680.0)
 
 @pytest.mark.parametrize('step_s', [0.5, 5.0, 77.0])
 def test_the_lag_of_a_ramp_agrees_with_the_closed_formula(step_s):
-    # For a ramp u = r t after a soak, u - lagged u = r tau (1 - exp(-t / tau)), at any interval.
+    # For a ramp u = r t after a soak, u - lagged u = r tau (1 - exp(-t / tau)), for any step.
     rate, n = 0.01, 200
     bank = LagBank(TAUS)
     for k in range(n + 1):
@@ -114,7 +114,7 @@ def test_the_lag_of_a_part_coupled_to_board_and_case_agrees_with_a_solver(rng):
     np.testing.assert_allclose(board - streamed[:, 0], part, atol=1e-5)
     on_grid = memory_on_grid(spec, 30.0, board, [case - board])
     np.testing.assert_allclose(on_grid[:, [0, 2, 4]], streamed[:, [0, 2, 4]], atol=1e-9)
-    # The case's lag contributes to the part's lag with a negative sign.
+    # The lagged gradient contributes to the part's lag with a negative sign: covariance < 0.
     P = start_covariance(spec.lags)
     assert P[0, 1] < 0.0 < P[0, 0] + 2.0 * P[0, 1] + P[1, 1]
     # The age of a lag with two inputs counts from the first value of the later input.
@@ -181,8 +181,8 @@ def test_a_jump_gives_a_lag_of_two_stages_the_errors_of_both_stages():
     memory = ThermalMemory(MemorySpec(lags=(TWO_STAGES,)))
     memory.board_step(0, 0.0)
     memory.note_jump(2.0)
-    # The lag is a difference of two first-order lags: (900 * lag_900 - 150 * lag_150) / 750. Both
-    # first-order lags may have errors of opposite signs: 1.4 = (900 + 150) / (900 - 150).
+    # The lag is a difference of two first-order lags: (900 * lag_900 - 150 * lag_150) / 750.
+    # Errors of +2 K in lag_900 and -2 K in lag_150 give an error of 2 K * 1.4: 1.4 = 1050 / 750.
     assert memory.at(0, 0.0, [0.0])[1] == pytest.approx((2.0 * 1.4) ** 2)
 
 

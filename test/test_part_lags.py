@@ -136,7 +136,7 @@ def test_lags_of_the_thermometers_themselves_are_fitted(sensors):
     parts = {term.part for term in calibration.response if term.kind == 'board'}
     taus, _, shares, leads = np.array(sorted(parts)).T
     if 'case' in sensors:
-        # Equal lags of both thermometers act like equal shares of the case in all parts' inputs.
+        # If both thermometers lag equally, the case has an equal share in the inputs of all parts.
         assert shares == pytest.approx([np.mean(shares)] * 3, abs=0.02)
     else:
         assert taus == pytest.approx(unit.part_s, rel=0.02)
@@ -229,19 +229,19 @@ def test_the_lags_of_parts_are_found_beside_an_effect_of_the_gradient():
 
 @pytest.mark.slow
 def test_a_bump_of_the_bias_over_temperature_is_fitted_by_knees():
-    # The bump lasts for two means over 60 s, and must not be taken for motion.
+    # The bump of the bias lasts for 2 min, and must not be taken for motion.
     _, study = study_of('bump', bump=np.array([450.0, -400.0, 500.0]), bump_c=17.0)
     # Stating the three groups makes the fit three times as fast as a choice among all groups.
     calibration = strangers.fitted(study, groups=('curve', 'part', 'bend'))
     judgement = judged(calibration, study)
-    # The bump is a bell curve (sd 0.85 K); the fit is made of straight lines of 0.5 K.
+    # The bump is a bell curve (sd 0.85 K), which the fit approximates by straight lines of 0.5 K.
     assert judgement.norm < 60.0
     assert judgement.norm_ratio < 1.5
 
 
 @pytest.mark.slow
 def test_two_lags_in_series_are_fitted_as_two_stages():
-    # Heads lag the board and pendulums lag the heads; T_board - T_pendulum changes the bias.
+    # Sensor heads lag the board, pendulums lag the heads; T_board - T_pendulum changes the bias.
     unit = second_simulator.unit_of('products', 2)
     # Two equal time constants are fitted as two time constants with a ratio of 0.89.
     unit.pendulum_s[0] = unit.head_s[0]
@@ -283,8 +283,8 @@ def test_norms_of_soaks_determine_the_curve_over_temperature(grade):
 
 @pytest.mark.slow
 def test_six_faces_in_three_soaks_determine_the_curve_at_other_temperatures():
-    # WHY: a fit to norms of six faces found misalignments of 0.3 rad (true: 0): the force error
-    # was 40 mg for drifts of 10 mg. With a stated `mounting_sd` the fit divided by zero.
+    # WHY: a fit to |f| on six faces found misalignments of 0.3 rad (true: 0): the force error
+    # was 40 mg, the unit's drift 10 mg. With a stated `mounting_sd` the fit divided by zero.
     _, study = study_of(
         'faces in soaks', 1, up=FACES.repeat(3, axis=0), corners=SOAKS, held=program(19.0, 90.0),
         grade=lambda rng: replace(consumer_grade(rng), misalignment=np.zeros(3)),
@@ -297,8 +297,8 @@ def test_six_faces_in_three_soaks_determine_the_curve_at_other_temperatures():
 
 @pytest.mark.slow
 def test_the_claimed_sd_between_two_soaks_includes_the_undetermined_curve():
-    # WHY: soaks at two temperatures do not determine powers of temperature. The covariance lacked
-    # the uncertainty of these powers, and the claimed sd was 1/8 of the error.
+    # WHY: soaks at two temperatures do not determine a curve over temperature. The covariance
+    # lacked the uncertainty of its curvature, and the claimed sd was 1/8 of the error.
     given = {'held': program(19.0, 90.0), 'grade': consumer_grade}
     _, study = study_of('two soaks', up=18, corners=SOAKS[::2], **given)
     assert judged(strangers.fitted(study), study).ratio < 2.0

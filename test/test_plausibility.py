@@ -35,7 +35,7 @@ def tracker_of(sensor='continuous', memory=None, board_lag_s=900.0, **config):
 
 
 def soak(tracker, celsius=20.0, seconds=60, start_s=0):
-    """Push readings of both sensors each second, alternating by some mK; return the end time."""
+    """Give both thermometers a reading per second, alternating by some mK; return the end [s]."""
     for second in range(start_s, start_s + seconds):
         flicker = 0.004 * (-1) ** second
         tracker.read('board', second * SECOND_NS, celsius + flicker)

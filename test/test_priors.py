@@ -87,9 +87,9 @@ def test_a_population_has_the_mean_of_its_units_and_their_scatter():
     variance = np.diag(prior.posterior.covariance())
     at = parameter_layout(prior).bias[0].static + 1
     sd = np.sqrt(variance[at]) / prior.axes.x.scale_factor
-    # Predicted variance of a fourth unit: 4/3 of the scatter of three units, mean over the axes,
-    # times 6 / (6 - 2) for Student's distribution with 6 degrees of freedom, plus the variance
-    # claimed by the calibrations of the three units.
+    # Expected variance of a fourth unit: 4/3 of the variance of three units (mean over the axes)
+    # times 6 / (6 - 2), for Student's distribution with 6 degrees of freedom, plus the claimed
+    # variance of the three units.
     own = []
     for unit in siblings():
         variance = np.diag(unit.posterior.covariance())
@@ -221,8 +221,8 @@ def test_rests_at_one_temperature_correct_a_bias_change_and_keep_the_response():
         for calibration, changed in ((old, lambda record: record), (old, aged), (new, aged))
     ]
     assert left[1] > 10.0 * left[0]
-    # In a rest of 10 min the unknown initial state of a lag of 1 h acts like a bias. Six norms
-    # give three biases an sd of 10 ug, or of 20 ug if they also determine three scale factors.
+    # In a rest of 10 min the unknown initial state of a lag of 1 h acts like a bias. Six means
+    # of |f| determine three biases to 10 ug (1 sd), or to 20 ug if also three scale factors.
     sd = float(sd_of_levels(new).max())
     assert sd < 20e-6 * STANDARD_GRAVITY
     assert left[2] < np.hypot(left[0], sd)
@@ -259,7 +259,7 @@ def test_one_to_three_faces_of_an_unchanged_unit_keep_the_calibration(n_faces):
 @pytest.mark.parametrize('kind', ['bias', 'scale'])
 def test_three_faces_halve_the_error_of_a_change_of_bias_or_scale(kind):
     # WHY: an update with three faces took a bias change of 100 ug for mounting offsets.
-    # WHAT: in each face one count, 300 ug, is added by a change of the bias or of the scale.
+    # WHAT: the bias or the scale changes so that each face reads 1 count (300 ug) more or less.
     K = np.array([axis.scale_factor for axis in fitted(9).calibration.axes])
     change = np.array([1.0, -1.0, 1.0]) / (K * STANDARD_GRAVITY)
 

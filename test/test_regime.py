@@ -46,7 +46,7 @@ def case_and_board(t, corners, lag=LAG_S, start=20.0):
 
 
 def onsets(noise, quantum, rate_k_min, lag, n, *, dt=1.0, end_s=1500.0, soak_s=1500.0):
-    """Run n ramps; return regime switches after each onset, and the number static at onset."""
+    """Run n ramps; return regime switches after each onset, and how many were static before."""
     settings = detector_settings(noise, quantum, lag)
     collected, n_static = [], 0
     for seed in range(n):
@@ -94,8 +94,8 @@ def test_the_onset_of_a_ramp_is_detected_early(headline, sensor, median_s, late_
 
 @pytest.mark.parametrize(('sensor', 'threshold'), [('1 mK', 9.65), ('10 mK', 8.87)])
 def test_the_onset_delay_is_below_twice_that_of_a_cusum_test(headline, sensor, threshold):
-    # A CUSUM test that is given ramp, baseline and noise has the shortest delay; docs/regime.md
-    # has its thresholds (log likelihood ratios) for one false alarm in 50 h.
+    # A CUSUM test that knows ramp, baseline and noise has the shortest delay. `threshold`: its log
+    # likelihood ratio for one false alarm in 50 h, from docs/regime.md.
     noise = SENSORS[sensor][0]
     rng = np.random.default_rng(4)
     k = np.arange(1.0, 121.0)
@@ -210,7 +210,7 @@ def test_the_threshold_follows_from_the_noise_of_the_filter(dt):
         noise = 1e-4 * np.sum(response**2)
         correlation = np.sum(response[1:] * response[:-1]) / np.sum(response**2)
         per_reading = math.acos(correlation) / (2.0 * math.pi)
-        allowed = 0.02 / 3600.0 / 4.0 * dt  # alarms per reading, filter and sign
+        allowed = 0.02 / 3600.0 / 4.0 * dt  # false alarms per reading, filter and sign
         squared = 2.0 * math.log(per_reading / allowed)
         assert threshold * covariance[1, 1] == pytest.approx(squared * noise, rel=0.04)
 
@@ -259,7 +259,7 @@ def test_the_relaxed_rate_sets_the_end_of_the_dynamic_regime():
         switches(detector_settings(0.001, relaxed_rate_k_min=rate), t, case, board)[-1][0]
         for rate in (0.025, 0.05, 0.1)
     ]
-    # Halving the relaxed rate delays the end by LAG_S * ln 2, with the longest lag LAG_S.
+    # If the relaxed rate is halved, the dynamic regime ends later by LAG_S (longest lag) * ln 2.
     assert ends[0] - ends[1] == pytest.approx(LAG_S * math.log(2.0), rel=0.25)
     assert ends[1] - ends[2] == pytest.approx(LAG_S * math.log(2.0), rel=0.25)
 
@@ -287,8 +287,8 @@ def test_the_dynamic_regime_ends_by_the_case_or_the_board(sensor):
     assert [regime for _, regime, _ in early] == [STATIC, DYNAMIC, STATIC]
     assert early[1] == late[1]
     assert late[2][0] - early[2][0] == pytest.approx(earlier, abs=300.0)
-    # The end condition `case` acts like a missing board thermometer; without a case thermometer
-    # both end conditions use the board thermometer.
+    # With the end condition 'case' the regime switches as without a board thermometer. Without a
+    # case thermometer both end conditions use the board thermometer.
     assert early == switches(board_too, t, case, None)
     t, board = t[:3000], board[:3000]
     assert switches(case_alone, t, None, board) == switches(board_too, t, None, board)

@@ -147,7 +147,7 @@ def test_motion_and_bad_samples_are_not_logged_as_rests(fault):
 
 
 def test_a_long_rest_is_logged_with_increasing_intervals():
-    # A rest is logged by 60 windows in its first 10 min, one per min up to 1 h, then one in 5 min.
+    # A rest is logged by 60 windows in its first 10 min, 1 per min up to 1 h, then 1 per 5 min.
     kept, searching = 0, finder()
     samples = standing(6 * 60)
     for minute in range(71):

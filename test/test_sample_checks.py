@@ -278,7 +278,7 @@ def test_a_jump_back_in_time_does_not_restore_a_refuted_calibration(rng, is_mend
     stream(compensator, events(0.0 if is_mended else 100.0))
     assert compensator.counters.n_time_jumps == 1
     if is_mended:
-        # The first window of 5 s has no predecessor to compare with; the next two restore output.
+        # The first window of 5 s has no predecessor to compare with; two more restore the output.
         assert compensator.counters.n_out - n_out == pytest.approx(4500, abs=200)
     else:
         assert compensator.counters.n_out == n_out
@@ -347,8 +347,8 @@ def steps(rng, *, offset, at_s=20.0, ramp_s=0.0, rate_hz=2.5, scatter=0.0):
 @pytest.mark.parametrize('rate_hz', [2.5, 5.0, 10.0])
 @pytest.mark.parametrize('offset', [0.3, -3.0, 15.0])
 def test_a_step_at_rest_refutes_the_calibration_within_a_second(rng, rate_hz, offset):
-    # WHY: the refusal came after five seconds, and its printed mean included samples before the
-    # change.
+    # WHY: a calibration was refused only 5 s after the step, and the printed mean of |f| included
+    # samples before the step.
     after_s, result = steps(rng, offset=offset, rate_hz=rate_hz)
     assert after_s < 1.0
     assert result.residual == pytest.approx(offset, abs=5 * NOISE_SD)

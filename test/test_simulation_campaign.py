@@ -225,7 +225,7 @@ def test_the_sum_of_counts_of_a_day_at_100_hz_is_exact_to_one_count():
         total += int(counts.sum())
         n_cycles += len(counts)
     exact = n_cycles * Fraction(8935, 3)
-    # The remainder has steps of 2^-40 counts; in 8.8e6 cycles the rounding adds up to 8e-6 counts.
+    # The charge has steps of 2^-40 counts, whose rounding adds up to 8e-6 counts in 8.8e6 cycles.
     assert abs(total - exact) < 1 + 1e-4
 
 

@@ -108,7 +108,7 @@ def test_simulated_white_noise_has_the_stated_density(unit):
     frequency, power = welch(accel, fs=50.0, nperseg=16384, axis=0)
     # With a carried remainder, rounding noise rises with f^2, to 1 (ug)^2/Hz at f = 0.4 Hz.
     band = (frequency > 0.01) & (frequency < 0.4)
-    # The mean of 128 lines, each a mean over 86 half-overlapping segments, is uncertain by 1 %.
+    # The mean of 128 spectral lines, each from 86 half-overlapping segments, is uncertain by 1 %.
     np.testing.assert_allclose(
         power[band].mean(axis=0), 2.0 * np.array(unit.noise_density) ** 2, rtol=0.05
     )

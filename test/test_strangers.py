@@ -89,7 +89,7 @@ def test_simulated_samples_have_the_stated_noise_bias_scale_and_misalignment():
     n = len(error)
     sd = 5.0 * UG * np.sqrt(0.5)
     assert np.abs(error.mean(axis=0)).max() < 4.0 * sd / np.sqrt(n)
-    # The sd of n errors is uncertain by 1 / sqrt(2 n); division by 1 + gain changes it by 3 %.
+    # The sd of n errors is uncertain by 1 / sqrt(2 n); scale errors change this sd by up to 3 %.
     assert error.std(axis=0) == pytest.approx([sd] * 3, rel=0.03 + 4.0 / np.sqrt(2 * n))
 
 
@@ -109,7 +109,7 @@ def test_a_cold_start_begins_at_the_temperature_of_the_air():
     warm = record(given, cases.FROST, LEVEL, rng_of('cold'))
     for bag, heat in ((cold, 0.0), (warm, 2.0)):
         board, case = bag.temperatures['board'][1][0], bag.temperatures['case'][1][0]
-        # The tolerance allows for the chamber's ripple, 0.03 K, and self-heating within 0.3 s.
+        # Tolerance: chamber's ripple, 0.03 K, and self-heating up to the first reading, at 0.3 s.
         assert board - case == pytest.approx(heat, abs=0.1)
 
 
@@ -131,7 +131,7 @@ def test_flicker_noise_has_a_flat_allan_deviation():
 
 @pytest.fixture
 def recorded(monkeypatch):
-    """Replace `record` by a stub; return a function from a bag to the arguments of its record."""
+    """Replace `record` by a stub; return a function that gives the arguments of a bag's call."""
     notes = {}
 
     def note(given, corners, up, rng, *, name='bag', **keys):

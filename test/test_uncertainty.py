@@ -98,7 +98,7 @@ def test_beyond_1_g_the_covariance_includes_an_unknown_k2():
 @pytest.mark.parametrize('fault', ['both stand still', 'swapped topics'])
 def test_the_claimed_sd_covers_thermometer_errors_for_parts_that_lag_the_board(fault):
     # WHY: the claimed sd lacked the effect of lasting errors of the board temperature. The bias
-    # depends on a part that lags the board by 10 min, so a short error hardly changes the output.
+    # depends on a part that lags the board by 10 min, so only lasting errors of T_board matter.
     per_kelvin, axis = 30.0, axis_set((0.0, 30.0))
     part = term('board', (-per_kelvin, 0.0, 0.0), tau_s=600.0)
     parts = regime_set(x=axis, rate_range_k_min=(-5.0, 5.0))
@@ -159,7 +159,7 @@ def test_a_state_beyond_the_edge_of_a_column_is_limited_and_increases_the_sd():
 
 
 def sd_at(unit, board, behind=0.0, force=0.0):
-    """Return the claimed sd of x in a soak, without noise; `behind`: lag of parts [K]."""
+    """Return the x axis' claimed sd in a soak, without noise; `behind`: lag of parts [K]."""
     correction = Correction(unit)
     layout = StateLayout(correction.memory)
     state = [0.0] * layout.width
@@ -172,8 +172,8 @@ def sd_at(unit, board, behind=0.0, force=0.0):
 
 
 def test_beyond_the_range_curve_and_lag_do_not_cancel_in_the_claimed_sd():
-    # Inside the range the slopes of curve and lag over board temperature cancel; outside of it
-    # their sum is not known, and the claimed sd is that of the curve.
+    # The slopes of curve and lag over board temperature cancel inside the range. Their sum outside
+    # of the range is unknown, so that the claimed sd is that of the curve alone.
     bias = axis_set((0.0, 0.5), residual_sd_m_s2=1e-6)
     unit = calibration(
         static=regime_set(bias), dynamic=regime_set(bias),
@@ -230,7 +230,7 @@ def test_outside_its_range_a_set_follows_the_curve_of_the_other_set():
     )
     celsius = [-20.0, -7.5, -3.0, 0.0, 5.0, 30.0, 35.0, 38.0, 42.5, 60.0]
     static, dynamic = curves_at(unit, celsius)[:, 0]
-    # Outside the common range, 5 to 30 degC, both sets differ by as much as at its edge.
+    # Beyond an end of the common range, 5 to 30 degC, the sets differ by as much as at this end.
     np.testing.assert_allclose((dynamic - static)[:5], dynamic[4] - static[4], rtol=1e-12)
     np.testing.assert_allclose((dynamic - static)[5:], dynamic[5] - static[5], rtol=1e-12)
     wavy, bent = np.polynomial.Polynomial(WAVY), np.polynomial.Polynomial(BENT)
@@ -301,14 +301,14 @@ def test_with_lags_the_sd_in_a_ramp_does_not_depend_on_the_calibrated_rates():
         state[BOARD], state[RATE] = 20.0, 2.0 / 60.0
         line = correction.line(state, state, np.zeros(N_ROWS), 0.0)
         sds.append(math.sqrt(line[VARIANCES[0]] - correction.noise[0]))
-    # The ramp is 19 half ranges beyond the calibrated rates: the unit without lags gets additional
-    # variance, the unit with a lag does not.
+    # The rate, 2 K/min, is 19 times 0.1 K/min beyond the calibrated rates of up to 0.1 K/min: only
+    # the unit without lags gets additional variance.
     assert sds == pytest.approx([1e-5 * math.hypot(1.0, 19.0), 1e-5], rel=1e-6)
 
 
 def test_the_distance_of_a_squared_column_from_its_range_is_that_of_its_quantity():
     # WHY: a lag of 10 K is 100 times the range of the bags, 0.1 K; the square of the lag is 10000
-    # times its range. The claimed sd was 0.1 g, that for a distance of 10000 ranges.
+    # times its range. With the distance taken as 10000 ranges, the sd was 0.1 g.
     unit = calibration(response=(term('square', (1.0, 0.0, 0.0), tau_s=600.0, range=(0.0, 0.01)),))
     correction = Correction(unit)
     state = np.zeros(StateLayout(correction.memory).width)

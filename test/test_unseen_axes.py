@@ -134,7 +134,7 @@ def test_rests_in_one_pose_at_four_temperatures_determine_the_drift_of_level_axe
     drift = force - strangers.minutes(held).force
     drift -= np.nanmean(drift, axis=0)
     # Attitude errors of 0.2 mrad RMS in the rests cause errors of about 0.2 mg in the bias curve
-    # of a level axis. The tolerance is two sd of these errors, 0.4 mg.
+    # of a level axis. The tolerance is 0.4 mg, two sd of the error of this bias curve.
     assert np.sqrt(np.nanmean(drift**2)) < 2.0 * 2e-4 * GRAVITY
 
 
