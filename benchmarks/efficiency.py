@@ -28,7 +28,7 @@ def exact_unit(seed: int) -> UnitModel:
     """
     Make a unit whose bias and scale are quadratics of the board's temperature alone.
 
-    A calibration's constants are those without heat flow. The unit has no self-heating, so soaks
+    A calibration states its constants for zero heat flow. The unit has no self-heating, so soaks
     have no heat flow, and the bound needs no extrapolation.
     """
     rng = np.random.default_rng(seed)

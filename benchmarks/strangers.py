@@ -205,8 +205,8 @@ def bias_score(calibration: thermo_comp.Calibration, study: Study) -> Score:
     bag = Bag('zero', time_s, zero, temperatures)
     out = corrected(calibration, bag, config)
     error = out.force[len(out.force) // 2 :].mean(axis=0)
-    # The Cramer-Rao bound does not include thermometer noise and turn-ons: subtract their
-    # variance, which is all that a calibration without a posterior claims.
+    # The Cramer-Rao bound does not include thermometer noise and turn-ons: subtract the variance
+    # that a calibration without a posterior claims, which contains only these two.
     exact = corrected(replace(calibration, posterior=None), bag, config)
     sd = np.sqrt(np.maximum(np.diag(out.claim[-1] - exact.claim[-1]), 0.0))
     return Score(
@@ -222,8 +222,8 @@ def without_constants(calibration: thermo_comp.Calibration) -> thermo_comp.Calib
     Return a calibration in whose posterior bias, scale and misalignment have no variance.
 
     A single pose determines bias and scale to 50 mg only. The drift in a pose does not depend on
-    the constants, but the differences of claimed variances do: each contains ``a^2`` times the
-    variance of the scale factor, with the noise of the acceleration `a`.
+    these constants, but the claimed variance contains ``a^2`` times the variance of the scale
+    factor, and thereby changes with the noise of the acceleration `a`.
     """
     if calibration.posterior is None:
         return calibration

@@ -249,9 +249,9 @@ def network(unit: Unit, environment: Environment = CHAMBER) -> tuple[Floats, Flo
 
 
 def integrate(A: Floats, b: Floats, h: Floats, air: Floats, step_s: float, x: Floats) -> Floats:
-    """Integrate the network from the state `x`, exactly for air that is linear between steps."""
+    """Integrate the network from state `x`, exactly for an air temperature linear in a step."""
     n = len(b)
-    # Extended state: the nodes, the air, the slope of the air, and 1 for the self-heating.
+    # Extended state: temperatures of nodes and air, slope of the air, and 1 for self-heating.
     whole = np.zeros((n + 3, n + 3))
     whole[:n, :n], whole[:n, n], whole[:n, n + 2] = A, b, h
     whole[n, n + 1] = 1.0
