@@ -30,7 +30,7 @@ from regime_scenes import SENSORS, Scene, known_signature_delays, read, temperat
 from thermo_comp.thermal.regime import Regime
 
 SOAK_H = 5.0
-# Number of ramps per scene, by the rate of the readings [Hz], to which run time is proportional.
+# Number of ramps per scene by the rate of the readings [Hz]; run time is proportional to the rate.
 RAMPS = {10.0: 1, 1.0: 6, 0.1: 10}
 
 Rows = list[list[str]]

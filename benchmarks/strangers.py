@@ -334,7 +334,7 @@ def run_case(
         seen = Counter[str]()
         for study in studies:
             if not label or study.label == label or study.label in needed:
-                # Studies with equal labels hold out different bags; each is counted as a unit.
+                # Studies with equal labels hold out different bags; each study counts as a unit.
                 number = unit + seen[study.label]
                 seen[study.label] += 1
                 print(f'{case} {study.label}, unit {number}', file=sys.stderr, flush=True)

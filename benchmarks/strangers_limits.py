@@ -43,7 +43,7 @@ class Score:
 @dataclass(frozen=True)
 class Result:
     """
-    The scores of a unit, a study and a set of held-out bags.
+    Scores of all models for a unit, a study and a set of held-out bags.
 
     Parameters
     ----------
@@ -121,8 +121,8 @@ LIMITS = {
     'plain': Limit(norm=1.3, vector=2.0, low=0.7, high=1.4),
     'one-pose: own bag': Limit(vector=2.0, low=0.7, high=1.4),
     'one-pose: other program': Limit(vector=5.0, low=0.7, high=1.4),
-    # `score` subtracts a bag's smallest claimed variance. In 'returned' it contains the variance
-    # of a slope over temperature: error / claimed sd of the drift has no meaning and no limit.
+    # `score` subtracts the smallest claimed variance of a bag, in 'returned' also the variance of
+    # a slope over temperature, so that error / claimed sd has no meaning and no limit.
     'returned': Limit(high=np.inf),
     'soaks': Limit(low=0.5, high=1.5, claim=3.0),
     'turn-on': _TURN_ON,
