@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the errors of bias and scale divided by the Cramer-Rao bound, for docs/accuracy.md.
+Computes errors of bias and scale divided by the Cramer-Rao bound, for docs/accuracy.md.
 
 Run ``python benchmarks/efficiency.py``, or with fewer units: ``--units 10``.
 """

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the cost of fitting a fleet: speed-up by workers, overhead of the scheduler, network traffic,
-and results lost when workers are killed.
+Measures the cost of fitting a fleet: speed-up by workers, overhead of the scheduler, network
+traffic, and results lost when workers are killed.
 
 Units are simulated and written to bags once (``--folder`` keeps the bags), and fitted as in the
 command `fleet fit`, whose workers are processes of one thread.

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the figures of docs/regime.md: the regime detector in simulated ramps and soaks.
+Prints the figures of docs/regime.md: the regime detector in simulated ramps and soaks.
 
 A ramp of a chamber, with control ripple and a drift by self-heating, changes the temperatures of a
 case (first-order lag of the chamber) and of a board (first-order lag of the case). Sensors of

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the runs of benchmarks/regime.py: the detector over ramps and soaks, and its cost.
+Runs the detector over ramps and soaks, and measures its CPU time, for benchmarks/regime.py.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the errors of fits to bags of units whose physics the package does not model, compared with
-the errors of curves that scipy fits.
+Compares errors of fits to bags of units whose physics the package does not model with the errors
+of curves that scipy fits.
 
 Run ``python benchmarks/strangers.py`` for every case (many hours), or some cases with fewer units:
 ``python benchmarks/strangers.py --cases kink,soaks --units 2 --json strangers.json``. A colon

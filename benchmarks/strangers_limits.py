@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the limits of the benchmark `strangers.py`: rows of figures over several units, and the
+Contains the limits of the benchmark `strangers.py`: rows of figures over several units, and the
 limits that each row violates.
 """
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the units and recordings of the benchmark `strangers.py`, simulated by numpy and scipy.
+Simulates the units and recordings of the benchmark `strangers.py` by numpy and scipy.
 
 Case, board, the sensing part of each axis and a hidden node are the nodes of a linear thermal
 network. The input of the network is the air temperature of the chamber, which is linear in time
