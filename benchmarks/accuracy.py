@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the accuracy figures of docs/accuracy.md: the fit against the simulator's truth.
+Prints the figures of docs/accuracy.md: errors of fits, relative to the simulator's truth.
 
 Run ``python benchmarks/accuracy.py`` for everything, or a part with fewer units:
 ``python benchmarks/accuracy.py kinds --kinds own-lags,paper --seeds 1``.

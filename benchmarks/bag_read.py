@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the measured speed of reading a bag, by thermo_comp, rosbags and mcap in one run.
+Measures the speed of reading a bag, by thermo_comp, rosbags and mcap in one run.
 
 All bags hold counts at 400 Hz and two temperatures at 10 Hz; rosbags and mcap get shorter bags
 (`--peer-samples`). `rosbags` reads and deserializes each message; `mcap` only reads each message.

@@ -1,8 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the damages to the file of a bag: bits flipped, parts wiped or cut off, rows removed, a
-compression bomb.
+Damages the file of a bag: bits flipped, parts wiped or cut off, rows removed, a compression bomb.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the degenerate inputs: recordings and tables, each with the defect that its name states."""
+"""Makes degenerate inputs: recordings and tables, each with the defect that its name states."""
 
 from __future__ import annotations
 

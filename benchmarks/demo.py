@@ -33,8 +33,8 @@ from thermo_comp.topics import IMU_OUT, REGIME
 from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
-# Sd of the sample unit's bias from turn-on to turn-on [m/s^2]. Norms in nine positions do not
-# determine the sd of turn-ons, so the fit gets it as an option.
+# Sd of the sample unit's bias from turn-on to turn-on [m/s^2]. |f| in nine positions does not
+# determine this sd, so the fit gets the sd as an option.
 MOUNTING_SD = 1e-6 * STANDARD_GRAVITY
 
 # Groups of columns of each fit, by its name in the table: a curve for both regimes; a curve per

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns updates on real recordings, for the benchmark `field.py`.
+Updates calibrations with real recordings, for the benchmark `field.py`.
 
 No recording spans days, so each recording is cut into parts: a fit of the first part replaces the
 calibration of a laboratory, and each further part is taken as the recording of a separate turn-on.

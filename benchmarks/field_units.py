@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the units of the benchmark `field.py`, which age: physics, rests, reference filter.
+Simulates the ageing units of the benchmark `field.py`: physics, rests, reference filter.
 
 A unit leaves the laboratory with a calibration whose error is drawn from the covariance that the
 calibration states. In the field bias and scale follow random walks, each turn-on has a random bias

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the cost of a fit: CPU time and peak memory of fitting n bags, compared with those of reading
-the bags, and the exponent p in CPU time ~ (number of samples)^p.
+Measures the cost of a fit: CPU time and peak memory of fitting n bags, compared with those of
+reading the bags, and the exponent p in CPU time ~ (number of samples)^p.
 
 Bags of four hours are simulated once and written to disk. Reading and fitting run in separate
 processes, so that the peak memory of each is measured.

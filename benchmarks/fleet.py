@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the cost of fitting a fleet: speed-up by workers, overhead of the scheduler, network traffic,
-and results lost when workers are killed.
+Measures the cost of fitting a fleet: speed-up by workers, overhead of the scheduler, network
+traffic, and results lost when workers are killed.
 
 Units are simulated and written to bags once (``--folder`` keeps the bags), and fitted as in the
 command `fleet fit`, whose workers are processes of one thread.
@@ -42,7 +42,7 @@ from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 #: Program over 35 K with a sample per second, so that hundreds of units are simulated in minutes.
 PROGRAM, RATE_HZ, TEMPERATURE_HZ = '15 6min, 40@2 12min, 5@2 15min', 1.0, 0.2
-#: A thermal test that is short to fit: the shorter the fits, the higher the scheduler's load.
+#: A thermal test that is fitted quickly: the shorter the fits, the higher the scheduler's load.
 SMALL_PROGRAM, SMALL_BAGS = '20 2min, 45@5 8min, 5@5 10min', 6
 N_LOTS = 4
 _REST_S = 4.0
@@ -200,7 +200,7 @@ def scaling(folder: Path, n_units: int, repeats: int, model: str) -> None:
             for units, workers in ((n_units, 1), (n_units, 2), (n_units // 2, 1))
         )
         # Other programs on the cores slow two workers more than one worker. `free` is the speed-up
-        # if each worker had a free core, below 2 as workers wait and share memory.
+        # with a free core per worker; it is below 2, because workers wait and share memory.
         free = 2.0 * pair.busy(2) / solo.busy(1) * solo.cpu_s / pair.cpu_s
         collected.append((solo.seconds / pair.seconds, free, 2.0 * half.seconds / pair.seconds))
         print(

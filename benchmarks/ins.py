@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the position errors of an inertial navigator due to accelerometer drift, raw and compensated.
+Computes position errors of an inertial navigator by accelerometer drift, raw and compensated.
 
 The unit of the held-out bag stands still in the chamber, so any computed motion is an error. The
 navigator levels for five minutes, then navigates without aiding for half an hour; or it gets a

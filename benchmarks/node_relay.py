@@ -10,7 +10,7 @@ temperatures at 10 Hz, and a sink process receives the Imu messages. Between sou
 either the node, with all functions, or the naive relay: an rclpy node that copies Vector3Stamped
 to Imu in a callback. The CPU time is that of all threads of the relay process, from the first
 sample to the last. The latency is the time from the source's publish call to the arrival in the
-sink's middleware, before any Python code of the sink runs. Ratios of node to naive relay vary less
+sink's middleware, before any Python code of the sink runs. Ratios node / naive relay vary less
 between machines than CPU times and latencies. The node uses its profile for Fast DDS; source, sink
 and naive relay use the default profile. At the last rate the node is measured once more while the
 parameter `calibration_file` is set twice a second. `--core` binds each relay to a core. `--floor`

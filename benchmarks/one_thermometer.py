@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the table of errors of fits with and without the case thermometer, on held-out bags.
+Prints the errors of fits with and without the case thermometer, on held-out bags.
 
 python benchmarks/one_thermometer.py
 """

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the figures of docs/regime.md: the regime detector in simulated ramps and soaks.
+Prints the figures of docs/regime.md: the regime detector in simulated ramps and soaks.
 
 A ramp of a chamber, with control ripple and a drift by self-heating, changes the temperatures of a
 case (first-order lag of the chamber) and of a board (first-order lag of the case). Sensors of
@@ -30,7 +30,7 @@ from regime_scenes import SENSORS, Scene, known_signature_delays, read, temperat
 from thermo_comp.thermal.regime import Regime
 
 SOAK_H = 5.0
-# Number of ramps per scene, by the rate of the readings [Hz], to which run time is proportional.
+# Number of ramps per scene by the rate of the readings [Hz]; run time is proportional to the rate.
 RAMPS = {10.0: 1, 1.0: 6, 0.1: 10}
 
 Rows = list[list[str]]

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the runs of benchmarks/regime.py: the detector over ramps and soaks, and its cost.
+Runs the detector over ramps and soaks, and measures its CPU time, for benchmarks/regime.py.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Outcome:
 
 
 def settings(scene: Scene) -> DetectorSettings:
-    """Return the default settings with the scene's noise, quantum, lags and chamber ripple."""
+    """Return detector settings with the scene's noise, quantum, lags and chamber ripple."""
     case = ThermometerSettings(scene.noise_sd, scene.quantum, lag_s=scene.lag_s)
     board = ThermometerSettings(scene.noise_sd, scene.quantum, lag_s=scene.lag_s + BOARD_LAG_S)
     return DetectorSettings(ripple_c=RIPPLE_C, case=case, board=board)
@@ -102,7 +102,7 @@ def run_ramps(job: Job) -> tuple[Scene, Outcome]:
 
 
 def run_soak(job: tuple[Scene, float, int]) -> tuple[str, int, int, float]:
-    """Return for a soak: sensor, switches to dynamic, all switches, fraction of known flags."""
+    """Return for a soak: sensor, number of switches to dynamic, of all; share of known flags."""
     scene, hours, seed = job
     rng = rng_of(seed, 7, scene)
     t = np.arange(0.0, 3600.0 * hours, 1.0 / scene.rate_hz)

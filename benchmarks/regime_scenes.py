@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns simulated ramps and sensors of benchmarks/regime.py, and delays of a CUSUM test."""
+"""Simulates ramps and sensors for benchmarks/regime.py, and delays of a CUSUM test."""
 
 from __future__ import annotations
 

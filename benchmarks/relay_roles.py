@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the processes that `node_relay.py` runs side by side: source, relays, sink, reloader.
+Contains the processes that `node_relay.py` runs side by side: source, relays, sink, reloader.
 
 The processes communicate with their parent by lines on standard input and output, and with each
 other by DDS.

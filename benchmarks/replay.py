@@ -1,8 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the measurement of `replay`: reading, compensating and writing bags, by thermo_comp and
-rosbags.
+Measures `replay`: reading, compensating and writing bags, by thermo_comp and rosbags.
 
 thermo_comp is measured by the function that the command `thermo_comp replay` calls. rosbags is
 measured by a script that deserializes each message, corrects it with the compensator of

@@ -10,7 +10,7 @@ The node runs in this process, source and sink of samples in two other processes
 on in even seconds of the clock and off in odd seconds. Neighbouring seconds are compared, because
 the speed of a shared machine changes. The latency is the time from the source's publish call to
 the arrival in the sink's middleware. The rest log sums samples in blocks; summing a block
-delays the next sample. The time of a sum is printed.
+delays the next sample. The time of summing a block is printed.
 """
 
 from __future__ import annotations

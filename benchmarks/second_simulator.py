@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns a second simulator, without code of the simulator of thermo_comp, of units whose physics the
-fit does not model exactly.
+Simulates units whose physics the fit does not model exactly, without code of the simulator of
+thermo_comp.
 
 Run ``python benchmarks/second_simulator.py`` for the table of docs/accuracy.md, or a part of it:
 ``python benchmarks/second_simulator.py --kinds own,even --plans wide --seeds 1``.

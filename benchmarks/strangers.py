@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the errors of fits to bags of units whose physics the package does not model, compared with
-the errors of curves that scipy fits.
+Compares errors of fits to bags of units whose physics the package does not model with the errors
+of curves that scipy fits.
 
 Run ``python benchmarks/strangers.py`` for every case (many hours), or some cases with fewer units:
 ``python benchmarks/strangers.py --cases kink,soaks --units 2 --json strangers.json``. A colon
@@ -205,8 +205,8 @@ def bias_score(calibration: thermo_comp.Calibration, study: Study) -> Score:
     bag = Bag('zero', time_s, zero, temperatures)
     out = corrected(calibration, bag, config)
     error = out.force[len(out.force) // 2 :].mean(axis=0)
-    # The Cramer-Rao bound does not include thermometer noise and turn-ons: subtract their
-    # variance, which is all that a calibration without a posterior claims.
+    # The Cramer-Rao bound does not include thermometer noise and turn-ons: subtract the variance
+    # that a calibration without a posterior claims, which contains only these two.
     exact = corrected(replace(calibration, posterior=None), bag, config)
     sd = np.sqrt(np.maximum(np.diag(out.claim[-1] - exact.claim[-1]), 0.0))
     return Score(
@@ -222,8 +222,8 @@ def without_constants(calibration: thermo_comp.Calibration) -> thermo_comp.Calib
     Return a calibration in whose posterior bias, scale and misalignment have no variance.
 
     A single pose determines bias and scale to 50 mg only. The drift in a pose does not depend on
-    the constants, but the differences of claimed variances do: each contains ``a^2`` times the
-    variance of the scale factor, with the noise of the acceleration `a`.
+    these constants, but the claimed variance contains ``a^2`` times the variance of the scale
+    factor, and thereby changes with the noise of the acceleration `a`.
     """
     if calibration.posterior is None:
         return calibration
@@ -334,7 +334,7 @@ def run_case(
         seen = Counter[str]()
         for study in studies:
             if not label or study.label == label or study.label in needed:
-                # Studies with equal labels hold out different bags; each is counted as a unit.
+                # Studies with equal labels hold out different bags; each study counts as a unit.
                 number = unit + seen[study.label]
                 seen[study.label] += 1
                 print(f'{case} {study.label}, unit {number}', file=sys.stderr, flush=True)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the baselines that scipy fits to means over a minute, for the benchmark `strangers.py`.
+Fits the baselines of the benchmark `strangers.py` by scipy, to means over a minute.
 
 The baseline 'constants' has nine numbers: bias, scale and misalignment. The baseline 'cubic' adds
 for each axis a cubic of the bias and a line of the scale over board temperature. Both baselines

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the simulated cases of the benchmark `strangers.py`: units, bags of the fit, held-out bags.
+Simulates the cases of the benchmark `strangers.py`: units, bags of the fit, held-out bags.
 
 Each case draws a random unit, seeded by its number, and yields studies: bags for a fit, and
 held-out bags.

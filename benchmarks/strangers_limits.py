@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the limits of the benchmark `strangers.py`: rows of figures over several units, and the
+Contains the limits of the benchmark `strangers.py`: rows of figures over several units, and the
 limits that each row violates.
 """
 
@@ -43,7 +43,7 @@ class Score:
 @dataclass(frozen=True)
 class Result:
     """
-    The scores of a unit, a study and a set of held-out bags.
+    Scores of all models for a unit, a study and a set of held-out bags.
 
     Parameters
     ----------
@@ -73,8 +73,8 @@ class Result:
 @dataclass(frozen=True)
 class Limit:
     """
-    The limits of a row. By default the error may be 1.05 times that of the best baseline, and
-    error / claimed sd 1.5.
+    The limits of a row. By default the error may be 1.05 times the error of the best baseline,
+    and the RMS of error / claimed sd may be 1.5.
 
     Parameters
     ----------
@@ -121,8 +121,8 @@ LIMITS = {
     'plain': Limit(norm=1.3, vector=2.0, low=0.7, high=1.4),
     'one-pose: own bag': Limit(vector=2.0, low=0.7, high=1.4),
     'one-pose: other program': Limit(vector=5.0, low=0.7, high=1.4),
-    # `score` subtracts the smallest claimed variance of a bag. For 'returned' this variance
-    # contains that of a slope: error / claimed sd has no meaning and no limit.
+    # `score` subtracts the smallest claimed variance of a bag, in 'returned' also the variance of
+    # a slope over temperature, so that error / claimed sd has no meaning and no limit.
     'returned': Limit(high=np.inf),
     'soaks': Limit(low=0.5, high=1.5, claim=3.0),
     'turn-on': _TURN_ON,
@@ -149,7 +149,7 @@ LIMITS = {
     'coarse-thermometer': Limit(),
     'slow-drift': Limit(),
     'third-node alone': Limit(),
-    # A bag in still air may increase the error in the chamber by 2 %, the noise of a fit.
+    # Adding a bag in still air to the fit may increase the error by 2 %, the noise of a fit.
     'third-node joint: chamber': Limit(than='alone: chamber', times=1.02),
     'third-node joint: still air': Limit(than='alone: still air', times=1.02),
     'third-node joint: its attitude': Limit(than='alone: its attitude', times=0.5),

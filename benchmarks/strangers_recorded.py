@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the cases with recordings of the benchmark `strangers.py`: the sample bags, with and without
-the case thermometer, and a recording of a real unit, published with another package.
+Contains the cases with recordings of the benchmark `strangers.py`: the sample bags, with and
+without the case thermometer, and a recording of a real unit, published with another package.
 """
 
 from __future__ import annotations

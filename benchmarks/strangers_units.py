@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the units and recordings of the benchmark `strangers.py`, simulated by numpy and scipy.
+Simulates the units and recordings of the benchmark `strangers.py` by numpy and scipy.
 
 Case, board, the sensing part of each axis and a hidden node are the nodes of a linear thermal
 network. The input of the network is the air temperature of the chamber, which is linear in time
@@ -249,9 +249,9 @@ def network(unit: Unit, environment: Environment = CHAMBER) -> tuple[Floats, Flo
 
 
 def integrate(A: Floats, b: Floats, h: Floats, air: Floats, step_s: float, x: Floats) -> Floats:
-    """Integrate the network from the state `x`, exactly for air that is linear between steps."""
+    """Integrate the network from state `x`, exactly for an air temperature linear in a step."""
     n = len(b)
-    # Extended state: the nodes, the air, the slope of the air, and 1 for the self-heating.
+    # Extended state: temperatures of nodes and air, slope of the air, and 1 for self-heating.
     whole = np.zeros((n + 3, n + 3))
     whole[:n, :n], whole[:n, n], whole[:n, n + 2] = A, b, h
     whole[n, n + 1] = 1.0
