@@ -79,7 +79,7 @@ def check_calibration(data: bytes) -> None:
         return
     assert parse_calibration(dump_calibration(value).encode()) == value
     row = Compensator(value).process(START_NS, 1.0, 2.0, 3.0)
-    # Before the first temperature only a calibration without thermometer corrects a sample.
+    # Before the first temperature, only a calibration of constants corrects a sample.
     assert row is None or not value.needs_temperature
 
 
