@@ -117,10 +117,10 @@ Each QoS policy can be overridden at start with the usual `qos_overrides./topic.
 parameters.
 
 With Fast DDS the node uses a profile with `nackSupressionDuration` = 20 ms for its publishers, as no ROS QoS setting has
-this parameter. At its default, 0 s, a thread of the middleware wakes about four times for each sample to a reliable
-subscriber, and takes a quarter of the node's CPU time. With NACKs suppressed for 20 ms, a lost sample is resent up to 20 ms
-later. A user's profile (`FASTRTPS_DEFAULT_PROFILES_FILE`, or `DEFAULT_FASTRTPS_PROFILES.xml` in the working directory)
-replaces that of the node: repeat `nackSupressionDuration` there.
+this parameter. With the default of `nackSupressionDuration`, 0 s, a thread of the middleware wakes about four times for each
+sample to a reliable subscriber, and takes a quarter of the node's CPU time. With NACKs suppressed for 20 ms, a lost sample
+is resent up to 20 ms later than without. A user's profile (`FASTRTPS_DEFAULT_PROFILES_FILE`, or
+`DEFAULT_FASTRTPS_PROFILES.xml` in the working directory) replaces that of the node: repeat `nackSupressionDuration` there.
 
 `linear_acceleration_covariance` is a full 3x3 matrix: noise of the sample plus uncertainty of the calibration at the
 present thermal state. Without an angular rate or an orientation in the input, the first element of the covariance of the
