@@ -43,7 +43,7 @@ def model_of(
         {name for name, readings in bag.temperatures.items() if len(readings.value)}
         for bag in bags
     )
-    # Case thermometer, recorded or not, and all thermometers but the board's that every bag has.
+    # Thermometers of the columns: the case's, even if not recorded, and others that all bags have.
     sensors = 'case', *sorted(set.intersection(*recorded) - {'board', 'case'})
     detector = options.detector or learn_detector(bags)
     columns: tuple[Column, ...] = ()
@@ -106,8 +106,8 @@ def windows_of(
 def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
     """
     Fit the windows with one lag per axis (`find_parts`). If no lags are found, or all lags leave a
-    left-out drift above `Parts.most_drift`, fit the windows with the columns of `windows`, too,
-    and return the better fit. No lags are searched with a prior, or for Golovach's model.
+    left-out drift above `Parts.most_drift`, fit the model of `windows`, too, and return the better
+    fit. With a prior calibration, or for Golovach's model, only the model of `windows` is fitted.
     """
     bags, options = problem.bags, problem.options
     is_free = options.prior is None and options.model != 'golovach'

@@ -204,7 +204,7 @@ def blank_terms(columns: Iterable[Column]) -> tuple[ResponseTerm, ...]:
 
 
 def parameters_of(calibration: Calibration) -> Floats:
-    """Return the parameters in the order of the file's posterior, 0 for constant scale errors."""
+    """Return the parameters in the posterior's order; constant errors of scale factors are 0."""
     values: list[float] = []
     pairs = zip(calibration.static.axes(), calibration.dynamic.axes(), strict=True)
     for axis, (reference, sets) in enumerate(zip(calibration.axes, pairs, strict=True)):
@@ -228,7 +228,7 @@ def with_parameters(
     """
     Replace the scale factors and the parameters of a calibration.
 
-    `values`: parameters in the order of the posterior; constant scale errors are not used
+    `values`: parameters in the order of the posterior; constant errors of scale factors: unused
     """
     layout = parameter_layout(calibration)
     levels = values[[bias.static for bias in layout.bias]]

@@ -111,7 +111,7 @@ def _over_offsets(
     variance of the bias offset that all bags share if they have one turn-on (the regression has no
     unknown for this offset), or 0 if they have several turn-ons.
 
-    `offset_sd`: sd of a mounting's offset; `known_sd`: offset sd of a prior calibration [m/s^2]
+    `offset_sd`: sd of mounting offsets in the fit; `known_sd`: in a prior calibration [m/s^2]
     """
     windows, scale = regression.windows, posterior.prior.offset_scale
     n_mountings = int(windows.mounting[-1]) + 1
@@ -147,7 +147,7 @@ def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Fl
     log prior density of the logarithm of this sd at these values.
 
     `scale`: `Prior.offset_scale` [m/s^2]; `known_sd`: offset sd by a prior calibration [m/s^2],
-    0 without a prior calibration; `kind`: kind of the offsets, see `largest`
+    0 without a prior calibration; `kind`: 'mounting', 'turn-on' or 'both', see `largest`
     """
     if known_sd:
         # A test of 12 positions determines the sd of mounting offsets within a factor of 1.5.
@@ -188,12 +188,12 @@ def _widened(
     # The drifts of warm-ups within the positions determine the chosen curve. A warm-up heats the
     # board in another way than a chamber does, so the curve fitted to the positions' means is an
     # alternative: half of the squared difference of the curves is added to the covariance. Columns
-    # that change more within the positions than between them keep their weights.
+    # that change more within the positions than between them keep the weights of the chosen fit.
     within = within_positions(regression.columns, regression.windows.position)
     is_of_means = np.mean(within**2, axis=0) < np.mean((regression.columns - within) ** 2, axis=0)
     weights = np.where(is_of_means, of_means.weights, state.weights)
     other = replace(of_means, weights=weights)
-    # A tiny prior sd gives columns active only in the fit to the means rows in the covariance.
+    # Columns active only in `of_means` get a tiny prior sd, so that the covariance has their rows.
     is_used = other.weights.any(axis=1) & (prior.column_sd == 0.0)
     prior = replace(prior, column_sd=np.where(is_used, 1e-9, prior.column_sd))
     with_unseen = regression.solve(state, prior, n_steps=0)
@@ -215,8 +215,8 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
     groups, prior = np.array(regression.windows.groups), posterior.prior
     kelvins = regression.windows.kelvins
     active = groups[prior.column_sd.any(axis=0)]
-    # Add columns of lags and curves (few temperatures do not determine all powers), and columns
-    # active in only one of bias and scale (one attitude does not separate their drifts).
+    # Columns to add are those of lags and curves (few temperatures do not determine all powers),
+    # and those active in only one of bias and scale (one attitude does not separate their drifts).
     curves = [PART if PART in active else CURVE]
     may = np.isin(groups, [*LAGS, *curves]) | prior.column_sd.any(axis=0)
     inactive = regression.inactive(posterior, may & typical.any(axis=0))
@@ -230,8 +230,8 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
         sd = np.where((sd > 0.0) & (regression.windows.lag >= 0), np.inf, sd)
     sd = np.where(is_of_lags, sd, np.minimum(sd, typical))
     if CURVE in active:
-        # A lag only delays the curve: limit the prior sd of a lag's weight to the slope of the
-        # curve (RMS of the axes), including the slopes that inactive curve columns may add.
+        # A lag only delays the curve: the prior sd of a lag's weight is at most the curve's slope
+        # (RMS of the axes), including the slopes that inactive curve columns may add.
         is_curve = (groups == CURVE) & (kelvins > 0.0)
         square = np.mean(posterior.state.weights**2, axis=1) + sd**2
         slopes = np.sqrt(np.sum(square[:, is_curve] / kelvins[is_curve] ** 2, axis=1))
@@ -255,8 +255,8 @@ def _over_mountings(
     regression: Regression, posterior: PosteriorMode, tried: Floats, log_prior: Floats
 ) -> tuple[Floats, float]:
     """
-    Return the covariance of the unit's unknowns, and the RMS of the offset sd [m/s^2], by a
-    mixture of fits with the sds `tried` of mounting offsets, (k,), and their log prior density.
+    Return the covariance of the unit's unknowns, and the RMS of the sd of mounting offsets
+    [m/s^2], by a mixture of fits, one per sd `tried`, (k,); `log_prior`: log density of these sds.
     """
     prior, mounting = posterior.prior, regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
@@ -302,7 +302,7 @@ def _mixture(
 
 
 def _excess(covariance: Floats, other: Floats) -> Floats:
-    """Return ``covariance - other``, scaled by sds of `other`, with eigenvalues < 0 set to 0."""
+    """Return ``covariance - other``, with eigenvalues < 0 (scaled by sds of `other`) set to 0."""
     sd = np.sqrt(np.diag(other))
     values, vectors = np.linalg.eigh((covariance - other) / np.outer(sd, sd))
     root = sd[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
@@ -332,7 +332,7 @@ def _norm_evidence(
     weight = rows[:, -1]
     along, errors = rows[:, :-2] / weight[:, None], rows[:, -2] / weight
     if prior.informative is None:
-        # The prior of the constants is so wide that its mean may be replaced by the state.
+        # The constants have so wide a prior that its mean may be replaced by their fitted values.
         weights = layout.axis[:, 2:].ravel()
         constants = np.setdiff1d(np.arange(layout.n_unit), weights)
         of_prior = np.hstack((
@@ -367,7 +367,7 @@ def _jackknifed(regression: Regression, posterior: PosteriorMode) -> Floats:
         changes.append(other[:n] - step[:n])
         ratios.append(_ratios_to_noise(factor.T @ changes[-1], remaining.T @ posterior.root))
     ratio, without = np.concatenate(ratios), np.array(changes)
-    # Under noise alone each ratio of a squared change to its variance has mean 1 and variance 2.
+    # Under noise alone each ratio (of squared change to variance) has mean 1 and variance 2.
     if ratio.sum() - len(ratio) < 2.0 * np.sqrt(2.0 * len(ratio)):
         return np.zeros((n, n))
     return np.asarray(last / (last + 1) * without.T @ without)

@@ -109,17 +109,17 @@ def n_directions(means: Floats) -> int:
 
 def rough_centre(means: Floats) -> Floats:
     """
-    Return the reading at zero force: 0, or the centre of a sphere if the readings' norms differ.
+    Return the reading at zero force: 0, or a sphere's centre if the norms of the readings differ.
 
-    `means`: mean readings, shape (n, 3). The result is 0 for fewer than four readings, readings in
-    a plane or almost one attitude, and an implausible sphere.
+    `means`: mean readings, shape (n, 3). The result is 0, too, for fewer than four readings, for
+    readings in a plane or almost one attitude, and for an implausible sphere.
     """
     zero = np.zeros(3)
     if len(means) < 4:
         return zero
     arms = means - means.mean(axis=0)
     spread = float(np.sqrt(np.mean(np.sum(arms**2, axis=1))))
-    # The origin is the centre if the norms scatter (sd) by less than 30 % of the readings' spread.
+    # The centre is 0 if the norms' sd is below 30 % of the readings' RMS distance from their mean.
     if np.std(np.linalg.norm(means, axis=1)) < 0.3 * spread:
         return zero
     values = np.linalg.eigvalsh(arms.T @ arms)
@@ -156,10 +156,10 @@ def best_rests(candidates: list[Floats]) -> int:
     """
     Return the index of the best set of rests; each set has mean readings of shape (n, 3).
 
-    The sd of the constants follows from the directions of the rests of a set and from the
-    residuals of |f|. The best set is the first whose sd is within 2 % of the smallest sd: the
-    first sets have the longest, quietest rests. If no set has six attitudes, the first set is
-    returned.
+    The largest sd of a calibration constant follows from the directions of a set's rests and the
+    residuals of |f|. The best set is the first whose largest sd is within 2 % of the smallest of
+    all sets, as earlier sets have longer, quieter rests. The index is 0 if no set has rests in six
+    attitudes.
     """
     counts = [n_directions(means) for means in candidates]
     costs = np.array([

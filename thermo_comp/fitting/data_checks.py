@@ -166,7 +166,7 @@ def _judge_ramps(windows: ThermalWindows) -> Iterator[Finding]:
             'unknown; record ramps between the soaks',
         )
         steps = np.diff(np.sort(windows.temperature))
-        # Temperatures of two soaks differ by more than 1 K and more than a tenth of the span.
+        # Two soaks differ if their temperatures differ by over 1 K and over a tenth of the span.
         is_gap = steps > max(1.0, 0.1 * steps.sum())
         n = 1 + int(is_gap.sum())
         # If the temperature drifts slowly through its range, there are no soaks to count.
@@ -356,8 +356,8 @@ def judge_result(
     else:
         yield Finding('residual', 'good', text)
     alone = overall.two_sets.rms
-    # These do not contradict the prior: a shift of the bias by up to 2 sd (2 `slow`) at a turn-on,
-    # and a residual due to initial lag states, with which `sigma` is near the noise.
+    # Two effects do not contradict the prior: a bias shift by up to 2 sd (2 `slow`) at a turn-on,
+    # and a residual due to initial lag states, in which case `sigma` is near the white noise.
     contradiction, sigma = '', float(np.mean(prior.sigma))
     is_above = overall.fitted.rms > np.hypot(1.5 * alone, 2.0 * slow) and sigma > 1.5 * alone
     if options.prior is not None and is_above:

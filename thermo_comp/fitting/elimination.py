@@ -55,9 +55,9 @@ def factored_with_prior(information: Floats, precision: Floats) -> Floats:
     """
     Return the lower Cholesky factor of an information matrix plus the precision of a prior, (n,).
 
-    The information matrix is a difference of larger matrices, so its smallest eigenvalues are
-    rounding errors. If the sum has no Cholesky factor, the information is scaled to a unit
-    diagonal, and eigenvalues up to ten times the size of the most negative one are set to 0.
+    The smallest eigenvalues of the information, a difference of larger matrices, are rounding
+    errors. If information plus precision has no Cholesky factor, it is scaled to a unit diagonal,
+    and eigenvalues of the information up to ten times the size of the most negative one become 0.
     """
     places = np.diag_indices(len(information))
     hessian = information.copy()
@@ -153,7 +153,7 @@ class Reduced:
         return sum(block.log_determinant for block in blocks if block is not None)
 
     def with_prior_of_sum(self, total: Floats, variance: float) -> Reduced:
-        """Add a prior (mean 0, `variance`) of the lag states' sum over bags (`total` now)."""
+        """Add a prior of mean 0 and `variance` to the sum `total` over bags of initial lag states."""
         r = len(total)
         cross = self.bags.solved[:, :r].sum(axis=0, keepdims=True)
         cross[..., -1] += total

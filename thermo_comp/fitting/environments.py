@@ -38,7 +38,7 @@ from .windows import ThermalWindows, thermal_windows
 
 
 def _is_far_above(square: Floats | float, usual: float) -> Bools:
-    """Whether an RMS error exceeds five times the usual RMS error; arguments: mean squares."""
+    """Whether the mean square error `square` exceeds 5^2 times the mean square error `usual`."""
     return np.asarray(square > 5.0**2 * usual)
 
 

@@ -6,8 +6,8 @@ Owns the measurement equation of the windows, and its linearisation.
 Equation [m/s^2] of the mean reading N of window w, position p, axis i; K0: nominal scale::
 
     N / K0 = kappa a (1 + S s) + b + B beta + o_p + o_b + kappa (A l_p)_i g + noise,
-    a = (A u_p)_i g,  A = M^-1,  kappa: scale factor / K0,  b: bias,  u_p: attitude,
-    l_p, perpendicular to u_p: tilt of the support,
+    a = (A u_p)_i g,  A = M^-1,  M: misalignment,  kappa: scale factor / K0,  b: bias,
+    u_p: attitude,  l_p, perpendicular to u_p: tilt of the support,
     o_p, o_b: bias offsets of the position and of the turn-on (bag)
 
 B and S are columns of the table in `unit.columns`, each divided by its RMS, with the weights beta
@@ -151,7 +151,7 @@ class Equations(Series):
 
     def _combined(self, state: State, base: Base, n_starts: int) -> Floats:
         """
-        Return the combinations of the base series that `Tangent` uses: 1 + S s; the derivatives
+        Return the combinations of base series in `Tangent`: the scale's 1 + S s; the derivatives
         w.r.t. kappa, the force along the axis and the initial lag states; and the residual.
         """
         force, _, without_bias, (bend, bend_by_t), (slope, slope_by_t) = self._effects(state)

@@ -169,7 +169,7 @@ def group_evidence(regression: Regression, posterior: PosteriorMode) -> tuple[Gr
             if of_prior is None:
                 weight_sd = regression.weight_sd(prior)[k][:, used].ravel()
             else:
-                # The geometric mean of the principal sds of the weights in the prior.
+                # One sd for all weights: the geometric mean of their prior's principal sds.
                 root = of_prior[places]
                 mean_sd = np.exp(np.linalg.slogdet(root @ root.T)[1] / (2.0 * len(root)))
                 weight_sd = np.full(len(places), mean_sd)
@@ -221,7 +221,7 @@ def drift_variance(
 def _points(
     temperature: Floats, excess: Floats, model_error: Floats, rows: Bools
 ) -> tuple[LackOfFit, ...]:
-    """Average the excess of squared drifts in up to 5 temperature bins of 10 windows or more."""
+    """Return the lack of fit in up to 5 temperature bins, each with 10 windows or more."""
     n_bins = min(5, int(rows.sum()) // 10)
     if not n_bins:
         return ()
@@ -229,8 +229,8 @@ def _points(
     order = np.argsort(temperature, kind='stable')
     for part in np.array_split(order[rows[order]], n_bins):
         mean = excess[part].mean(axis=0)
-        # Errors of neighbouring windows are correlated: ten windows count as one observation. A
-        # mean excess below two standard errors is set to 0.
+        # Errors of neighbouring windows are correlated: ten windows count as one observation. The
+        # mean excess of the squared drift is set to 0 if it is below two standard errors.
         error = excess[part].std(axis=0) / np.sqrt(max(len(part) / 10.0, 1.0))
         mean = np.where(mean > 2.0 * error, mean, 0.0)
         x, y, z = np.sqrt(mean + model_error[part].mean(axis=0)).tolist()

@@ -7,7 +7,7 @@ Each column has one prior standard deviation of its weights in the bias of all a
 scale. Each sd that is not fixed is found by MacKay's fixed point [1]_ with a log-normal hyperprior
 of the sd, of centre sd0 and variance tau^2 of log sd. The mode of log evidence plus log hyperprior
 satisfies ``effective parameters + log(sd / sd0) / tau^2 = sum w^2 / sd^2``, w being the weights of
-the column on the three axes. If the data do not inform about a column, the sd stays at sd0.
+the column on the three axes. Without information about a column its prior sd stays at sd0.
 
 References
 ----------
@@ -65,7 +65,7 @@ class Candidates:
 def settle(
     regression: Regression, state: State, prior: Prior, candidates: Candidates, rounds: int = 25
 ) -> PosteriorMode:
-    """Iterate prior sd and noises up to `rounds` times, until `_updated` gives a change < 0.05."""
+    """Update prior sds and noises up to `rounds` times, until none changes by over about 5 %."""
     posterior = regression.solve(state, prior, n_steps=3)
     for _ in range(rounds):
         prior, change = _updated(regression, posterior, candidates)
@@ -110,7 +110,7 @@ def _updated(
 
     return moved, max(
         change('column_sd', moves & (effective > 0.3)),
-        # Ignore a change of the sd of offsets unless the data determine more than one offset.
+        # A change of the sd of offsets counts only if the data determine more than one offset.
         change('offset_sd') * bool(determined[layout.offset].sum() > 1.0),
         change('turn_on_sd') * bool(determined[layout.turn_on].sum() > 1.0),
         # An error of 15 % of the sd of tilts hardly changes the fit.
@@ -149,12 +149,12 @@ def _start_variance_ratio(posterior: PosteriorMode) -> float:
 
 
 def _tilt_sd(posterior: PosteriorMode, kelvins: float) -> float:
-    """Move the sd of tilts towards the mode; `kelvins`: RMS of the board temperature [K]."""
+    """Move the sd of tilts towards the mode; `kelvins`: RMS of T_board less the reference [K]."""
     sd, tilt = posterior.prior.tilt_sd, posterior.state.tilt
     if not tilt.size:
         return sd
     # The scale of the half-normal prior of the tilts' sd is 15 urad/K, for unevenly heated
-    # aluminium of 23 ppm/K, times the RMS temperature, or times 1 K if this is larger.
+    # aluminium of 23 ppm/K, times the larger of `kelvins` and 1 K.
     square = (sd / (1.5e-5 * max(kelvins, 1.0))) ** 2
     effective = posterior.determined[posterior.layout.tilt].sum()
     step = _toward(effective, np.sum(tilt**2), sd, square - 1.0, 2.0 * square)
@@ -187,7 +187,7 @@ def _toward(
 
 
 def _offset_sd(posterior: PosteriorMode, sd: float, places: Ints) -> float:
-    """Move the sd of the offsets at `places` towards the mode under a half-Student prior."""
+    """Move the sd of offsets (unknowns `places`) towards the mode under a half-Student prior."""
     scale = posterior.prior.offset_scale
     if scale <= 0.0 or not places.size:
         return sd
@@ -345,7 +345,7 @@ def undisturbed(residual: Floats, weight: Floats, position: Ints) -> Floats:
     size = residual * np.sqrt(weight)[:, None]
     for part in np.split(size, np.flatnonzero(np.diff(position)) + 1):
         if len(part) > 6:
-            # The local level of a window is the median of the seven windows about it.
+            # Subtract from each window's residual the median residual of the seven about it.
             np.subtract(part, median_filter(part, (7, 1), mode='mirror'), out=part)
     size = np.abs(size)
     # The 80 % quantile of |x| is 1.2816 sd of a normal x. The median of |x| can be 0: the window

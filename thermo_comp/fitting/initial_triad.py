@@ -69,12 +69,12 @@ def constant_calibration(
             f'an axis ({axes}) reads the same in all positions: the axis is dead, or the unit was '
             'never turned about another axis'
         )
-    # If no axis pointed nearly up and nearly down, half ranges are below |f|: try also |f| / 1.3.
+    # If no axis is near up and near down, half ranges are below |f|: try also 1.3 times the scale.
     scales = (float(np.max(half)) * spread / gravity for spread in (1.0, 1.3))
     starts = (np.where(half * 4.0 > np.max(half), scale, half / gravity) for scale in scales)
     tried = (_refine(means, gravity, bias, scale, misalignment_sd) for scale in starts)
     calibration, rms = min(tried, key=lambda fitted: fitted[1])
-    # Scattered points may give a very large ellipsoid with a far centre, which is refused.
+    # Means that are on no ellipsoid may fit a very large one with a far centre: refuse it.
     is_around = np.all(np.abs(calibration.bias - bias) < 2.0 * np.max(half))
     if not (is_around and rms < largest_rms):
         raise FitError(
@@ -138,7 +138,7 @@ def white_noise_of(windows: Windows, scale: Floats) -> Floats:
     which do not depend on a linear drift; 0 if no position has three windows.
 
     In fast ramps second differences contain a part of the drift. If the noise from fourth or sixth
-    differences is below 70 % of the noise from second differences, the smallest is used.
+    differences is below 70 % of the noise from second ones, the smallest of these noises is used.
     """
     position, noises = windows.position, []
     for order in (2, 4, 6):

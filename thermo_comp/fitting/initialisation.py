@@ -70,7 +70,7 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
 
     Without a prior, if the positions are whole rests and temperature changes more between than
     within positions, two fits are made: of the curve to the means of the positions, and to all
-    windows. The fit to the means is returned unless the other fit is better on left-out data.
+    windows. The fit to the means is returned unless the fit to all is better on left-out data.
     """
     if problem.options.prior is not None:
         return _regress(windows, problem)
@@ -117,7 +117,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     state = initial_state(regression, start, problem.up)
     prior = _initial_prior(windows, problem)
     if n_directions >= POSITIONS_NEEDED and not data.has_turn_ons:
-        # Misalignments would explain turn-on offsets, which are no unknowns here: reduce M's sd.
+        # Turn-on offsets are no unknowns here, and M would explain them: reduce M's prior sd.
         prior = _with_faces(prior, problem.up)
     steepness = _steepness(windows, problem, is_at_rest=is_at_rest)
     candidates = _candidates(windows, problem, steepness, is_bench=is_bench)
@@ -343,7 +343,7 @@ def _steepness(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool) -
         errors -= powers @ np.linalg.lstsq(powers, errors, rcond=None)[0]
     if is_at_rest:
         # Divide the RMS error of |f| by the RMS error of |f| that slopes of bias and scale of size
-        # 1 would cause. Constant bias and scale, which explain a part of both errors, are removed.
+        # 1 would cause, both without the part that a constant bias and scale explain.
         constants = norm_columns(force / norms[:, None])[:, :6]
         celsius = windows.temperature[data.edges[:-1]]
         of_slopes = (celsius - celsius.mean())[:, None] * constants

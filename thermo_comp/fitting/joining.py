@@ -6,7 +6,7 @@ recorded one after the other while the unit is turned to the next attitude.
 
 Between the parts of a recording the unit may have stayed switched on, so the parts count as one
 turn-on: positions of one turn-on do not show how well the bias repeats from turn-on to turn-on.
-No lag restarts at the start of a part, and a rest may continue from one part to the next.
+Lags do not restart where a part begins, and a rest may continue from one part to the next.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def joined(bags: Sequence[ReducedBag]) -> list[ReducedBag]:
     for bag in sorted(bags, key=lambda bag: bag.start_ns):
         before = [recording for recording in recordings if _continues(recording[-1], bag)]
         if before:
-            # Simulated recordings may end at equal stamps: choose that with the nearest readings.
+            # Simulated recordings may end at equal stamps: extend the one with nearest readings.
             min(before, key=lambda recording: _step(recording[-1], bag)).append(bag)
         else:
             recordings.append([bag])
@@ -116,7 +116,7 @@ def _intervals(parts: Sequence[ReducedBag]) -> tuple[StillInterval, ...]:
         shift_s = 1e-9 * (part.start_ns - parts[0].start_ns)
         is_alike = abs(part.window_s - parts[0].window_s) < 0.01 * parts[0].window_s
         for number, rest in enumerate(part.intervals):
-            # No window counts as whole if its length differs from that in the first part.
+            # Windows are whole only if their length is within 1 % of that in the first part.
             n_whole = rest.n_whole if is_alike else 0
             shifted = replace(rest, time=rest.time + shift_s, n_whole=n_whole)
             is_first = bool(result) and number == 0
@@ -132,7 +132,7 @@ def _is_one_rest(before: StillInterval, after: StillInterval, window_s: float) -
     Whether a rest continues in the next part. The gap between the parts is at most three windows
     long. The step over the gap is, on each axis, at most five times the RMS step between the 20
     windows before the gap and between the 20 windows after it, or twice the largest of these steps
-    (most steps may be 0 by rounding). At least 10 of these steps must be known.
+    (most steps may be 0 by rounding). There must be 10 or more steps between these windows.
     """
     gap_s = 1e-9 * (after.start_ns - before.end_ns)
     means = before.mean[: before.n_whole][-20:], after.mean[:20]

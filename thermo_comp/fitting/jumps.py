@@ -129,7 +129,7 @@ def _examine(
     by_rounding = 2.0**0.5 * rounding_sd
     lasting_sd = np.hypot(quiet_sd * relative_sd * _correlation(residual, quiet_sd), by_rounding)
     step, relative_sd, residual = _step(time, accel, time[at], r)
-    # If noise is correlated, the scatter within half a second underestimates the noise of means.
+    # The scatter within half a second underestimates the noise of means if noise is correlated.
     sd = np.sqrt(np.mean(residual**2, axis=0)) if r else quiet_sd
     step_sd = np.hypot(sd * relative_sd * _correlation(residual, sd), by_rounding)
     if r:
@@ -164,7 +164,7 @@ def _examine(
 
 
 def _correlation(residual: Floats, sd: Floats) -> Floats:
-    """Return the ratio, >= 1, of a mean residual's sd to its sd for white noise of `sd`, (3,)."""
+    """Return the ratio, >= 1, of the sd of a mean residual to that by white noise `sd`, (3,)."""
     # A lag-1 correlation r of the means of 40 pieces multiplies the variance of the mean of all
     # pieces by (1 + r) / (1 - r).
     size = max(len(residual) // 40, 1)

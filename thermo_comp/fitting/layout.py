@@ -101,7 +101,7 @@ class Layout:
 
     @cached_property
     def of_axis(self) -> Ints:
-        """Column indices, in `own`, of a position's unknowns in each axis' equations, (3, k)."""
+        """Columns of `own` with the unknowns that occur in the equations of each axis, (3, k)."""
         first = self.up.shape[1] + self.stretch.shape[1]
         before, after = range(first), range(first + 3, self.own.shape[1])
         return np.array([[*before, first + axis, *after] for axis in range(3)])
@@ -187,7 +187,7 @@ class Normal(NamedTuple):
     unit: Floats
 
     def scaled(self, factor: Floats) -> Normal:
-        """Multiply the normal equations of each axis by a factor, shape (3,)."""
+        """Multiply the normal equations of each axis by its element of `factor`, shape (3,)."""
         return Normal(self.local * factor[:, None, None], self.unit * factor[:, None, None])
 
     @property
@@ -202,12 +202,12 @@ class Tangent:
     The equations linearised about a state, as coefficients of the base series at this state.
 
     The derivative of the readings w.r.t. an unknown is a factor times a base series, or times one
-    of the combinations `combined` of base series. For axis i, position p and unknown u the
-    derivative is ``factor[p, i, u]`` times the series of index ``place[u]``; the indices of
-    combinations follow those of the base series. The unknowns of an axis are those of the position
+    of the combinations `combined` of base series. For axis i, position p and unknown u it is
+    ``factor[p, i, u]`` times series ``place[u]``, which is a base series or, from index n_base on,
+    one of `combined`. The unknowns in the equations of an axis are those of the position
     (2 of the attitude, stretch, offset, tilts), then those of the bag (initial lag states, turn-on
     offset), then those of the unit (kappa, bias, weights, nonlinear coefficients, radius, 3 of the
-    misalignment, 2 of each pose). The last place is for the residual, measured minus predicted.
+    misalignment, 2 of each pose). The last element is for the residual, measured minus predicted.
 
     combined: the combinations of base series, shape (n_positions, 3, n_base, n_combined)
     place: index of the series of each unknown, shape (k + 1,)
@@ -227,7 +227,7 @@ class Tangent:
     scale: Floats
 
     def normal(self, products: Floats) -> Normal:
-        """Return the normal equations; products of base series: (n_positions, n_base, n_base)."""
+        """Return normal equations by `products` of base series, (n_positions, n_base, n_base)."""
         first, with_combined = self.n_local, products[:, None] @ self.combined
         place = self.place[first:]
         n, bias = len(place), slice(1, 1 + self.n_bias)
@@ -263,7 +263,7 @@ class Tangent:
         return np.asarray(result)
 
     def at(self, places: Ints) -> Tangent:
-        """Return the equations of the positions `places`."""
+        """Return the linearised equations of the positions with the indices `places`."""
         kept = {name: getattr(self, name)[places] for name in ('combined', 'factor', 'scale')}
         return replace(self, **kept)
 

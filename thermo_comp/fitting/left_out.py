@@ -91,7 +91,7 @@ class Folds:
         before, after = ((folds.square * folds.windows)[known] + 1e-300 for folds in (self, other))
         of_sums = float(np.log(before.sum() / after.sum()))
         if n == 1:
-            # One fold gives no standard error: return the largest negligible log ratio instead.
+            # One fold gives no standard error: return the largest log ratio that counts as equal.
             return of_sums, _NEGLIGIBLE_LOG_RATIO
         each = np.log(before / after)
         others = (np.maximum(square.sum() - square, 1e-300) for square in (before, after))
@@ -103,7 +103,7 @@ class Folds:
         return max(estimates, key=lambda estimate: abs(estimate[0]) / max(estimate[1], 1e-12))
 
     def is_noise(self, other: Folds, noise: float) -> bool:
-        """Whether white noise explains this model's errors in the folds scored for both models."""
+        """Whether white noise explains the errors in those folds that `other` scores, too."""
         known = np.isfinite(self.square) & np.isfinite(other.square)
         square = np.average(self.square[known], weights=self.windows[known])
         return bool(square <= (_NOISE_RATIO * noise) ** 2)
@@ -187,7 +187,7 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
         for gain, first, second in zip(drifts, before.kinds, after.kinds, strict=False)
         if gain and (gain[0] > gain[1] or not second.is_noise(first, after.noise))
     ]
-    # The RMS error of left-out halves may rise by a quarter: it usually scatters by this ratio.
+    # The RMS error of left-out halves may rise by a quarter, which is its usual scatter.
     is_worse_by_halves = by_halves and after.halves.rms > 1.25 * before.halves.rms
     if is_worse_by_norms(before, after) or is_worse_by_halves:
         return 0.0
@@ -296,7 +296,7 @@ def _sd_of_changes(posterior: PosteriorMode, columns: Floats) -> float:
 def _by_positions(
     regression: Regression, posterior: PosteriorMode
 ) -> tuple[Folds, Folds, Floats, Floats]:
-    """Leave out each mounting; return errors of drift and of |f|, force and drift of windows."""
+    """Leave out mountings; return errors of drift and of |f|, and force and drift by window."""
     windows, share = regression.windows, regression.weight / regression.windows.weight
     point, edges = regression.at(posterior.state, posterior.prior), windows.edges
     counts = np.diff(edges).astype(np.float64)

@@ -88,9 +88,9 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> list[Part
     Find the lag of each axis, and reduce the weights of windows that deviate from the model.
 
     Returns [] if the model with one lag per axis does not explain the drift of all axes, or if the
-    data do not determine a time constant. If the residual of every shape exceeds the noise, a
-    second stage may only describe slow noise or a tilt of the support: lags of one stage then come
-    first, if the RMS residual of every axis is less than half of that without a lag.
+    data do not determine a time constant. If the residual exceeds the noise for all shapes of the
+    curves, a second stage may only describe slow noise or a tilt of the support: the list begins
+    with lags of one stage if these halve the RMS residual of every axis, compared with no lag.
     """
     data, columns = windows.data, windows.model.columns
     if not windows.has_temperature or not any(column.group == 'board' for column in columns):
@@ -192,8 +192,8 @@ class _PartCurves:
     def _lag(self, axis: int, noise: float) -> Part:
         """
         Return the lag with the smallest RMS residual; 0 s if no lag reduces the residual. If noise
-        does not explain the residual, a second stage or another share of the gradient is tried,
-        and must reduce the RMS residual by more than 5 %.
+        does not explain the residual, a second stage or another share of the gradient, then both,
+        are tried; each must reduce the RMS residual by more than 5 %.
         """
         one_stage = self.one_stage(axis)
         best = self._with_lead(one_stage, axis)
@@ -206,7 +206,7 @@ class _PartCurves:
                 along = [self.one_stage(axis, share) for share in (0.3, 0.6, 0.9)]
                 starts.append(min(along, key=lambda lag: self._square(lag, axis)))
             if not any(self._is_of_use(near, axis, noise, 8.0, 1.5) for near in (best, *starts)):
-                # No second stage, or share of the gradient, would reduce the residual enough.
+                # The residual is too large for a second stage, or share of the gradient, to help.
                 return best
             lags = [self._searched(axis, _in_two_stages(one_stage), (0.2, 0.4, 0.0, 0.0))]
             if best.lead_s:
@@ -225,11 +225,11 @@ class _PartCurves:
 
     def _with_lead(self, lag: Part, axis: int) -> Part:
         """
-        Add a share of the gradient to a lag or, without a case thermometer, a positive lead time,
-        if the residual then is significantly smaller.
+        Return `lag` plus a share of the gradient or, without a case thermometer, a positive lead
+        time; or `lag` itself if the residual does not become significantly smaller.
 
-        The residual is linearised w.r.t. time constant and share of the gradient, or lead. Its sum
-        of squares must decrease by a factor that white residuals reach with a probability of 1e-5.
+        The residual is linearised w.r.t. time constant and share of the gradient, or lead. The
+        sum of squares must decrease by a ratio that white noise has with a probability of 1e-5.
         """
         tau = lag.tau_s
         if not tau:
@@ -331,12 +331,12 @@ class _PartCurves:
         return float(np.sqrt(self._square(Part(0.0), axis) / self._square(lag, axis)))
 
     def parts(self, lags: Sequence[Part], noise: Floats) -> tuple[Parts, float]:
-        """Return the lags with factors of the weights, and the ratio of RMS residual to noise."""
+        """Return lags with factors of windows' weights, and the ratio of RMS residual to noise."""
         weighted = np.column_stack([self._weighted(lag, axis) for axis, lag in enumerate(lags)])
         residual = weighted / self._root_weight
         factors = undisturbed(residual, self._weight, self._position)
         square = np.average(residual**2, axis=0, weights=self._weight * factors)
-        # The unknowns of an axis are the coefficients, and one level per position.
+        # The unknowns of an axis are a coefficient of each regressor, and one level per position.
         n_unknowns = self._series(lags[0], 0).shape[1] + len(self._first)
         square /= max(1.0 - n_unknowns / len(residual), 0.05)
         ratio = float(np.sqrt((square / noise**2).max()))
@@ -394,7 +394,7 @@ class _PartCurves:
         return self._centred(np.hstack((*bias, of_scale, begin)))
 
     def _centred(self, values: Floats) -> Floats:
-        """Subtract each position's weighted mean from columns; multiply by the root weights."""
+        """Return columns less their weighted mean in each position, times the root weights."""
         level = np.add.reduceat(values * self._share, self._first)
         return np.asarray((values - level[self._position]) * self._root_weight)
 

@@ -195,11 +195,11 @@ def reduce_source(
     Read one source in blocks and keep its sufficient statistics.
 
     `still_sd` is the largest sd of samples at rest [g]. Without `min_rest_s` a rest lasts at least
-    3 s, or at least 1 or 2 s if these shorter rests determine bias and scale better. The limit
-    of the variance in a rest is also chosen for the best bias and scale. If the user or the bag
-    states |f|, this limit is fixed, and `min_rest_s` is by default 3 s. At a low sample rate,
-    cells of the usual number of samples are so long that drifts look like motions and short rests
-    are lost: cells of 10 or 5 samples are tried.
+    3 s, or at least 1 or 2 s if these shorter rests determine bias and scale better. The largest
+    variance in a rest, too, is chosen so that the rests determine bias and scale best. If the user
+    or the bag states |f|, this variance is fixed, and `min_rest_s` is by default 3 s. At a low
+    sample rate, cells of the usual number of samples are so long that drifts look like motions and
+    short rests are lost: cells of 10 or 5 samples are tried.
     """
 
     def reduced(least: int) -> tuple[ReducedBag, float]:
@@ -238,7 +238,7 @@ def _reduced(
     if source.force is None:
         ranges = _rests(cells, min_rest_s, still_sd)
     else:
-        # |f| at rest is not gravity, so thresholds cannot be chosen by the norms of rests.
+        # If |f| is stated, it is not gravity: the norms of rests cannot decide on thresholds.
         cells = stillness.without_rotation(cells)
         ranges = stillness.still_intervals(cells, min_rest_s or 3.0, still_sd)
     restless = reading.causes.cause(cells, still_sd)
@@ -289,7 +289,7 @@ def _cycle_s(cells: Cells) -> float:
     """Return the typical interval between samples [s]; NaN without samples."""
     if not len(cells.count):
         return np.nan
-    # Complete cells have the median number of samples, or one more or less. If most cells are not
+    # A cell is complete if its number of samples is within 1 of the median. If most cells are not
     # complete, as with bursts of samples, cells with over half of the median number are used.
     median = float(np.median(cells.count))
     use = np.abs(cells.count - median) <= 1.0
@@ -306,7 +306,7 @@ def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
     use &= stamp_ns > np.maximum.accumulate(before[: len(stamp_ns)])
     stamp_ns, value = stamp_ns[use], value[use]
     span_s = np.ptp(stamp_ns) * 1e-9 if len(stamp_ns) else 0.0
-    # Average over 0.2 s, as no thermometer responds faster and the tracker's Python loop is slow.
+    # Average readings over 0.2 s: no thermometer is faster, and the tracker's Python loop is slow.
     size = int(0.2 * (len(stamp_ns) - 1) / span_s) if span_s else 1
     n = len(stamp_ns) // size * size if size > 1 else 0
     if n:
@@ -319,14 +319,14 @@ def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
 
 def is_spike(value: Floats) -> Bools:
     """Return which readings are over 10 K from the median of five readings about them, (n,)."""
-    # A thermometer with a loose contact reads -127 or 85 degC for a moment. The noise is estimated
-    # without such readings, so that the tracker rejects them as outliers.
+    # A thermometer with a loose contact reads -127 or 85 degC for a moment. Its noise is estimated
+    # without such spikes, so that the tracker rejects them as outliers.
     far = np.zeros(len(value), dtype=bool)
     if len(value) > 4:
         middle = np.median(sliding_window_view(value, 5), axis=1)
         far[2:-2] = np.abs(value[2:-2] - middle) > 10.0
-        # The first reading, and the last, has neighbours on one side only. A large step to its
-        # neighbour belongs to a ramp if the step from there to the next neighbour is similar.
+        # The first and the last reading have neighbours on one side only. A large step to the
+        # nearest reading belongs to a ramp if the next step in this direction is similar.
         for place, nearest in ((0, value[:3]), (-1, value[:-4:-1])):
             step, after = np.abs(np.diff(nearest)).tolist()
             far[place] = step > 10.0 and after < CONTINUED_SHARE * step
@@ -334,7 +334,7 @@ def is_spike(value: Floats) -> Bools:
 
 
 def _max_abs(cells: Cells) -> float:
-    """Return the 99 % quantile, over cells, of |mean| + 3 sd of the axis with the largest sum."""
+    """Return the 99 % quantile, over cells, of the largest |mean| + 3 sd of the three axes."""
     if not len(cells.count):
         return 0.0
     sizes = np.max(np.abs(cells.mean) + 3.0 * np.sqrt(cells.variance), axis=1)
@@ -426,7 +426,7 @@ def rounding_sd(variance: Floats, drift: Floats, quantum: Floats) -> Floats:
 
     `variance`: median variance of the rounded samples in a cell; above 0, the noise of the
     samples averages the rounding error to 0.
-    `drift`: range of the means; a drift over n steps of the converter divides the sd by n + 1.
+    `drift`: range of the means; over n steps of the converter it divides the error's sd by n + 1.
     """
     steps = np.divide(drift, quantum, where=quantum > 0.0, out=np.zeros(3))
     return np.asarray(np.where(variance > 0.0, 0.0, quantum / 12.0**0.5 / (1.0 + steps)))

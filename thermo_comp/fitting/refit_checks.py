@@ -77,7 +77,7 @@ def _slow_drift(data: Windows, drift: Floats) -> tuple[float, float]:
 
 
 def is_better_with_tilts(fit: Fit, tilted: Fit) -> bool:
-    """Whether errors of left-out |f| decrease if the supports may tilt from hour to hour."""
+    """Whether errors of |f| in left-out positions fall if supports may tilt from hour to hour."""
     before, after = fit.selected.score.norms, tilted.selected.score.norms
     n_common = np.sum(np.isfinite(before.square) & np.isfinite(after.square))
     gain = before.gain_of(after)
@@ -118,7 +118,7 @@ def of_whole_rests(
     for bag in bags:
         for rest in bag.intervals:
             parts = [next(left) for _ in _pieces(rest, bag.window_s)]
-            # A rest of one sample has a duration of 0, so its weight is the length of a window.
+            # Weight of a piece: its duration, or a window's length if longer (one sample: 0 s).
             share = np.array([max(part.duration_s, bag.window_s) for part in parts])
             up = share @ np.array([part.up for part in parts])
             x, y, z = (up / np.linalg.norm(up)).tolist()

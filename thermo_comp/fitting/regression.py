@@ -58,7 +58,7 @@ class PosteriorMode:
 
     @property
     def effective_parameters(self) -> Floats:
-        """Effective parameters of each column, sum over the axes, shape (2, m)."""
+        """Effective parameters of each column's weights, summed over the axes, shape (2, m)."""
         padded = np.append(self.determined, 0.0)
         return np.asarray(padded[self.layout.weights].sum(axis=1))
 
@@ -111,7 +111,7 @@ class Point:
         of_data = float((each + self.regression.noise_determinant).sum())
         of_prior = float(self.precision @ self.deviation**2)
         if self.prior.informative is not None:
-            # `precision` is 0 for unknowns with an informative prior: add the term of this prior.
+            # `precision` is 0 for unknowns with an informative prior, whose term is added here.
             root = self.prior.informative.root
             of_prior += float(np.sum((root @ self.deviation[: self.layout.n_unit]) ** 2))
         if self._common_variance:
@@ -223,7 +223,7 @@ class Point:
         return self._solution(self._reduced(Normal(local, unit), self.deviation))[0]
 
     def with_step(self, step: Floats) -> Point:
-        """Return the point at the state plus a step."""
+        """Return the equations linearised about the state plus a step."""
         return replace(self, state=with_step(self.state, step, self.layout))
 
     def stepped(self) -> Point:
@@ -282,7 +282,7 @@ class Regression(Equations):
     _linearised: tuple[State, Layout, Floats, Tangent, Normal] | None = None
 
     def at(self, state: State, prior: Prior, grams: Floats | None = None) -> Point:
-        """Return the equations at a state, inactive weights 0; `grams`: None for all windows."""
+        """Linearise about `state`, with inactive weights 0; `grams`: by default of all windows."""
         layout = self.layout(prior.column_sd > 0.0, prior.nonlinear_sd > 0.0)
         grams = self.products(layout.used).of_positions if grams is None else grams
         return Point(self, without_inactive(state, layout), prior, layout, grams)

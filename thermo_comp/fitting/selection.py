@@ -127,7 +127,7 @@ class Growth:
         self.tried: list[Trial] = []
 
     def fit(self, groups: tuple[str, ...], state: State, prior: Prior, typical: Floats) -> Trial:
-        """Fit the model of `groups`, also with columns that the fit of a smaller model dropped."""
+        """Fit all columns of `groups`, also those that the fit of a smaller model dropped."""
         candidates = replace(self._candidates, typical=typical)
         initial_sd = np.where(prior.column_sd > 0.0, prior.column_sd, typical)
         is_wanted = np.isin(self._names, groups)
@@ -147,7 +147,7 @@ class Growth:
         self, before: Trial, groups: tuple[str, ...] = (), most: Floats | None = None
     ) -> Trial:
         """
-        Fit the model `before` with further groups, beginning from the fit of `before`. `most`:
+        Fit the model `before` plus groups of columns, beginning from the fit of `before`. `most`:
         largest typical prior sd of the new columns, (2, m); None for the typical sd of `before`
         """
         regression, posterior, typical = self.regression, before.posterior, before.typical
@@ -159,7 +159,7 @@ class Growth:
                 # mean squares to the mean square of the residual.
                 by_attitude = regression.gravity * state.from_pose
                 square += float(np.mean(state.offset**2) + np.mean(by_attitude**2))
-            # With its typical weight, a new column alone would explain the RMS residual.
+            # The typical weight of a new column is that which alone explains the RMS residual.
             slope = np.sqrt(square) / (float(kelvins[0]) or 1.0)
             units = np.array([[1.0], [1.0 / (regression.gravity or 1.0)]])
             new = np.minimum(slope * units * kelvins, most)
@@ -167,7 +167,7 @@ class Growth:
         return self.fit((*before.groups, *groups), posterior.state, posterior.prior, typical)
 
     def added(self, chosen: Trial, progress: Callable[[float], None]) -> Trial:
-        """Add groups while left-out errors decrease; return the final model."""
+        """Add groups of columns while left-out errors decrease; return the final model."""
         part = 1.0
         while True:
             larger = self.trials(chosen, self.free)
@@ -183,7 +183,7 @@ class Growth:
             chosen = next(t for t in better if t is best or not is_better(t.score, best.score))
 
     def with_bends(self, before: Trial, groups: Sequence[str]) -> list[Trial]:
-        """Fit model `before` plus groups, then also with columns of `BEND`; return all fits."""
+        """Fit `before` plus `groups`, and this model plus columns of `BEND`; return all fits."""
         added = tuple(group for group in groups if group in self.free)
         smooth = self.extended(before, added, self._candidates.typical)
         return [smooth, *self.trials(smooth, [BEND])]
@@ -205,7 +205,7 @@ class Growth:
         return chosen
 
     def trials(self, chosen: Trial, groups: Sequence[str]) -> list[Trial]:
-        """Fit the chosen model plus one set of groups, for up to 4 sets with large gains."""
+        """Fit the chosen model plus groups of columns, for up to 4 choices with large gains."""
         absent = [group for group in groups if group in self.free and group not in chosen.groups]
         if not absent:
             return []
@@ -298,7 +298,7 @@ def select(
 def _grown(
     growth: Growth, first: Trial, parts: Trial | None, progress: Callable[[float], None]
 ) -> Trial:
-    """Add groups to `first`, or to `parts` if this model is better; return the best model."""
+    """Add groups of columns to the better of `first` and `parts`; return the best model."""
     chosen = first
     if parts is not None:
         trials = [parts, *growth.trials(parts, [BEND])]
@@ -314,8 +314,8 @@ def _grown(
     may_bend = BEND in growth.free and {*PRODUCTS} & {*chosen.groups}
     if may_bend and BEND not in chosen.groups and not chosen.is_complete:
         # A bend of the curve over a part's temperature is found only in a model with the part's
-        # lag, not in one that approximates the lag by products and squares. Add groups to the
-        # model with bends if its left-out error is below three times that of the chosen model.
+        # lag, not in one that approximates the lag by products and squares. Add columns to a model
+        # with lags and bends if its left-out error is below three times that of the chosen model.
         _, *with_bends = growth.with_bends(first, LAGS)
         if with_bends and with_bends[0].score.rms < 3.0 * chosen.score.rms:
             growth.tried += with_bends

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the estimation of thermometer and detector settings from bags.
+Owns the estimation of the settings of thermometers and of the regime detector from bags.
 
 Rates of temperature are central differences over two minutes, which are not causal and so need a
-recording. The rates show the lag and the ramps of the test. Lag, ramps and noise of the readings
-become settings of the thermal tracker and of the regime detector, which are causal.
+recording. These rates show the lags of the thermometers and the ramps of the test. Lags, ramps and
+noise of their readings become settings of the causal thermal tracker and regime detector.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ whitens these series for slow noise, and the sums of products of whitened series
 All terms of the measurement equation (`equations`) are linear combinations of the base series, so
 the sums of the products of whitened base series in each position are sufficient statistics.
 
-The noise is white plus exponentially correlated (first-order Gauss-Markov). Within a position the
+Windows' noise is white plus exponentially correlated (first-order Gauss-Markov). In a position the
 error of window k is ``c_k + e_k``: e_k is white with variance ``sigma^2 / weight_k``, c_k a
 stationary Gauss-Markov process of variance ``ratio sigma^2`` and correlation time T (IEEE Std 952,
 Annex B.4.3); a random walk is the limit for a long T. Flicker noise, the bias instability of a
@@ -273,7 +273,7 @@ class Series:
         self.noise_determinant = self.whitener.log_determinant(self.weight, noise)
 
     def products(self, used: Bools) -> Products:
-        """Return the sums of products for the active columns, (2, m), and the noise last set."""
+        """Return the sums of products, with the columns `used`, (2, m), for the current noise."""
         active = np.flatnonzero(used.any(axis=0))
         if self._products is None or not np.array_equal(self._products.base.columns, active):
             base = Base.of(active, self.windows.lag, self._n_t, self.windows.tilt.shape[1])
@@ -326,6 +326,6 @@ class Series:
         return result
 
     def products_at(self, products: Floats, state: State, base: Base) -> Floats:
-        """Convert sums of products, (n_positions, n_base, n_base), to `state`'s initial lags."""
+        """Convert sums of products, (n_positions, n_base, n_base), to `state.start` lag states."""
         half = self.at_starts(products, state, base)
         return self.at_starts(np.swapaxes(half, 1, 2), state, base)

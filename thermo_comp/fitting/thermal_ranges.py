@@ -37,7 +37,7 @@ def valid_range(values: Floats, smallest_margin: float, order: int = 0) -> Range
     """
     Return the valid range of a quantity that is proportional to a power (`order`) of a heat flow,
     and so of the rate of a ramp: the range of its values with a margin, extended by the factor
-    2^order to ramps of twice the rate. A temperature has the order 0: its range is not extended.
+    2^order to ramps of twice the rate. Order 0 is for temperatures: their range is not extended.
     """
     ratio = 2.0**order
     lower, upper = float(np.min(values)), float(np.max(values))
@@ -104,7 +104,7 @@ def _has_gradients(windows: ThermalWindows) -> bool:
 
 
 def usable_board_lag(windows: ThermalWindows) -> float:
-    """Return the lag of the board behind the case [s]; outside 1..1e5 s the usual lag."""
+    """Return the lag of the board behind the case [s], or a usual lag if not in 1..1e5 s."""
     lag = _slope_of_gradient(windows)
     return lag if 1.0 <= lag <= 1e5 else USUAL_BOARD_LAG_S
 

@@ -304,8 +304,8 @@ class State:
     @cached_property
     def tangents(self) -> Floats:
         """
-        Two vectors perpendicular to each attitude, shape (n, 3, 2). The vectors of an attitude
-        with a pose are the tangents of this pose, projected perpendicular to the attitude.
+        Two vectors perpendicular to the `up` of each attitude, shape (n, 3, 2). For an attitude
+        with a pose they are the tangents of this pose, projected perpendicular to `up`.
         """
         result = tangent_basis(self.up)
         if self.pose.size:

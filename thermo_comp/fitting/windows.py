@@ -332,8 +332,8 @@ def _windows(
     tilt = np.column_stack((t, gradient, (t + gradient) ** 2))
     tilt_rms = np.sqrt(np.mean(tilt**2, axis=0))
     is_tilting = tilt_rms > 0.0
-    # The scale has no level of the dynamic set (the relative scale is 1 at the reference
-    # temperature in both regimes), and no columns of terms that act on the bias only, `has_scale`.
+    # No weights in the scale: the level of the dynamic set (the relative scale at the reference
+    # temperature is 1 in both regimes), and terms that act on the bias only (not `has_scale`).
     in_scale = [True] * n_curves + [c.term.has_scale for c in columns] + [True] * len(sums)
     in_scale[model.sets.level] = False
     start = np.hstack((np.zeros((len(t), n_curves)), rows.start))
@@ -416,7 +416,7 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
     """Run the thermal tracker over the readings of a bag; store its state 5 times per window."""
     spec = replace(spec, lags=(), plays=())
     if not len(bag.board.value):
-        # Without readings, assume the reference temperature since 1e9 s, so that all lags are 0.
+        # Without readings the unit is at the reference temperature, since 1e9 s: all lags are 0.
         still = np.zeros((2, StateLayout(spec).width))
         still[:, BOARD] = model.reference_temperature
         end_s = 1.0 + (bag.end_ns - bag.start_ns) * 1e-9
