@@ -153,7 +153,7 @@ class Reduced:
         return sum(block.log_determinant for block in blocks if block is not None)
 
     def with_prior_of_sum(self, total: Floats, variance: float) -> Reduced:
-        """Add a prior of mean 0 and `variance` to the sum `total` over bags of initial lag states."""
+        """Add a prior (mean 0, `variance`) to `total`, the sum of initial lag states over bags."""
         r = len(total)
         cross = self.bags.solved[:, :r].sum(axis=0, keepdims=True)
         cross[..., -1] += total

@@ -223,7 +223,7 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
 def _relative_to(
     calibration: Calibration, template: Calibration, mean_K: Floats
 ) -> tuple[Floats, Floats]:
-    """Return parameters and covariance in `template`'s layout, converted to the scales `mean_K`."""
+    """Return parameters and covariance in `template`'s layout, converted to scales `mean_K`."""
     if calibration.posterior is None:
         raise FitError(
             f'the calibration of unit {calibration.unit.serial} has no covariance, so it cannot '
