@@ -64,7 +64,7 @@ def model_of(
 
 
 def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
-    """Fit the windows with alternative lags and regimes; return the best fit and its windows."""
+    """Fit the windows with alternative lags and regime detectors; return the best fit."""
     bags, options = problem.bags, problem.options
     fit = _with_lags(windows, problem)
     has_case = all(len(bag.case.value) for bag in bags)
@@ -87,7 +87,7 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     closed = replace(model, detector=replace(model.detector, end_condition='case'))
     undisturbed = fit.windows.data.undisturbed
     early = regress(windows_of(bags, closed, options, undisturbed=undisturbed), problem)
-    # Left-out halves of the program show too many columns, not which of two detectors is better.
+    # Left-out halves of the program detect superfluous columns, not the better of two detectors.
     return early if is_better(fit.selected.score, early.selected.score, by_halves=False) else fit
 
 

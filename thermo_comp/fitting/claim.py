@@ -117,7 +117,7 @@ def _over_offsets(
     n_mountings = int(windows.mounting[-1]) + 1
     is_single = windows.n_turn_ons == 1 < n_mountings
     if scale <= 0.0:
-        # A stated offset sd also holds for a turn-on. The mean of m mounting offsets has the
+        # A sd stated by the user is also that of turn-ons. The mean of m mounting offsets has the
         # variance sd^2 / m in the regression: add the remaining (1 - 1 / m) sd^2.
         variance = offset_sd**2 * (1.0 - 1.0 / n_mountings) if is_single else 0.0
         return posterior.covariance, offset_sd, variance

@@ -97,13 +97,13 @@ def distinct_directions(up: Floats) -> Floats:
 
 
 def directions(means: Floats, centre: Floats) -> Floats:
-    """Return unit vectors from a centre to mean readings (n, 3), NaN at the centre."""
+    """Return unit vectors from a centre to mean readings (n, 3); NaN if a reading is there."""
     norms = np.linalg.norm(means - centre, axis=1, keepdims=True)
     return np.asarray((means - centre) / np.where(norms > 0.0, norms, np.nan))
 
 
 def n_directions(means: Floats) -> int:
-    """Return the number of distinct directions of mean readings, (n, 3), from `rough_centre`."""
+    """Return the number of distinct directions of mean readings, (n, 3), about `rough_centre`."""
     return len(distinct_directions(directions(means, rough_centre(means))))
 
 
@@ -119,7 +119,7 @@ def rough_centre(means: Floats) -> Floats:
         return zero
     arms = means - means.mean(axis=0)
     spread = float(np.sqrt(np.mean(np.sum(arms**2, axis=1))))
-    # The centre is 0 if the norms' sd is below 30 % of the readings' RMS distance from their mean.
+    # The result is 0 if the norms' sd is below 30 % of the readings' RMS distance from their mean.
     if np.std(np.linalg.norm(means, axis=1)) < 0.3 * spread:
         return zero
     values = np.linalg.eigvalsh(arms.T @ arms)
@@ -144,7 +144,7 @@ def rough_centre(means: Floats) -> Floats:
 
 
 def geometry(up: Floats, with_misalignment: bool) -> float:
-    """Return the ratio of the largest sd of a constant to the noise sd of |f|; inf if unknown."""
+    """Return the largest sd of a constant / noise sd of |f|; inf if a constant is undetermined."""
     jacobian = norm_columns(up)[:, : 9 if with_misalignment else 6]
     values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
     if values[0] < 1e-9 * values[-1]:
@@ -154,7 +154,7 @@ def geometry(up: Floats, with_misalignment: bool) -> float:
 
 def best_rests(candidates: list[Floats]) -> int:
     """
-    Return the index of the best set of rests; each set has mean readings of shape (n, 3).
+    Return the index of the best candidate: a set of n rests, given by mean readings, (n, 3).
 
     The largest sd of a calibration constant follows from the directions of a set's rests and the
     residuals of |f|. The best set is the first whose largest sd is within 2 % of the smallest of

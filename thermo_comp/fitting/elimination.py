@@ -153,7 +153,7 @@ class Reduced:
         return sum(block.log_determinant for block in blocks if block is not None)
 
     def with_prior_of_sum(self, total: Floats, variance: float) -> Reduced:
-        """Add a prior (mean 0, `variance`) to `total`, the sum of initial lag states over bags."""
+        """Add a prior (mean 0, `variance`) of `total`, the sum of initial lag states over bags."""
         r = len(total)
         cross = self.bags.solved[:, :r].sum(axis=0, keepdims=True)
         cross[..., -1] += total
@@ -186,7 +186,7 @@ class Reduced:
         return positions, starts
 
     def without(self, places: Ints, normal: Normal) -> Floats:
-        """Return `matrix` less the positions `places`; `normal`: equations of these positions."""
+        """Return `matrix` without positions `places`, whose normal equations are `normal`."""
         bag, r = self.layout.bag, len(self.bags.root[0])
         at = np.unique(bag[places])
         others = (bag == at[:, None]) & ~np.isin(np.arange(len(bag)), places)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the estimation of prior sd and noises, and the removal of columns of small log Bayes factor.
+Owns the estimation of prior sds and noises, and the removal of columns of small log Bayes factor.
 
 Each column has one prior standard deviation of its weights in the bias of all axes and one in the
 scale. Each sd that is not fixed is found by MacKay's fixed point [1]_ with a log-normal hyperprior
@@ -122,7 +122,7 @@ def _updated(
 
 
 def _misalignment_sd(posterior: PosteriorMode) -> float:
-    """Move the sd of the elements of M to the mode if the data determine more than one element."""
+    """Move the prior sd of the misalignment to its mode if more than one element is determined."""
     prior, misalignment = posterior.prior, posterior.state.misalignment
     if prior.informative is not None or prior.unseen_misalignment_sd:
         return prior.misalignment_sd
@@ -136,7 +136,7 @@ def _misalignment_sd(posterior: PosteriorMode) -> float:
 
 
 def _start_variance_ratio(posterior: PosteriorMode) -> float:
-    """Move the variance ratio of the initial lag states to the mode."""
+    """Move the prior variance ratio of the initial lag states to its mode."""
     start, places = posterior.state.start, posterior.layout.start
     if not places.size:
         return posterior.prior.start_variance_ratio
@@ -149,7 +149,7 @@ def _start_variance_ratio(posterior: PosteriorMode) -> float:
 
 
 def _tilt_sd(posterior: PosteriorMode, kelvins: float) -> float:
-    """Move the sd of tilts towards the mode; `kelvins`: RMS of T_board less the reference [K]."""
+    """Move the prior sd of tilts towards its mode; `kelvins`: RMS of T_board - T_reference [K]."""
     sd, tilt = posterior.prior.tilt_sd, posterior.state.tilt
     if not tilt.size:
         return sd
@@ -162,7 +162,7 @@ def _tilt_sd(posterior: PosteriorMode, kelvins: float) -> float:
 
 
 def _pose_sd(posterior: PosteriorMode) -> float:
-    """Move the sd of attitudes about poses towards the mode."""
+    """Move the prior sd of attitudes about their poses towards its mode."""
     sd, layout = posterior.prior.pose_sd, posterior.layout
     if not layout.pose.size:
         return sd

@@ -117,7 +117,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     state = initial_state(regression, start, problem.up)
     prior = _initial_prior(windows, problem)
     if n_directions >= POSITIONS_NEEDED and not data.has_turn_ons:
-        # Turn-on offsets are no unknowns here, and M would explain them: reduce M's prior sd.
+        # Turn-on offsets are no unknowns here, and M would explain them: reduce the prior sd of M.
         prior = _with_faces(prior, problem.up)
     steepness = _steepness(windows, problem, is_at_rest=is_at_rest)
     candidates = _candidates(windows, problem, steepness, is_bench=is_bench)

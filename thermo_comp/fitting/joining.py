@@ -132,7 +132,7 @@ def _is_one_rest(before: StillInterval, after: StillInterval, window_s: float) -
     Whether a rest continues in the next part. The gap between the parts is at most three windows
     long. The step over the gap is, on each axis, at most five times the RMS step between the 20
     windows before the gap and between the 20 windows after it, or twice the largest of these steps
-    (most steps may be 0 by rounding). There must be 10 or more steps between these windows.
+    (most steps may be 0 by rounding). If fewer than 10 steps are known, the rest ends.
     """
     gap_s = 1e-9 * (after.start_ns - before.end_ns)
     means = before.mean[: before.n_whole][-20:], after.mean[:20]

@@ -216,8 +216,8 @@ def _place_of_step(time: Floats, accel: Floats, quiet_sd: Floats, r: float) -> i
     residual = residual - trend @ (trend.T @ residual)
     candidates = np.arange(_FEWEST_SAMPLES, n - _FEWEST_SAMPLES + 1)
     # A unit step at sample k, whitened for the lag-1 correlation r, is 1 at k and 1 - r after k:
-    # its product with a residual is a sum over the residuals from sample k on. Removing the trend
-    # from the whitened step reduces its square by squares of sums over the trend from k on.
+    # its product with a residual is a sum over the residuals from sample k on. Without the trend
+    # the step's sum of squares is smaller by the squared sums of the trend columns from k on.
     tail = _sums_behind(residual, r)[candidates]
     trend_tail = _sums_behind(trend, r)[candidates]
     square = 1.0 + (1.0 - r) ** 2 * (n - candidates - 1) - (trend_tail**2).sum(axis=1)
@@ -254,7 +254,7 @@ def _trend(time: Floats, r: float) -> Floats:
 
 
 def _turn(time: Floats, gyro: Floats, at: int) -> float:
-    """Return the rotation within 1 s of a step [rad]; each side's median rate is subtracted."""
+    """Return the rotation within 1 s of a step [rad], by rates less the median of each side."""
     about_level = [side - np.median(side, axis=0) for side in (gyro[:at], gyro[at:])]
     angles = np.concatenate(about_level)[1:] * np.diff(time)[:, None]
     return float(np.linalg.norm(angles[np.abs(time[1:] - time[at]) <= 1.0].sum(axis=0)))

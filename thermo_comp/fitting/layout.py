@@ -202,9 +202,9 @@ class Tangent:
     The equations linearised about a state, as coefficients of the base series at this state.
 
     The derivative of the readings w.r.t. an unknown is a factor times a base series, or times one
-    of the combinations `combined` of base series. For axis i, position p and unknown u it is
-    ``factor[p, i, u]`` times series ``place[u]``, which is a base series or, from index n_base on,
-    one of `combined`. The unknowns in the equations of an axis are those of the position
+    of the combinations `combined` of base series. For axis i, position p and unknown u the
+    derivative is ``factor[p, i, u]`` times series ``place[u]``: a base series or, from index
+    n_base on, one of `combined`. The unknowns of an axis, in this order, are those of the position
     (2 of the attitude, stretch, offset, tilts), then those of the bag (initial lag states, turn-on
     offset), then those of the unit (kappa, bias, weights, nonlinear coefficients, radius, 3 of the
     misalignment, 2 of each pose). The last element is for the residual, measured minus predicted.

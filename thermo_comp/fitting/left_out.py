@@ -103,7 +103,7 @@ class Folds:
         return max(estimates, key=lambda estimate: abs(estimate[0]) / max(estimate[1], 1e-12))
 
     def is_noise(self, other: Folds, noise: float) -> bool:
-        """Whether white noise explains the errors in those folds that `other` scores, too."""
+        """Whether white noise explains the errors in the folds that `self` and `other` score."""
         known = np.isfinite(self.square) & np.isfinite(other.square)
         square = np.average(self.square[known], weights=self.windows[known])
         return bool(square <= (_NOISE_RATIO * noise) ** 2)

@@ -105,7 +105,7 @@ class Forces:
 
 def with_forces(windows: ThermalWindows, options: FitOptions) -> ThermalWindows:
     """
-    Add |f| of the positions and the nonlinear terms to the windows.
+    Add the stated |f| of the positions, and the nonlinear terms to be fitted, to the windows.
 
     The windows stay unchanged if |f| is within 1e-3 of gravity in all positions, and neither the
     options nor the prior have nonlinear terms.

@@ -185,7 +185,7 @@ class _PartCurves:
     def _is_of_use(
         self, lag: Part, axis: int, noise: float, most_noise: float = 3.0, reduction: float = 4.0
     ) -> bool:
-        """Whether the residual with `lag` is near the noise, or far below that with lag 0 s."""
+        """Whether the residual with `lag` is near the noise, or far below that of 0 s."""
         typical = 1.4826 * np.median(np.abs(self._weighted(lag, axis) / self._root_weight[:, 0]))
         return bool(typical <= most_noise * noise or self.reduction(lag, axis) >= reduction)
 
@@ -229,7 +229,7 @@ class _PartCurves:
         time; or `lag` itself if the residual does not become significantly smaller.
 
         The residual is linearised w.r.t. time constant and share of the gradient, or lead. The
-        sum of squares must decrease by a ratio that white noise has with a probability of 1e-5.
+        decrease of its sum of squares must have a probability below 1e-5 in white noise.
         """
         tau = lag.tau_s
         if not tau:
@@ -268,8 +268,8 @@ class _PartCurves:
         Return the lag of the smallest RMS residual by the simplex method, from the lag `first`.
 
         The search is over the logarithms of both time constants, the share of the gradient, and
-        lead / first time constant. `steps`: first steps in these coordinates; 0 keeps a coordinate
-        constant. `accuracy`: half of the largest extent of the final simplex.
+        lead / first time constant. `steps`: first steps in these four numbers, 0 keeps a number
+        constant; `accuracy`: half of the largest extent of the final simplex.
         """
         tau, second, share, lead = first
         start = np.array([np.log(tau), np.log(second or 1.0), share, lead / tau])
@@ -389,7 +389,7 @@ class _PartCurves:
         if self._shape.has_gradient:
             bias.append(self._case[:, None])
         of_scale = self._force[:, [axis]] * np.hstack(scale)
-        # The lag of the part at the start of each bag is unknown; its effect decays with tau.
+        # The unknown lag of the part at the start of a bag has an effect that decays with tau.
         begin = self._is_of_bag * np.exp(-self._age / max(lag.tau_s, 1.0))
         return self._centred(np.hstack((*bias, of_scale, begin)))
 

@@ -171,7 +171,7 @@ def _in_one_stage(column: Column, tau_s: float) -> Column:
 
 def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
     """
-    Return columns of the bank of time constants, with factors, whose sum approximates a column.
+    Return columns of the bank of time constants, and factors: their sum approximates `column`.
 
     Parts of two units of a type have different time constants, so a lag is interpolated between
     the lags of the bank, which is common to all units; a lag of 0 s has the value 0. A lag of two
@@ -223,7 +223,7 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
 def _relative_to(
     calibration: Calibration, template: Calibration, mean_K: Floats
 ) -> tuple[Floats, Floats]:
-    """Return parameters and covariance in `template`'s layout, converted to scales `mean_K`."""
+    """Return parameters and covariance in `template`'s layout, for scale factors `mean_K`."""
     if calibration.posterior is None:
         raise FitError(
             f'the calibration of unit {calibration.unit.serial} has no covariance, so it cannot '

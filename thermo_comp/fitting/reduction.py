@@ -4,10 +4,10 @@
 Owns the statistics of a bag: still intervals, their windows, temperature readings, counters.
 
 The blocks of a bag are read once, in bounded memory. Samples are averaged to cells of about half a
-second (see `stillness`), and the cells of a still interval to windows of ten seconds. Windows of a
-short interval, and the last window of an interval, may be shorter. Within a window the deviation
-of every thermal regressor from a straight line is far below the noise, so the mean of a window is
-a sufficient statistic. The regression estimates the noise of the means, which for a
+second (see `stillness`), and the cells of a still interval to windows of ten seconds. A short
+interval, and the end of an interval, may have shorter windows. Within a window the deviation of
+every thermal regressor from a straight line is far below the noise, so the mean of a window is a
+sufficient statistic. The regression estimates the noise of these means, which for a
 charge-balancing converter is less than the scatter of the samples implies.
 """
 
@@ -196,7 +196,7 @@ def reduce_source(
 
     `still_sd` is the largest sd of samples at rest [g]. Without `min_rest_s` a rest lasts at least
     3 s, or at least 1 or 2 s if these shorter rests determine bias and scale better. The largest
-    variance in a rest, too, is chosen so that the rests determine bias and scale best. If the user
+    variance allowed in a rest is chosen so that rests determine bias and scale best. If the user
     or the bag states |f|, this variance is fixed, and `min_rest_s` is by default 3 s. At a low
     sample rate, cells of the usual number of samples are so long that drifts look like motions and
     short rests are lost: cells of 10 or 5 samples are tried.

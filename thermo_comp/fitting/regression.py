@@ -223,7 +223,7 @@ class Point:
         return self._solution(self._reduced(Normal(local, unit), self.deviation))[0]
 
     def with_step(self, step: Floats) -> Point:
-        """Return the equations linearised about the state plus a step."""
+        """Return a `Point` whose state is this state plus a step."""
         return replace(self, state=with_step(self.state, step, self.layout))
 
     def stepped(self) -> Point:

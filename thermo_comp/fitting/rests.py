@@ -52,8 +52,8 @@ def is_steady(windows: ThermalWindows) -> Bools:
     """
     Return which positions have constant temperatures, shape (n_positions,): in a position the
     board temperature and the lags change (RMS) by less than three sd of the estimated board
-    temperature. Noise is a ninth of the mean square of a change of three sd, so slopes fitted to
-    such changes would be a ninth too small.
+    temperature. A ninth of the mean square of a change of three sd is noise, so slopes fitted
+    over such changes would be a ninth too small.
     """
     data, model = windows.data, windows.model
     lags = [column.group in LAGS and not column.power for column in model.columns]

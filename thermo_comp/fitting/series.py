@@ -182,7 +182,7 @@ class Base:
 
     @classmethod
     def of(cls, columns: Ints, lags: Ints, n_t: int, n_tilts: int) -> Base:
-        """Assign indices to the series; `lags`: index of each column's lag, -1 for none."""
+        """Assign indices to base series; `lags`: index of each column's lag, -1 for none."""
         lagged = np.flatnonzero(lags[columns] >= 0)
         counts = 1 + len(columns), len(lagged), n_t, n_tilts, 3
         _, *places = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
@@ -216,7 +216,7 @@ class Products:
         return np.asarray(np.add.reduceat(self.cells, self.first, axis=0))
 
     def without(self, sections: Ints) -> Floats:
-        """Return the sums over each position, without the windows of the given sections."""
+        """Return `of_positions` without the products of the windows of the given sections."""
         result: Floats = self.of_positions.copy()
         left_out = np.flatnonzero(np.isin(self.section, sections))
         position = np.searchsorted(self.first, left_out, side='right') - 1
@@ -326,6 +326,6 @@ class Series:
         return result
 
     def products_at(self, products: Floats, state: State, base: Base) -> Floats:
-        """Convert sums of products, (n_positions, n_base, n_base), to `state.start` lag states."""
+        """Convert `products`, (n_positions, n_base, n_base), to initial lag states of `state`."""
         half = self.at_starts(products, state, base)
         return self.at_starts(np.swapaxes(half, 1, 2), state, base)

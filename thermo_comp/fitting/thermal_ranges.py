@@ -177,7 +177,7 @@ def _known_ranges(fit: Fit, known: Calibration | None) -> Floats:
     prior sd of its scale factor includes the error of extrapolation.
     """
     lower, upper = _seen(fit, known)
-    # The temperature ranges of the positions of one test differ by about a tenth.
+    # The temperature ranges of the positions of one test differ by about a tenth of the range.
     reach = 0.1 * (upper - lower)
     is_seen = lower <= upper
     return np.where(is_seen, (lower - reach, upper + reach), [[-np.inf], [np.inf]])

@@ -67,7 +67,7 @@ class Sets:
 
     @property
     def families(self) -> tuple[TemperatureFunction, TemperatureFunction]:
-        """Families of both curves; a shared dynamic curve has the higher of both orders."""
+        """Families of both curves; the dynamic curve, if shared, has the higher of both orders."""
         is_higher = self.is_shared and self.static.n_free > self.dynamic.n_free
         return self.static, self.static if is_higher else self.dynamic
 
@@ -203,7 +203,7 @@ class ThermalWindows:
 
     @property
     def has_temperature(self) -> bool:
-        """Whether a change of temperature was recorded."""
+        """Whether the board temperature differs between windows."""
         return bool(np.ptp(self.temperature) > 0.0)
 
 
@@ -416,7 +416,7 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
     """Run the thermal tracker over the readings of a bag; store its state 5 times per window."""
     spec = replace(spec, lags=(), plays=())
     if not len(bag.board.value):
-        # Without readings the unit is at the reference temperature, since 1e9 s: all lags are 0.
+        # Without readings take the reference temperature for the last 1e9 s: all lags are 0.
         still = np.zeros((2, StateLayout(spec).width))
         still[:, BOARD] = model.reference_temperature
         end_s = 1.0 + (bag.end_ns - bag.start_ns) * 1e-9
