@@ -105,10 +105,10 @@ def residual_rows(fit: Fit) -> tuple[tuple[ResidualRow, ...], Floats, Floats]:
 
 
 def _with_only(regression: Regression, chosen: PosteriorMode, groups: tuple[str, ...]) -> State:
-    """Repeat the fit with the given groups only, under an almost flat prior of their weights."""
+    """Fit only the columns of the given groups, under an almost flat prior of their weights."""
     only = np.isin(regression.windows.groups, groups)
-    # The residuals of a model with few groups are mostly model error, which slow noise or mounting
-    # offsets would absorb: the fit has white noise only and no offsets.
+    # Residuals of a model of few columns are mostly model error, which slow noise or mounting
+    # offsets would absorb: this fit has white noise only and no offsets.
     prior = replace(
         chosen.prior,
         column_sd=only * regression.windows.parts * [[0.05], [0.005]],
@@ -141,9 +141,9 @@ def position_reports(fit: Fit, residual: Floats, left_out: Floats) -> tuple[Posi
 
 def group_evidence(regression: Regression, posterior: PosteriorMode) -> tuple[GroupEvidence, ...]:
     """
-    Return RMS contribution, effective parameters and log Bayes factor of each active group.
+    Return contribution (RMS), effective parameters and log Bayes factor of groups of columns.
 
-    The Bayes factor compares the fit with a fit without the group or, if the prior is a
+    The Bayes factor compares the fit with a fit without a group or, if the prior is a
     calibration, with a fit in which the group keeps the weights of this calibration.
     """
     names = np.array(regression.windows.groups)

@@ -156,7 +156,7 @@ def white_noise_of(windows: Windows, scale: Floats) -> Floats:
 def thermometer_error_of(windows: Windows, scale: Floats, *, beyond_noise: bool = False) -> Floats:
     """
     Return the error of a window on each axis due to the error of the board temperature [m/s^2],
-    (3,): the sd of the temperature times the slope of the samples over temperature in positions.
+    (3,): the sd of the temperature times the slope, within positions, of samples over temperature.
 
     `beyond_noise`: subtract the variance of a reading's noise from that of the temperature; the
     remaining error is due to coarse steps of the readings, or to long intervals between readings

@@ -130,9 +130,9 @@ def _intervals(parts: Sequence[ReducedBag]) -> tuple[StillInterval, ...]:
 def _is_one_rest(before: StillInterval, after: StillInterval, window_s: float) -> bool:
     """
     Whether a rest continues in the next part. The gap between the parts is at most three windows
-    long. The step over the gap is, on each axis, at most five times the RMS step between the 20
-    windows before the gap and between the 20 windows after it, or twice the largest of these steps
-    (most steps may be 0 by rounding). If fewer than 10 steps are known, the rest ends.
+    long. On each axis the step over the gap is at most five times the RMS, or twice the largest,
+    of the steps between successive windows of the 20 before and the 20 after the gap (most steps
+    may be 0 by rounding). A rest with fewer than 10 such steps near the gap does not continue.
     """
     gap_s = 1e-9 * (after.start_ns - before.end_ns)
     means = before.mean[: before.n_whole][-20:], after.mean[:20]

@@ -104,7 +104,7 @@ def _beside_gaps(
 
 
 def _margin(samples: Floats, quiet_sd: Floats) -> float:
-    """Return the time [s] to average beside a gap: 60 time constants of the noise, 10 to 100 s."""
+    """Return how long [s] to average beside a gap: 60 time constants of the noise, 10 to 100 s."""
     time, accel = samples[:, 0], samples[:, 1:4]
     if len(time) < 2 * _FEWEST_SAMPLES:
         return _MARGIN_S

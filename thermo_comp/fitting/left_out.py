@@ -80,9 +80,9 @@ class Folds:
         (positive if `other` is better), and the standard error of the log ratio, over the folds
         that are scored for both models; None without such folds.
 
-        The result is the more significant of two estimates, or 0 if their signs differ: the mean
-        of the log ratios of the folds, robust to few folds of large errors; and the log ratio of
-        the sums over folds (with its jackknife error), robust to folds of small errors.
+        The result is the more significant of two estimates, or 0 if their signs differ. The mean
+        of the log ratios of the folds is robust to few folds of large errors; the log ratio of the
+        sums of squares over the folds (with a jackknife error), to folds of small errors.
         """
         known = np.isfinite(self.square) & np.isfinite(other.square)
         n = int(known.sum())
@@ -210,9 +210,9 @@ def is_worse_by_norms(before: Score, after: Score) -> bool:
 
 def is_undecided(before: Score, after: Score) -> bool:
     """
-    Whether left-out data do not decide between two models, given that `after` is not better: the
-    drifts agree to 5 %, and the errors of |f| either have no fold scored for both models, or are
-    smaller in `after` by one to two standard errors.
+    Whether left-out data do not decide between two models, given that `after` is not better. The
+    drifts then agree to 5 %, and errors of |f| are smaller in `after` by one to two standard
+    errors, or no fold has an error of |f| for both models.
     """
     *drift, norms = _beyond_thermometer(before, after)
     is_equal = all(abs(gain[0]) < _NEGLIGIBLE_LOG_RATIO for gain in drift if gain)

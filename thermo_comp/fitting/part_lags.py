@@ -342,8 +342,8 @@ class _PartCurves:
         ratio = float(np.sqrt((square / noise**2).max()))
         x, y, z = (Part(*map(round, lag, (1, 1, 4, 1))) for lag in lags)
         # Other models are tried if the left-out drift is above `most_drift`: 2 sd of the noise, or
-        # 10 sd if noise explains the residual of a shape without stress, because such a shape
-        # extrapolates badly to left-out data.
+        # 10 sd for a shape without stress whose residual noise explains, because even then such
+        # a shape extrapolates badly to left-out data.
         is_curve = ratio <= self._shape.most_noise and not self._shape.has_stress
         most_drift = (10.0 if is_curve else 2.0) * float(noise.mean())
         return Parts((x, y, z), factors, most_drift), ratio

@@ -30,7 +30,7 @@ _FEWEST_NORMS = 6
 
 def extrapolates(fit: Fit) -> bool:
     """
-    Whether the left-out drift of the chosen model exceeds noise, and its bias at settled
+    Whether the left-out drift of the chosen model exceeds the noise, and its bias at settled
     temperatures has a larger expected error (`settled_error`) than that of a smaller model.
     """
     settled, trials = fit.windows.data.settled, fit.selected.trials

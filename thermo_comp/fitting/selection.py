@@ -3,8 +3,8 @@
 """
 Owns the choice of the model: groups of columns are added to the constants in steps.
 
-The log evidence ranks the groups to be tried; the score on left-out data decides which group is
-added. The fit of each model begins from the fit of a smaller model.
+The log evidence ranks the groups of columns to try; the score on left-out data decides which to
+add. The fit of each model begins from the fit of a smaller model.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ def _best(chosen: Trial, trials: Sequence[Trial]) -> Trial:
 
 
 class Growth:
-    """Fits models made of given groups; each fit begins from the fit of a smaller model."""
+    """Fits models of given groups of columns; each fit begins from the fit of a smaller model."""
 
     def __init__(self, regression: Regression, candidates: Candidates) -> None:
         self.regression = regression
@@ -267,7 +267,7 @@ def select(
     constants = first = better_start(fits)
     growth.tried.append(constants)
     if CURVE in growth.free:
-        # Add the curve without a test: a curve may improve the score only with further groups.
+        # Add the curve without a test: a curve may improve the score only with further columns.
         if regression.windows.has_drifts:
             curve = better_start([growth.extended(fit, (CURVE,)) for fit in fits])
             downweigh(regression, curve.posterior)
