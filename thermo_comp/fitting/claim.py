@@ -239,7 +239,7 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
         typical = np.minimum(typical, of_curve)
         # A curve column that the data do not determine may change the curve's slope by 50 %.
         sd = np.where(groups == CURVE, np.minimum(sd, 0.5 * of_curve), sd)
-    # n lags must not have more variance than one lag: each lag gets 1 / n of the variance.
+    # n lags must not have more prior variance than one: each weight gets 1 / n of the variance.
     is_lag = is_of_lags & (sd > 0.0)
     share = np.sqrt(np.maximum(is_lag.sum(axis=1, keepdims=True), 1))
     sd = np.where(is_lag, np.minimum(sd, typical / share), sd)

@@ -128,8 +128,8 @@ def with_unseen_axes(
     (lower, upper), (new_lower, new_upper) = _known_ranges(fit, known), _seen(fit, None)
     slope = _unknown_slope(fit) * fit.regression.gravity
     ends = _ends(fit, known)
-    # The variance of the lack of fit grows with the square of the distance in K, but is
-    # interpolated linearly between temperatures, so it is stated at five temperatures.
+    # The variance of an extrapolated scale factor grows with the square of the distance [K], but
+    # is interpolated linearly between stated temperatures, so it is stated at five temperatures.
     between = [
         np.linspace(edge, end, 5)
         for edge, end in zip((lower.max(), upper.min()), ends, strict=True)
