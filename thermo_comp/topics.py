@@ -97,7 +97,7 @@ STAMPED = NodeTopic(
 )
 STATUS = NodeTopic('/diagnostics', DIAGNOSTICS, '1 Hz; hardware_id = serial of the unit', 10)
 
-#: Topics of the samples by the value of the parameter `input`; all inputs by names in `Topics`.
+#: Sample topics by the value of the parameter `input`; all input topics by their keys in `Topics`.
 SAMPLES = {'counts': COUNTS, 'imu': IMU_IN}
 INPUTS = {**SAMPLES, 'board': BOARD, 'case': CASE}
 #: Topics of the regime flags with their serializers; all topics that `replay` writes.

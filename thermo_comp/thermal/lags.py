@@ -46,7 +46,7 @@ class Quantity:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Names of the input thermometers; a gradient names its sensor, not the board."""
+        """Names of the input thermometers; for a gradient the sensor alone, without the board."""
         return (self.input,)
 
     @property
@@ -87,7 +87,7 @@ class Lag(_Lag, Quantity):
 
     @property
     def first_order_weights(self) -> dict[tuple[str, float], float]:
-        """Weights of the first-order lags whose sum is this lag, by input and tau [s]."""
+        """Weights of the first-order lags in the sum that is this lag, by input and tau [s]."""
         stages = list(zip((self.tau_s, self.second_tau_s), self.shares, strict=True))
         return {
             (name, tau): factor * share
@@ -103,7 +103,7 @@ class Lag(_Lag, Quantity):
         return (tau - lead) / (tau - second), (lead - second) / (tau - second) if second else 0.0
 
     def remaining_share(self, age_s: Any, exp: Any = math.exp) -> Any:
-        """Return the share of the initial state (RMS) that remains after a time [s], 1 to 0."""
+        """Return the share (RMS) of the lag's initial state that a time [s] leaves, 1 to 0."""
         first = exp(-age_s / self.tau_s)
         if not self.second_tau_s:
             return first
@@ -129,7 +129,7 @@ class _Play(NamedTuple):
 class Play(_Play, Quantity):
     """
     Output of a play of half-width `width_k` less its input [K]. The input is the lagged board
-    temperature, or the board temperature if `tau_s` is 0. This difference has no variance,
+    temperature, or the board temperature if `tau_s` is 0. Output less input has no variance,
     because an error of the input shifts input and output equally.
     """
 
@@ -185,10 +185,10 @@ def start_root(lags: Sequence[tuple[Any, ...]]) -> Floats:
     Return a factor of the covariance of `start_covariance`, which is the factor times its
     transpose, shape (n, number of first-order lags) [K].
 
-    The factor exists even if the covariance is singular, as with two nearly equal lags. The
+    The factor is also computed for a singular covariance, as of two nearly equal lags. The
     input before the first reading is modelled as a random walk with ``D = 2 sd^2 / START_TAU_S``
-    [K^2/s], so that ``P_kl = D tau_k tau_l / (tau_k + tau_l)`` for two lags of one input, and 0
-    for lags of different inputs. P_kl decays with time dt as ``exp(-dt / tau_k - dt / tau_l)``.
+    [K^2/s]: two lags k, l of one input have the covariance ``P_kl = D tau_k tau_l / (tau_k +
+    tau_l)``, lags of different inputs 0. With time dt P_kl decays as ``exp(-dt / tau_k - dt / tau_l)``.
     """
     all_lags = [Lag(*lag) for lag in lags]
     terms = first_order_lags(all_lags)

@@ -85,7 +85,7 @@ class Fault(Enum):
 class SensorCheck:
     """
     Judges readings of `sensor` by its earlier readings and by those of `other`; `lag_s`: lag of
-    the board behind `other` [s], 0 if `other` is the board; `is_revived`: restart the estimate.
+    the board behind `other` [s], 0 if `other` is the board; `is_revived`: `sensor` must restart.
     """
 
     def __init__(self, sensor: Thermometer, other: Thermometer, lag_s: float) -> None:
@@ -131,7 +131,7 @@ class SensorCheck:
         (first_ns, wrong), (second_ns, second) = first
         step, after = second - wrong, celsius - second
         possible = LARGEST_RATE * (second_ns - first_ns) * 1e-9 + 2.0 * self._quantum
-        # Change from the second to the third reading in a ramp of constant rate [K].
+        # In a ramp of constant rate: the change from the second to the third reading [K].
         continued = abs(step) * (stamp_ns - second_ns) / (second_ns - first_ns)
         is_step = abs(step) > possible + _NOISE_SDS * self.sensor.settings.noise_sd_c
         return is_step and abs(after) < CONTINUED_SHARE * min(abs(step), continued)
@@ -150,7 +150,7 @@ class SensorCheck:
         change = celsius - sensor.reading
         is_doubtful = self._n_same >= self._n_doubtful and not self._has_cells
         if is_doubtful and abs(change) > self._largest_noise:
-            # A large change after equal readings: those readings and the estimate were wrong.
+            # A large change after equal readings: the equal readings and the estimate were wrong.
             self.note_jump(stamp_ns, change)
         self._n_same = 0
         self._other_then = nan
@@ -216,7 +216,7 @@ class SensorCheck:
         return Fault.FROZEN if self._moved > OTHER_MOVED + margin else Fault.STILL
 
     def note_jump(self, stamp_ns: int, change: float) -> None:
-        """Note a jump of the sensor [K]: the readings before or after the jump are wrong."""
+        """Note a jump of the sensor's readings [K]: those before or after the jump are wrong."""
         self._jumped = self._jump_at(stamp_ns) + change * change
         self._jumped_ns = stamp_ns
 
@@ -253,8 +253,8 @@ def still_readings(settings: ThermometerSettings) -> int:
 
 class CopyCheck:
     """
-    Finds out whether a sensor repeats the readings of the board, as when one topic is given for
-    both: the gradient would be 0 even in a ramp.
+    Finds out whether a sensor repeats the board's readings, as when one topic is given for both:
+    the sensor's gradient (its temperature less the board's) would be 0 even in a ramp.
     """
 
     def __init__(self) -> None:

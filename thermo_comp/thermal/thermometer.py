@@ -295,8 +295,8 @@ class Thermometer:
         box = half * half / 3.0
         if variance > box:
             return reading, variance * box / (variance - box)
-        # An estimate outside the cell is corrected towards the edge of the cell: all readings in
-        # the time of a predicted change by one sd have together the weight of one measurement.
+        # An estimate outside the cell is corrected towards the edge of the cell. All readings in
+        # the time of a predicted change by one sd together have the weight of one measurement.
         if abs(expected - reading) > half:
             edge = reading + (half if expected > reading else -half)
             return edge, variance * max(1.0, sqrt(variance) / (abs(move) + 1e-30))

@@ -12,9 +12,9 @@ elements of the misalignment M. To first order the error e of the corrected forc
     e_z = zx (u0 + x u1) + zy (u2 + y u3) + u4 + z u5 + x u7 + y u8
 
 Each element of the covariance of the force error e is a polynomial of second degree in the forces
-x, y, z, and the coefficients are sums over the elements of the covariance of the errors u. An
-array of the covariance of the errors u has the rows a, b, c of each axis, whose error variance is
-``a + b x + c x^2``, then one row for each pair of errors in `BETWEEN`.
+x, y, z, and the coefficients are sums over the elements of the covariance of the errors u. The
+covariance of u is stored as rows: for each axis a, b, c of its error variance ``a + b x + c x^2``,
+then for each pair of errors in `BETWEEN` their covariance.
 """
 
 from collections.abc import Sequence
@@ -68,7 +68,7 @@ class CovarianceMap:
         factors = sums[:, u, w]
         # The row b of an axis is twice the covariance of its constant error and its scale error.
         factors[:, 1:9:3] /= 2.0
-        # Each coefficient is a weighted sum of few rows: keep indices and weights of these rows.
+        # Each coefficient of xx, ..., zz is a weighted sum of few rows: keep indices and weights.
         n = int((factors != 0.0).sum(axis=1).max())
         self._places = np.argsort(factors == 0.0, axis=1, kind='stable')[:, :n]
         self._factors = np.take_along_axis(factors, self._places, axis=1)[:, :, np.newaxis]
@@ -97,7 +97,7 @@ def rows_between(errors: Floats, misalignment_variances: Floats) -> Floats:
 
 
 def misalignment_variances(between: Floats) -> Floats:
-    """Return the variances of the three elements of the misalignment, (3, n), from `between`."""
+    """Return the variances of the three elements of M, (3, n), from the rows `BETWEEN`."""
     return between[_OF_M]
 
 

@@ -85,7 +85,7 @@ class Nonlinearity:
     beyond_sd_g_g2: Annotated[
         float,
         QUANTITIES['nonlinearity'],
-        'Sd of K2 of an unknown square term that begins at the largest norm in the fit.',
+        'Sd of K2 of an unknown square term that begins at the largest |f| of the fit.',
     ]
     terms: Annotated[
         tuple[NonlinearTerm, ...], 'At most one square, odd square and cube term, in this order.'
@@ -173,7 +173,7 @@ def nonlinear_covariance(
 class BeyondForce(NamedTuple):
     """
     The variance of an unknown square term that begins at the force `edge` [m/s^2]. `growth`:
-    variance / (2 d)^4, with d the distance of |x| beyond `edge`.
+    this variance / (2 d)^4, with d = |x| - `edge` [m/s^2].
     """
 
     edge: float
@@ -244,8 +244,8 @@ class ForceCorrection:
         Return the contribution of the nonlinear terms to the coefficients of x^2 to x^6 in the
         error variance of an axis, (5, n); `t`: T_board - T_ref, (n,) [K].
 
-        `rows`, (2 k, rank), and `rest`: factor of the covariance of the coefficients of k terms,
-        and variances added to its diagonal; `on_bias`, `on_scale`, (rank, n): bias and relative
+        The covariance of the coefficients of k terms has the factor `rows`, (2 k, rank), and the
+        variances `rest` added to its diagonal; `on_bias`, `on_scale`, (rank, n): bias and relative
         scale due to each column of the factor. The covariances of Kq with other parameters are
         omitted: most are negative, so in most cases the result is too large.
         """

@@ -37,7 +37,7 @@ class Posterior:
         str, 'base64 of little-endian float32: one row of `rank` numbers per parameter.'
     ]
     diagonal: Annotated[
-        str, 'base64 of little-endian float32: one variance per parameter, of diag(diagonal).'
+        str, 'base64 of little-endian float32: the vector `diagonal`, a variance per parameter.'
     ]
 
     def __post_init__(self) -> None:
@@ -50,7 +50,7 @@ class Posterior:
 
     @classmethod
     def of(cls, matrix: npt.NDArray[np.floating[Any]], variances: Floats) -> Posterior:
-        """Encode a factor, shape (n_parameters, rank), and the variances of diag(diagonal)."""
+        """Encode a factor, (n_parameters, rank), and the variances to add to the diagonal."""
         return cls(matrix.shape[1], _encoded(matrix), _encoded(variances))
 
     @property
