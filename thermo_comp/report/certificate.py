@@ -133,7 +133,7 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
 
 
 def unclaimed_gravity_sd(evidence: Evidence, info: CertificateInfo) -> float | None:
-    """Return the sd of gravity that no covariance includes [m/s^2]; None if not stated."""
+    """Return the sd of gravity beyond that in the covariance [m/s^2]; None if not stated."""
     stated = info.gravity.standard_uncertainty_m_s2
     if stated is None:
         return 0.0 if evidence.gravity_sd else None

@@ -188,7 +188,7 @@ def start_root(lags: Sequence[tuple[Any, ...]]) -> Floats:
     The factor is also computed for a singular covariance, as of two nearly equal lags. The
     input before the first reading is modelled as a random walk with ``D = 2 sd^2 / START_TAU_S``
     [K^2/s]: two lags k, l of one input have the covariance ``P_kl = D tau_k tau_l / (tau_k +
-    tau_l)``, lags of different inputs 0. With time dt P_kl decays as ``exp(-dt / tau_k - dt / tau_l)``.
+    tau_l)``, lags of different inputs 0. With time s P_kl decays as ``exp(-s / tau_k - s / tau_l)``.
     """
     all_lags = [Lag(*lag) for lag in lags]
     terms = first_order_lags(all_lags)

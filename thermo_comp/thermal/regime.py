@@ -79,8 +79,8 @@ class RegimeDetector:
         is_calm = self._case.is_calm(stamp_ns, case, change.swing)
         is_calm = self._board.is_calm(stamp_ns, board, change.swing) and is_calm
         if is_dynamic and not self._is_grown:
-            # A ramp's onset is detected while the temperature rate is low. Until it exceeds a share
-            # of the relaxed rate, the dynamic state only ends if the rate is back at its baseline.
+            # A ramp's onset is detected while the rate is low. Until the temperature rate exceeds a
+            # share of the relaxed rate, only its return to the baseline ends the dynamic state.
             self._is_grown = abs(lead.rate) > OBVIOUS_SHARE * self._relaxed_rate
             is_calm = is_calm and change.is_back()
         if not is_calm:
@@ -163,7 +163,7 @@ class _Watch:
         self._mean = 0.0
 
     def is_calm(self, stamp_ns: int, sensor: Thermometer | None, lead_swing: float) -> bool:
-        """Update a sensor's mean rate; return whether the rate is low, or has no fresh reading."""
+        """Update a sensor's mean rate; return whether it is low; True if no reading is fresh."""
         seen_ns = None if sensor is None else sensor.stamp_ns
         if sensor is None or seen_ns is None or stamp_ns - seen_ns > self._stale_ns:
             return True
