@@ -3,7 +3,7 @@
 """
 Owns the table of the node's ROS topics: name, type, QoS, serialization of the regime flags.
 
-Node, replay, recorders, player, bag writer and docs/ros_interface.md use this table. A message is
+Node, replay, recorders, player, bag writer and docs/ros_interface.md use the table. A message is
 packed in little-endian CDR: 4 bytes of encapsulation, then the fields.
 """
 

@@ -193,7 +193,7 @@ class Evidence:
 
     @cached_property
     def positions(self) -> tuple[Position, ...]:
-        """The still positions, with attitudes computed from the last entry of `forces`."""
+        """The still positions, with attitudes from the best known correction in `forces`."""
         windows = self.windows
         if windows is None or not self.forces:
             return ()
@@ -282,7 +282,7 @@ def evidence_of_bags(
 
 
 def evidence_of_fit(result: FitResult, gravity_sd: float = 0.0) -> Evidence:
-    """Return the evidence of a fit on its bags; `gravity_sd`: sd of gravity in it [m/s^2]."""
+    """Return the evidence of a fit on its bags; `gravity_sd`: the fit's sd of gravity [m/s^2]."""
     rests = [(bag.source.name, rest.start_ns) for bag in result.bags for rest in bag.intervals]
     left_out = {(place.source, place.start_ns): place.left_out_rms for place in result.positions}
     against = [f'{note.name}: {note.message}' for note in result.findings if _is_reservation(note)]

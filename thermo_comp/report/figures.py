@@ -163,7 +163,7 @@ def _plot(axes: Axes, evidence: Evidence, value: Floats, unit: float, **line: An
 
 
 def _drift(evidence: Evidence) -> tuple[Floats, str]:
-    """Return the change of the readings in each position, shape (n, 3), and its unit."""
+    """Return the drift of the readings from each position's start, shape (n, 3), and its unit."""
     windows = evidence.windows
     if windows is None or not _rows(evidence).any():
         return np.zeros((0, 3)), ''

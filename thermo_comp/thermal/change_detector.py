@@ -5,9 +5,9 @@ Owns the detection of departures: a temperature's rate leaves the baseline, its 
 
 Two Kalman filters of temperature and rate, one with a long and one with a short memory, have white
 noise as second derivative. A rate has departed if it exceeds the baseline, away from 0, by more
-than the sum of swing, error of the baseline and k times the sd of the noise. The factor k follows
-from the permitted rate of false alarms (Rice's formula [1]_, docs/regime.md). If noise cannot move
-the readings of a quantized sensor across a cell of one quantum, the filters are not used: two
+than swing plus error of the baseline plus k times the sd of the rate's noise; k follows from the
+permitted number of false alarms per hour (Rice's formula [1]_, docs/regime.md). If noise cannot
+move the readings of a quantized sensor across a cell of one quantum, the filters are not used: two
 edges of cells crossed in the same direction give the mean rate.
 
 References

@@ -142,7 +142,7 @@ class Play(_Play, Quantity):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Thermometers of the play: the board and, for a part between both, `sensor`."""
+        """Thermometers of the play: the board and, if the lag has a `sensor_share`, `sensor`."""
         return self.lag.inputs if self.lag else (self.input,)
 
 
@@ -187,8 +187,8 @@ def start_root(lags: Sequence[tuple[Any, ...]]) -> Floats:
 
     The factor is also computed for a singular covariance, as of two nearly equal lags. The
     input before the first reading is modelled as a random walk with ``D = 2 sd^2 / START_TAU_S``
-    [K^2/s]: two lags k, l of one input have the covariance ``P_kl = D tau_k tau_l / (tau_k +
-    tau_l)``, lags of different inputs 0. With time s P_kl decays as ``exp(-s / tau_k - s / tau_l)``.
+    [K^2/s]: lags k, l of one input have the covariance ``P_kl = D tau_k tau_l / (tau_k + tau_l)``,
+    lags of different inputs 0. In a time s P_kl falls by ``exp(-s / tau_k - s / tau_l)``.
     """
     all_lags = [Lag(*lag) for lag in lags]
     terms = first_order_lags(all_lags)

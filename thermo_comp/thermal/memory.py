@@ -241,7 +241,7 @@ def memory_on_grid(
     spec: MemorySpec, step_s: float, board: Floats, gradients: Sequence[Floats]
 ) -> Floats:
     """
-    Compute `ThermalMemory.at` for series on a uniform grid, equal except for rounding.
+    Compute the results of `ThermalMemory.at`, except for rounding, on a uniform grid of times.
 
     Returns (n, 2 * n_lags + n_plays): each lag [K] and a 0, then each play less its input [K].
     """

@@ -49,8 +49,8 @@ LARGEST_ERROR: Final = 60.0
 LEAD_K: Final = 0.5
 LEAD_SHARE: Final = 0.15
 #: A sensor leads after `LEAD_READINGS` readings in a row at which the ratio of the slower to the
-#: faster rate exceeds `LEAD_RATE_SHARE`. If the ratio exceeds `DOUBTFUL_RATE_SHARE` and the board
-#: leads, the variance of the board temperature is increased.
+#: faster rate exceeds `LEAD_RATE_SHARE`. If the board leads and the ratio of the two rates exceeds
+#: `DOUBTFUL_RATE_SHARE`, the variance of the board temperature is increased.
 LEAD_READINGS: Final = 5
 LEAD_RATE_SHARE: Final = 0.3
 DOUBTFUL_RATE_SHARE: Final = 0.03

@@ -79,8 +79,8 @@ class RegimeDetector:
         is_calm = self._case.is_calm(stamp_ns, case, change.swing)
         is_calm = self._board.is_calm(stamp_ns, board, change.swing) and is_calm
         if is_dynamic and not self._is_grown:
-            # A ramp's onset is detected while the rate is low. Until the temperature rate exceeds a
-            # share of the relaxed rate, only its return to the baseline ends the dynamic state.
+            # A ramp's onset is detected while the rate is low. Until the rate exceeds a share of
+            # the relaxed rate, only its return to the baseline ends the dynamic state.
             self._is_grown = abs(lead.rate) > OBVIOUS_SHARE * self._relaxed_rate
             is_calm = is_calm and change.is_back()
         if not is_calm:
@@ -135,7 +135,7 @@ class RegimeDetector:
         self.direction = direction
         self._turning_ns = None
         self._is_grown = False
-        # The onset is detected before the rate is large: hold the dynamic state for `hold_ns`.
+        # A ramp is detected before its rate is large: hold the dynamic state for `hold_ns`.
         hold_ns = max(self._dwell_ns, round(HOLD_LAGS * 1e9 * lead.settings.lag_s))
         self._held_until_ns = stamp_ns + hold_ns
 

@@ -325,8 +325,8 @@ def mix(state: State, other: State, share: float) -> State:
 
 def predict(state: State, dt: float, lag: float, power: float) -> State:
     """
-    Predict a state `dt` [s] later. The acceleration decays with the time constant `lag` [s]; white
-    noise of the density `power` [K^2/s^5] drives the acceleration.
+    Predict a filter's state `dt` [s] later. The acceleration d2T/dt2 decays with the time constant
+    `lag` [s] and is driven by white noise of the density `power` [K^2/s^5].
     """
     t, v, a, p00, p01, p02, p11, p12, p22 = state
     half = 0.5 * dt * dt

@@ -146,22 +146,22 @@ class Column:
 
     @property
     def source(self) -> Quantity:
-        """The quantity of the thermal state that the value is computed from."""
+        """The quantity of the thermal state that determines the column's value."""
         return self.term.source(self)
 
     @property
     def part(self) -> Part:
-        """The lag of the part of the unit whose temperature determines the value."""
+        """The lag of the part of the unit whose temperature determines the column's value."""
         return Part(self.tau_s, self.second_tau_s, self.sensor_share, self.lead_s)
 
     @property
     def is_of_sensor(self) -> bool:
-        """Whether the value is computed from readings of `sensor`."""
+        """Whether the column's value depends on readings of `sensor`."""
         return self.source.inputs != (BOARD_INPUT,)
 
     @property
     def is_gradient(self) -> bool:
-        """Whether the value is the gradient of `sensor`."""
+        """Whether the column's value is linear in the gradient of `sensor`, without a lag."""
         return self.term.form is LINE and isinstance(self.source, Gradient)
 
 
@@ -251,7 +251,7 @@ _DURING: Final = ('always', 'static', 'dynamic')
 
 
 class ColumnTable:
-    """Evaluates columns, (n_columns, n), at each of n thermal states, (width, n), by itself."""
+    """Evaluates columns, (n_columns, n), at n independent thermal states, (width, n)."""
 
     def __init__(
         self,
@@ -325,8 +325,8 @@ class ColumnTable:
 
     def slopes(self, states: Floats) -> tuple[Floats, Floats | None]:
         """
-        Differentiate u, not limited to its range, by the quantity that u is computed from and, at
-        constant lag, by T_board (None if no column is a function of t - lag).
+        Differentiate each column's u, without its limits, by the quantity that determines u and,
+        at constant lag, by T_board (None if no column is a function of t - lag).
         """
         slopes, scaled = np.ones((len(self._places), states.shape[1])), self._scaled(states)
         for rows, term in self._terms:

@@ -74,12 +74,12 @@ class CovarianceMap:
         self._factors = np.take_along_axis(factors, self._places, axis=1)[:, :, np.newaxis]
 
     def coefficients(self, rows: Floats) -> Floats:
-        """Return coefficients of xx, xy, ..., zz, (40, n), for the covariance of u, (45, n)."""
+        """Map the covariance of errors u, (45, n), to coefficients of xx, xy, ..., zz, (40, n)."""
         return in_order(self._factors * rows[self._places], 1)
 
 
 def grown(between: Floats, growth: Floats) -> Floats:
-    """Increase the rows `BETWEEN` (36, n) by the growth factors (3, n) of the axes' variances."""
+    """Increase the covariances `BETWEEN`, (36, n), by growth factors of axis variances, (3, n)."""
     # The misalignment does not depend on the temperature, so its errors have the factor 1.
     roots = np.concatenate((np.repeat(np.sqrt(growth), 2, 0), np.ones_like(growth)))
     return np.asarray(between * roots[_FIRST] * roots[_SECOND])
@@ -90,7 +90,7 @@ def rows_between(errors: Floats, misalignment_variances: Floats) -> Floats:
     Return the rows `BETWEEN`, (36, n), of the covariance of u. `errors`, (9, p, n): u due to each
     of p independent causes; `misalignment_variances`, (3,): variances due to further causes.
     """
-    # Products and sums are explicit, because results of BLAS depend on the arrays' alignment.
+    # The sums do not use BLAS, whose results depend on the arrays' alignment.
     result = in_order(errors[_FIRST] * errors[_SECOND], 1)
     result[_OF_M] += misalignment_variances[:, np.newaxis]
     return result

@@ -256,7 +256,7 @@ class ForceCorrection:
         along[kinds] = (rows[:k, :, np.newaxis] + t * rows[k:, :, np.newaxis]) / units[:, :, None]
         alone[kinds] = (rest[:k, np.newaxis] + t * t * rest[k:, np.newaxis]) / (units * units)
         (n2, nq, n3), (v2, vq, v3) = along, alone
-        # Products and sums are explicit, because results of BLAS depend on the arrays' alignment.
+        # The sums do not use BLAS, whose results depend on the arrays' alignment.
         products = (
             2.0 * on_bias * n2,
             2.0 * (on_scale * n2 + on_bias * n3),

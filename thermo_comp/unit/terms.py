@@ -90,7 +90,7 @@ class Term:
         return (column.source.largest + abs(self.centre(column))) ** self.order
 
     def steepest(self, column: Column, raw: Floats, flow_k: float) -> float:
-        """Return the largest change of u per kelvin [1/K]; `flow_k` is the RMS of the gradient."""
+        """Return the largest change of a column's u per kelvin; `flow_k`: RMS gradient [K]."""
         if self.bounds is not None:
             return 1.0 / flow_k
         largest = float(np.abs(raw).max(initial=0.0)) ** (1.0 / self.order)
@@ -126,10 +126,10 @@ def _play(column: Column) -> Quantity:
 
 
 _ALL: Final = (
-    # Effect of the heat flow from a thermometer to the board; no fit makes columns of kind `rate`.
+    # `gradient`: heat flow from a thermometer to the board; `rate`: a fit never uses this kind.
     Term('gradient', 'g_s', _gradient),
     Term('rate', 'dT_board/dt [K/s]', lambda _: state.Rate()),
-    # `board`: a part that lags the board; `gradient_lag`: a part between board and thermometer.
+    # `board`: for a part that lags the board; `gradient_lag`: for a part between thermometers.
     Term('board', 'T_board - lagged T_board', _part, positive=('tau_s',)),
     Term('gradient_lag', 'lagged g_s', _lagged_gradient, positive=('tau_s',)),
     # With lag: term of a curve over a part's temperature; without lag: square of a heat flow.
