@@ -3,8 +3,8 @@
 """
 Owns the table of the node's ROS topics: name, type, QoS, serialization of the regime flags.
 
-Node, replay, recorders, player, bag writer and docs/ros_interface.md use the table. A message is
-packed in little-endian CDR: 4 bytes of encapsulation, then the fields.
+Node, replay, recorders, player, bag writer and docs/ros_interface.md use the topics' table. A
+message is packed in little-endian CDR: 4 bytes of encapsulation, then the fields.
 """
 
 from collections.abc import Callable
@@ -43,7 +43,7 @@ def _bool_flag(_stamp_ns: int, is_dynamic: bool, _serial: str) -> bytes:
 
 
 def _stamped_flag(stamp_ns: int, is_dynamic: bool, serial: str) -> bytes:
-    """Serialize the regime as a DiagnosticArray with the stamp of the deciding reading."""
+    """Serialize the regime as a DiagnosticArray with the stamp of the reading that decided it."""
     status = b''
     for text in ('regime', 'dynamic' if is_dynamic else 'static', serial):
         # In CDR the level of a status is one byte; the length of a text is aligned to 4 bytes.

@@ -180,7 +180,7 @@ def columns_of(windows: JudgedWindows, bags: Sequence[str]) -> dict[str, npt.NDA
 # A structured array of partial sums of samples, or of windows.
 _Table: TypeAlias = npt.NDArray[Any]
 # Integer fields of a window: `count` is the total of its partial sums, the others are those of its
-# first partial sum. The fields in `_AVERAGED` and `_TRIPLES` are means of those of partial sums.
+# first partial sum. Fields in `_AVERAGED` and `_TRIPLES` are means over a window's partial sums.
 _ONCE = ('bag', 'position', 'start_ns', 'count')
 _AVERAGED = ('time', 'board', 'rate', 'weight', 'variance', 'swapped', 'size', 'size_sd')
 _TRIPLES = ('mean', 'force')

@@ -143,7 +143,7 @@ class ChangeDetector:
         self._reading = sensor.reading
 
     def _tune(self, dt: float) -> None:
-        """Compute for each filter the threshold of (rate - baseline)^2 / variance of the rate."""
+        """Compute each filter's threshold of (rate beyond the limits)^2 / variance of the rate."""
         self._dt = dt
         self._thresholds: list[float] = []
         for power in self._powers[::-1]:

@@ -41,7 +41,7 @@ class Quantity:
     largest: ClassVar[float] = QUANTITIES['temperature span'].at_most or 0.0
     #: Typical change of the quantity per kelvin of temperature change.
     per_kelvin: ClassVar[float] = 1.0
-    #: Whether the quantity depends on the lag of one part of the unit (0 for the board itself).
+    #: Whether the quantity depends on a part's lag behind the board (0 s for the board itself).
     is_of_part: ClassVar[bool] = True
 
     @property
@@ -87,7 +87,7 @@ class Lag(_Lag, Quantity):
 
     @property
     def first_order_weights(self) -> dict[tuple[str, float], float]:
-        """Weights of the first-order lags in the sum that is this lag, by input and tau [s]."""
+        """Weights of first-order lags whose weighted sum is this lag, by input and tau [s]."""
         stages = list(zip((self.tau_s, self.second_tau_s), self.shares, strict=True))
         return {
             (name, tau): factor * share
@@ -103,7 +103,7 @@ class Lag(_Lag, Quantity):
         return (tau - lead) / (tau - second), (lead - second) / (tau - second) if second else 0.0
 
     def remaining_share(self, age_s: Any, exp: Any = math.exp) -> Any:
-        """Return the share (RMS) of the lag's initial state that a time [s] leaves, 1 to 0."""
+        """Return the share (RMS, 1 to 0) of a lag's initial state that is left after a time [s]."""
         first = exp(-age_s / self.tau_s)
         if not self.second_tau_s:
             return first
@@ -129,8 +129,8 @@ class _Play(NamedTuple):
 class Play(_Play, Quantity):
     """
     Output of a play of half-width `width_k` less its input [K]. The input is the lagged board
-    temperature, or the board temperature if `tau_s` is 0. Output less input has no variance,
-    because an error of the input shifts input and output equally.
+    temperature, or the board temperature if `tau_s` is 0. The output of a play less its input has
+    no variance, because an error of the input shifts input and output equally.
     """
 
     input = BOARD_INPUT
@@ -188,7 +188,7 @@ def start_root(lags: Sequence[tuple[Any, ...]]) -> Floats:
     The factor is also computed for a singular covariance, as of two nearly equal lags. The
     input before the first reading is modelled as a random walk with ``D = 2 sd^2 / START_TAU_S``
     [K^2/s]: lags k, l of one input have the covariance ``P_kl = D tau_k tau_l / (tau_k + tau_l)``,
-    lags of different inputs 0. In a time s P_kl falls by ``exp(-s / tau_k - s / tau_l)``.
+    lags of different inputs 0. In a time s P_kl falls by a factor ``exp(-s/tau_k - s/tau_l)``.
     """
     all_lags = [Lag(*lag) for lag in lags]
     terms = first_order_lags(all_lags)

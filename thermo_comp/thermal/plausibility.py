@@ -195,7 +195,7 @@ class SensorCheck:
                 # Expect the judged sensor to follow the other sensor with a first-order lag.
                 self._expected += dt / (dt + self.lag_s) * (moved - self._expected)
         else:
-            # The board may approach, but not pass, the temperature of a constant sensor.
+            # The board may approach, but not pass, the constant temperature of `sensor`.
             ahead = self.sensor.temperature - self._other_then
             self._expected = moved - min(max(moved, min(ahead, 0.0)), max(ahead, 0.0))
         self._seen_ns = now_ns

@@ -119,7 +119,7 @@ class RegimeDetector:
         return self.regime
 
     def _turn(self, stamp_ns: int, direction: int) -> None:
-        """Reverse the direction once the rate's new sign lasts: coarse quanta may flip it."""
+        """Reverse the direction if the rate's new sign lasts: coarse quanta may flip the sign."""
         if direction == self.direction or not direction:
             self._turning_ns = None
         elif self._turning_ns is None:

@@ -295,7 +295,7 @@ class Thermometer:
         box = half * half / 3.0
         if variance > box:
             return reading, variance * box / (variance - box)
-        # An estimate outside the cell is corrected towards the edge of the cell. All readings in
+        # An estimate outside the reading's cell is corrected to the cell's edge. All readings in
         # the time of a predicted change by one sd together have the weight of one measurement.
         if abs(expected - reading) > half:
             edge = reading + (half if expected > reading else -half)

@@ -32,7 +32,7 @@ from .nonlinearity import ForceCorrection, beyond_force
 #: faster transition is lengthened, by a factor of at most `LONGEST_TRANSITION`.
 GENTLE_RATE = MICRO_G
 LONGEST_TRANSITION = 10.0
-#: Number of board temperatures at which the curves' slopes and dynamic less static are evaluated.
+#: Number of board temperatures at which slopes of curves, and dynamic less static, are evaluated.
 _GAP_TEMPERATURES = 33
 #: Variance of rounding [counts^2]: twice 1/12, as the converter adds the remainder to the next
 #: cycle.

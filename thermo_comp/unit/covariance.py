@@ -97,7 +97,7 @@ def rows_between(errors: Floats, misalignment_variances: Floats) -> Floats:
 
 
 def misalignment_variances(between: Floats) -> Floats:
-    """Return the variances of the three elements of M, (3, n), from the rows `BETWEEN`."""
+    """Return the variances of the misalignment's elements, (3, n), from the rows `BETWEEN`."""
     return between[_OF_M]
 
 

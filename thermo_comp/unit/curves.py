@@ -70,7 +70,7 @@ class Curves:
         return result
 
     def _evaluate(self, t: Floats, what: str = 'value') -> Floats:
-        """Evaluate curves or slopes of both sets at t [K from T_ref], one row per set, (2, n)."""
+        """Evaluate curves or slopes of each set at its row of t [K from T_ref], (2, n)."""
         pairs = zip(self._rows, t, strict=True)
         return np.array([[getattr(function, what)(at) for function in row] for row, at in pairs])
 

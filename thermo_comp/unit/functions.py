@@ -28,8 +28,8 @@ from .schema import broken
 #: A temperature difference [K], or an array of temperature differences.
 Kelvins: TypeAlias = float | Floats
 
-#: Length of the tangent that continues a curve beyond its range / width of the range. A parabola's
-#: distance from the tangent is 16 times smaller at its outer end than at the range's other end.
+#: Length of the tangent that continues a curve beyond its range / width of the range. A parabola
+#: differs from its tangent 16 times less at the tangent's outer end than at the range's other end.
 TANGENT_SPANS = 0.25
 #: Largest accepted error of a function's value at the reference temperature.
 NORMALISATION_TOLERANCE = 1e-9
