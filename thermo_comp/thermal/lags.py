@@ -103,7 +103,7 @@ class Lag(_Lag, Quantity):
         return (tau - lead) / (tau - second), (lead - second) / (tau - second) if second else 0.0
 
     def remaining_share(self, age_s: Any, exp: Any = math.exp) -> Any:
-        """Return the share (RMS, 1 to 0) of a lag's initial state that is left after a time [s]."""
+        """Return the share (RMS, 1 to 0) of a lag's initial state that is left after `age_s`."""
         first = exp(-age_s / self.tau_s)
         if not self.second_tau_s:
             return first
