@@ -26,26 +26,26 @@ LARGEST_RATE: Final = 0.2
 SETTLED_READINGS: Final = 5
 
 #: A sensor's first reading is wrong if the second reading differs from it by an impossible step,
-#: and the change to the third reading is below this share of the step, in K and in K/s.
+#: and the third from the second by less than this share of the step, in K and in K/s.
 CONTINUED_SHARE: Final = 0.25
 
-#: Smallest number of equal readings, and shortest time [s], after which a sensor counts as
-#: standing still; the number is larger if the declared noise makes that many equal readings more
-#: probable than `STILL_PROBABILITY`.
+#: A sensor counts as standing still after at least this number of equal readings and this time
+#: [s]. The number is larger if the declared noise makes that many equal readings more probable
+#: than `STILL_PROBABILITY`.
 STILL_READINGS: Final = 20
 STILL_S: Final = 5.0
 STILL_PROBABILITY: Final = 1e-9
 #: Number of equal readings in a row that are doubtful if the quantum is not far above the noise.
 DOUBTFUL_READINGS: Final = 4
 #: A sensor with constant readings counts as frozen if the other sensor's temperature changes by
-#: more than this plus noise and quanta [K]; the second limit is for a quantum far above the noise.
+#: more than noise, quanta and this margin [K]; the second margin is for a quantum far above noise.
 OTHER_MOVED: Final = 0.3
 OTHER_MOVED_BEYOND_CELL: Final = 0.7
 #: Largest assumed error of a sensor with constant readings [K].
 LARGEST_ERROR: Final = 60.0
 
-#: Smallest difference between the temperature changes of two sensors in a ramp at which the sensor
-#: with the larger change leads: in K, and relative to the larger change.
+#: In a ramp the sensor with the larger temperature change leads if the changes of the two sensors
+#: differ by at least this: in K, and relative to the larger change.
 LEAD_K: Final = 0.5
 LEAD_SHARE: Final = 0.15
 #: A sensor leads after `LEAD_READINGS` readings in a row at which the ratio of the slower to the
