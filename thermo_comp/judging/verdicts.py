@@ -23,7 +23,7 @@ LARGEST_RATIO = 2.0
 WIDE_PART = 0.5
 # Smallest number of windows of a regime that is judged separately.
 _FEWEST_WINDOWS = 6
-# Largest ratio of successive values of the known |f|, in rising order, in one section.
+# Ratio of successive values of the known |f|, sorted, above which a new section begins.
 _LEVEL_RATIO = 1.02
 
 SECTIONS = ('static', 'dynamic', 'all', 'outside')
@@ -52,8 +52,8 @@ class Section:
     Residuals of the `n` windows of a section: ``|f| - g`` [m/s^2], or angular rate less its mean
     in the rest [rad/s].
 
-    `raw` values are corrected only with the constants at the reference temperature, the other
-    values with the whole calibration; `claimed_rms`: RMS of the claimed sd of the windows, or NaN.
+    Fields named `raw`: residuals with the constants at the reference temperature only, others:
+    with the whole calibration; `claimed_rms`: RMS of the claimed sd of the windows, or NaN.
     """
 
     n: int
@@ -80,7 +80,7 @@ class Sections(dict[str, Section]):
 
     @property
     def worst_ratio(self) -> float:
-        """Largest ratio of RMS error to claimed RMS: of the regimes, and of all windows."""
+        """Largest ratio of RMS error to claimed RMS in a section: a regime, or all windows."""
         return max(part.ratio for part in (*self.regimes, self['all']))
 
     def facts(self) -> dict[str, Any]:
@@ -170,8 +170,8 @@ def judge_rates(windows: JudgedWindows, calibration: Calibration) -> RateJudgeme
         correction = Correction(triad, Correction(calibration).memory)
         bias, change = SlowUncertainty(triad, correction).of_bias(windows.gyro[:, 9:], mean_of)
         slow = np.square([axis.residual_sd_m_s2 for axis in triad.static.axes()])
-        # Errors due to thermometer noise and unknown initial lag states nearly vanish in the mean
-        # of a rest, so a change from this mean has the whole variance of these errors.
+        # Thermometer noise and unknown initial lag states hardly change the mean of a rest, so the
+        # change from this mean has the whole variance of the errors due to them.
         of_thermometers = np.maximum(variance - np.array(correction.noise) - slow - bias, 0.0)
         white = np.square(triad.noise_density_m_s2_sqrt_hz) / windows.window_s
         noise = white * (1.0 - 1.0 / np.maximum(counts, 1.0))[:, None]

@@ -30,8 +30,8 @@ from ..unit.nonlinearity import AT_REST
 
 #: Default duration of a window of a judgement [s].
 WINDOW_S = 60.0
-# Largest sum of the distances of a window outside the calibrated ranges [half ranges] that counts
-# as noise of the thermometers, so that the window counts as inside.
+# A window up to this far outside the calibrated ranges counts as inside, because of thermometer
+# noise: sum of the distances from the ranges of temperature, rate, worst column [half ranges].
 _RANGE_TOLERANCE = 0.02
 # A partial sum is used if it has at least this share of the median number of samples.
 _LEAST_FILLED = 0.9
@@ -99,7 +99,7 @@ class JudgedWindows:
 
 
 def sum_length(window_s: float) -> float:
-    """Divide `window_s` by the smallest integer that gives partial sums of 10 s or less [s]."""
+    """Return the longest partial sum [s] of at most 10 s that divides `window_s` evenly."""
     return window_s / float(np.ceil(window_s / reduction.WINDOW_S))
 
 
@@ -180,7 +180,7 @@ def columns_of(windows: JudgedWindows, bags: Sequence[str]) -> dict[str, npt.NDA
 # A structured array of partial sums of samples, or of windows.
 _Table: TypeAlias = npt.NDArray[Any]
 # Integer fields of a window: `count` is the total of its partial sums, the others are those of its
-# first partial sum. The fields of `_AVERAGED` and `_TRIPLES` are averages over the partial sums.
+# first partial sum. Fields in `_AVERAGED` and `_TRIPLES` are means over a window's partial sums.
 _ONCE = ('bag', 'position', 'start_ns', 'count')
 _AVERAGED = ('time', 'board', 'rate', 'weight', 'variance', 'swapped', 'size', 'size_sd')
 _TRIPLES = ('mean', 'force')
@@ -246,7 +246,7 @@ def _table(
 
 
 def _joined(sums: _Table) -> _Table:
-    """Combine each row of partial sums into a window; drop windows with an unusable sum."""
+    """Combine each row of partial sums to a window; drop windows with an unusable partial sum."""
     result = sums[:, 0].copy()
     result['count'] = sums['count'].sum(axis=1)
     result['excess'] = sums['excess'].max(axis=1)

@@ -107,7 +107,7 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
     claimed = noise
     if calibration.has_uncertainty:
         x, y, z = (windows.force / np.linalg.norm(windows.force, axis=1, keepdims=True)).T
-        # Derivatives of |f| = g by M[1][0], M[2][0] and M[2][1].
+        # Derivatives of |f| by M[1][0], M[2][0] and M[2][1] at |f| = g.
         by_element = np.stack((x * y, x * z, y * z)) * windows.gravity
         attitude = _rms(np.linalg.norm(by_element.T * calibration.misalignment_sd, axis=1))
         claimed = _rms(windows.claimed_sd)
@@ -133,7 +133,7 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
 
 
 def unclaimed_gravity_sd(evidence: Evidence, info: CertificateInfo) -> float | None:
-    """Return the uncertainty of gravity that the covariance lacks [m/s^2]; None if not stated."""
+    """Return the sd of gravity beyond that in the covariance [m/s^2]; None if not stated."""
     stated = info.gravity.standard_uncertainty_m_s2
     if stated is None:
         return 0.0 if evidence.gravity_sd else None
@@ -206,8 +206,8 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
         value, sd = evaluate(calibration, program, at)[2:]
         off = value - np.outer(at - calibration.reference_temperature_c, slope)
         value[:, :3] += bias_0 / MICRO_G
-        # Without a stated sd of gravity the rest of the uncertainty sets the digits of value and
-        # deviation; if the calibration states no uncertainty, the largest values have 4 digits.
+        # Without a stated sd of gravity value and deviation are rounded by the uncertainty due to
+        # all else; if the calibration states no uncertainty, the largest values have 4 digits.
         largest = np.maximum(np.abs(value).max(axis=0), 1e-3)
         four_digits = 10.0 ** (np.floor(np.log10(largest)) - 2.0)
         digits = np.where(known * sd > 0.0, known * sd, four_digits)
@@ -266,7 +266,7 @@ def _rms(values: Floats) -> float:
 
 
 def programs(calibration: Calibration) -> list[Program]:
-    """Return a soak and, if bias or scale depend on the rate, ramps at half the largest rates."""
+    """List the tabulated cases: a soak and, if ramps differ, ramps at half the largest rates."""
     static, dynamic = calibration.regime_sets()
     result = [Program('soak', static, 0.0)]
     if calibration.response or static != dynamic:

@@ -69,8 +69,8 @@ class Effect(ABC):
 @dataclass(frozen=True)
 class PartEffect(Effect):
     """
-    Tempco of a part, or stress or thermo-EMF between two parts. With d the deviation of a part
-    from the reference state [K], the signals are d and d^2 of `part`, less those of `cold` if any.
+    Tempco of a part, or stress or thermo-EMF between two parts. The two signals are the deviation
+    d of `part` from the reference state [K] and d^2, each less that of the part `cold` if given.
     """
 
     part: str

@@ -184,7 +184,7 @@ def _demo(draw: Specimen) -> UnitModel:
     links.append(Link('board', 'head', 0.02))
     network = ThermalNetwork(capacity, tuple(links), power={'board': draw.between(0.05, 0.15)})
     drift = PartEffect('board', **tempcos(draw))
-    # `stress` follows the temperature difference board - head, `load` the heat flow case - board.
+    # `stress` follows the temperature difference board - head, `load` the heat flow case to board.
     stress = PartEffect('board', 'head', bias=draw.signed(0.5, 1.0), scale=draw.normal(1.0))
     load = FlowEffect('case', 'board', 2.0, 0.5, True, bias=draw.signed(60.0, 120.0))
     return draw.triad(network, (drift, *loads(draw), load, stress))

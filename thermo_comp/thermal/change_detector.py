@@ -5,9 +5,9 @@ Owns the detection of departures: a temperature's rate leaves the baseline, its 
 
 Two Kalman filters of temperature and rate, one with a long and one with a short memory, have white
 noise as second derivative. A rate has departed if it exceeds the baseline, away from 0, by more
-than the sum of swing, error of the baseline and k times the sd of the noise. The factor k follows
-from the permitted rate of false alarms (Rice's formula [1]_, docs/regime.md). If noise cannot move
-the readings of a quantized sensor across a cell of one quantum, the filters are not used: two
+than swing plus error of the baseline plus k times the sd of the rate's noise; k follows from the
+permitted number of false alarms per hour (Rice's formula [1]_, docs/regime.md). If noise cannot
+move the readings of a quantized sensor across a cell of one quantum, the filters are not used: two
 edges of cells crossed in the same direction give the mean rate.
 
 References
@@ -53,7 +53,7 @@ class ChangeDetector:
         self._ripple_rate = min(ripple / sensor.lag_s, self._largest_swing)
         self._baseline_s = 0.5 * sensor.lag_s
         self._swing_memory_s = SWING_MEMORY_LAGS * sensor.lag_s
-        # Memory (1 / tracking frequency) of each filter [s]: the best one to detect the second
+        # Memory (1 / tracking frequency) of each filter [s]: the best memory to detect the second
         # derivative ``share * onset`` [K/s^2] in readings at 1 Hz. The memory determines the
         # spectral density of the filter's process noise for any interval of readings.
         self._noise = sensor.noise_sd_c**2 + sensor.quantum_c**2 / 12.0
@@ -71,7 +71,7 @@ class ChangeDetector:
         self.rate = 0.0
         self.swing = self._ripple_rate
         self._baseline = 0.0
-        # Largest error of the baseline [K/s]; the baseline may begin at a crest of the ripple.
+        # Largest error of the baseline [K/s]: its first rate may be at a crest of the ripple.
         self._baseline_error = self.swing
         self._trend = 0.0
         self._is_above = False
@@ -89,7 +89,7 @@ class ChangeDetector:
         return self._stamp_ns == stamp_ns and self._age_s > 0.0
 
     def is_back(self) -> bool:
-        """Whether the rate is nearer to the baseline than swing plus error of the baseline."""
+        """Whether |rate - baseline| is below the swing plus the error of the baseline."""
         return abs(self.rate - self._baseline) < self.swing + self._baseline_error
 
     def update(self, stamp_ns: int, sensor: Thermometer, pace: float) -> int:
@@ -143,7 +143,7 @@ class ChangeDetector:
         self._reading = sensor.reading
 
     def _tune(self, dt: float) -> None:
-        """Set for each filter the squared threshold of its rate / the variance of its rate."""
+        """Compute each filter's threshold of (rate beyond the limits)^2 / variance of the rate."""
         self._dt = dt
         self._thresholds: list[float] = []
         for power in self._powers[::-1]:

@@ -41,12 +41,12 @@ class Quantity:
     largest: ClassVar[float] = QUANTITIES['temperature span'].at_most or 0.0
     #: Typical change of the quantity per kelvin of temperature change.
     per_kelvin: ClassVar[float] = 1.0
-    #: Whether the quantity depends on the lag of one part of the unit (0 for the board itself).
+    #: Whether the quantity depends on a part's lag behind the board (0 s for the board itself).
     is_of_part: ClassVar[bool] = True
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Names of the input thermometers; a gradient names its sensor, not the board."""
+        """Names of the input thermometers; for a gradient the sensor alone, without the board."""
         return (self.input,)
 
     @property
@@ -87,7 +87,7 @@ class Lag(_Lag, Quantity):
 
     @property
     def first_order_weights(self) -> dict[tuple[str, float], float]:
-        """Weights of the first-order lags whose sum is this lag, by input and tau [s]."""
+        """Weights of first-order lags whose weighted sum is this lag, by input and tau [s]."""
         stages = list(zip((self.tau_s, self.second_tau_s), self.shares, strict=True))
         return {
             (name, tau): factor * share
@@ -103,7 +103,7 @@ class Lag(_Lag, Quantity):
         return (tau - lead) / (tau - second), (lead - second) / (tau - second) if second else 0.0
 
     def remaining_share(self, age_s: Any, exp: Any = math.exp) -> Any:
-        """Return the share of the initial state (RMS) that remains after a time [s], 1 to 0."""
+        """Return the share (RMS, 1 to 0) of a lag's initial state that is left after `age_s`."""
         first = exp(-age_s / self.tau_s)
         if not self.second_tau_s:
             return first
@@ -129,8 +129,8 @@ class _Play(NamedTuple):
 class Play(_Play, Quantity):
     """
     Output of a play of half-width `width_k` less its input [K]. The input is the lagged board
-    temperature, or the board temperature if `tau_s` is 0. This difference has no variance,
-    because an error of the input shifts input and output equally.
+    temperature, or the board temperature if `tau_s` is 0. The output of a play less its input has
+    no variance, because an error of the input shifts input and output equally.
     """
 
     input = BOARD_INPUT
@@ -142,7 +142,7 @@ class Play(_Play, Quantity):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Thermometers of the play: the board and, for a part between both, `sensor`."""
+        """Thermometers of the play: the board and, if the lag has a `sensor_share`, `sensor`."""
         return self.lag.inputs if self.lag else (self.input,)
 
 
@@ -185,10 +185,10 @@ def start_root(lags: Sequence[tuple[Any, ...]]) -> Floats:
     Return a factor of the covariance of `start_covariance`, which is the factor times its
     transpose, shape (n, number of first-order lags) [K].
 
-    The factor exists even if the covariance is singular, as with two nearly equal lags. The
+    The factor is also computed for a singular covariance, as of two nearly equal lags. The
     input before the first reading is modelled as a random walk with ``D = 2 sd^2 / START_TAU_S``
-    [K^2/s], so that ``P_kl = D tau_k tau_l / (tau_k + tau_l)`` for two lags of one input, and 0
-    for lags of different inputs. P_kl decays with time dt as ``exp(-dt / tau_k - dt / tau_l)``.
+    [K^2/s]: lags k, l of one input have the covariance ``P_kl = D tau_k tau_l / (tau_k + tau_l)``,
+    lags of different inputs 0. In a time s P_kl falls by a factor ``exp(-s/tau_k - s/tau_l)``.
     """
     all_lags = [Lag(*lag) for lag in lags]
     terms = first_order_lags(all_lags)

@@ -22,7 +22,7 @@ from .lags import BOARD_INPUT, Lag, MemorySpec, first_order_lags
 #: Interval between readings / time constant of a lag above which variance is added, because the
 #: time at which the input changed between the readings is unknown.
 SPARSE_SHARE: Final = 0.1
-#: Smallest weight of an old input in `_recursion`: smaller weights are below double precision.
+#: Smallest weight of an old input in `_recursion`: below it a term is lost in double precision.
 _LEAST_WEIGHT: Final = 1e-18
 
 
@@ -81,7 +81,7 @@ class LagBank:
         self.extra = [variance + change * change for variance in self.extra]
 
     def at(self, stamp_ns: int, value: float) -> tuple[list[float], list[float]]:
-        """Return each ``u - L`` [K] at u = `value`, and its variance but for the initial state."""
+        """Return each ``u - L`` [K] at u = `value`; its variance without the initial state's."""
         seen_ns = self.stamp_ns
         if seen_ns is None or stamp_ns <= seen_ns or not self.taus:
             return self.lagging, self.extra
@@ -217,7 +217,7 @@ class ThermalMemory:
     def _first_order(
         self, stamp_ns: int, board: float, gradients: Sequence[float]
     ) -> tuple[list[float], list[float]]:
-        """Return each first-order lag [K], and its variance but for the initial state."""
+        """Return each first-order lag [K], and its variance without the initial state's."""
         values, extra = self.board.at(stamp_ns, board)
         for name, gradient in zip(self.spec.sensors, gradients, strict=True):
             if (bank := self.banks[name]).taus:
@@ -241,7 +241,7 @@ def memory_on_grid(
     spec: MemorySpec, step_s: float, board: Floats, gradients: Sequence[Floats]
 ) -> Floats:
     """
-    Compute `ThermalMemory.at` for series on a uniform grid, equal except for rounding.
+    Compute the results of `ThermalMemory.at`, except for rounding, on a uniform grid of times.
 
     Returns (n, 2 * n_lags + n_plays): each lag [K] and a 0, then each play less its input [K].
     """

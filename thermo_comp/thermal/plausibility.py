@@ -26,31 +26,31 @@ LARGEST_RATE: Final = 0.2
 SETTLED_READINGS: Final = 5
 
 #: A sensor's first reading is wrong if the second reading differs from it by an impossible step,
-#: and the change to the third reading is below this share of the step, in K and in K/s.
+#: and the third from the second by less than this share of the step, in K and in K/s.
 CONTINUED_SHARE: Final = 0.25
 
-#: Smallest number of equal readings, and shortest time [s], after which a sensor counts as
-#: standing still; the number is larger if the declared noise makes that many equal readings more
-#: probable than `STILL_PROBABILITY`.
+#: A sensor counts as standing still after at least this number of equal readings and this time
+#: [s]. The number is larger if the declared noise makes that many equal readings more probable
+#: than `STILL_PROBABILITY`.
 STILL_READINGS: Final = 20
 STILL_S: Final = 5.0
 STILL_PROBABILITY: Final = 1e-9
 #: Number of equal readings in a row that are doubtful if the quantum is not far above the noise.
 DOUBTFUL_READINGS: Final = 4
 #: A sensor with constant readings counts as frozen if the other sensor's temperature changes by
-#: more than this plus noise and quanta [K]; the second limit is for a quantum far above the noise.
+#: more than noise, quanta and this margin [K]; the second margin is for a quantum far above noise.
 OTHER_MOVED: Final = 0.3
 OTHER_MOVED_BEYOND_CELL: Final = 0.7
 #: Largest assumed error of a sensor with constant readings [K].
 LARGEST_ERROR: Final = 60.0
 
-#: Smallest difference between the temperature changes of two sensors in a ramp at which the sensor
-#: with the larger change leads: in K, and relative to the larger change.
+#: In a ramp the sensor with the larger temperature change leads if the changes of the two sensors
+#: differ by at least this: in K, and relative to the larger change.
 LEAD_K: Final = 0.5
 LEAD_SHARE: Final = 0.15
 #: A sensor leads after `LEAD_READINGS` readings in a row at which the ratio of the slower to the
-#: faster rate exceeds `LEAD_RATE_SHARE`. If the ratio exceeds `DOUBTFUL_RATE_SHARE` and the board
-#: leads, the variance of the board temperature is increased.
+#: faster rate exceeds `LEAD_RATE_SHARE`. If the board leads and the ratio of the two rates exceeds
+#: `DOUBTFUL_RATE_SHARE`, the variance of the board temperature is increased.
 LEAD_READINGS: Final = 5
 LEAD_RATE_SHARE: Final = 0.3
 DOUBTFUL_RATE_SHARE: Final = 0.03
@@ -85,7 +85,7 @@ class Fault(Enum):
 class SensorCheck:
     """
     Judges readings of `sensor` by its earlier readings and by those of `other`; `lag_s`: lag of
-    the board behind `other` [s], 0 if `other` is the board; `is_revived`: restart the estimate.
+    the board behind `other` [s], 0 if `other` is the board; `is_revived`: `sensor` must restart.
     """
 
     def __init__(self, sensor: Thermometer, other: Thermometer, lag_s: float) -> None:
@@ -131,7 +131,7 @@ class SensorCheck:
         (first_ns, wrong), (second_ns, second) = first
         step, after = second - wrong, celsius - second
         possible = LARGEST_RATE * (second_ns - first_ns) * 1e-9 + 2.0 * self._quantum
-        # Change from the second to the third reading in a ramp of constant rate [K].
+        # In a ramp of constant rate: the change from the second to the third reading [K].
         continued = abs(step) * (stamp_ns - second_ns) / (second_ns - first_ns)
         is_step = abs(step) > possible + _NOISE_SDS * self.sensor.settings.noise_sd_c
         return is_step and abs(after) < CONTINUED_SHARE * min(abs(step), continued)
@@ -150,7 +150,7 @@ class SensorCheck:
         change = celsius - sensor.reading
         is_doubtful = self._n_same >= self._n_doubtful and not self._has_cells
         if is_doubtful and abs(change) > self._largest_noise:
-            # A large change after equal readings: those readings and the estimate were wrong.
+            # A large change after equal readings: the equal readings and the estimate were wrong.
             self.note_jump(stamp_ns, change)
         self._n_same = 0
         self._other_then = nan
@@ -195,7 +195,7 @@ class SensorCheck:
                 # Expect the judged sensor to follow the other sensor with a first-order lag.
                 self._expected += dt / (dt + self.lag_s) * (moved - self._expected)
         else:
-            # The board may approach, but not pass, the temperature of a constant sensor.
+            # The board may approach, but not pass, the constant temperature of `sensor`.
             ahead = self.sensor.temperature - self._other_then
             self._expected = moved - min(max(moved, min(ahead, 0.0)), max(ahead, 0.0))
         self._seen_ns = now_ns
@@ -216,7 +216,7 @@ class SensorCheck:
         return Fault.FROZEN if self._moved > OTHER_MOVED + margin else Fault.STILL
 
     def note_jump(self, stamp_ns: int, change: float) -> None:
-        """Note a jump of the sensor [K]: the readings before or after the jump are wrong."""
+        """Note a jump of the sensor's readings [K]: those before or after the jump are wrong."""
         self._jumped = self._jump_at(stamp_ns) + change * change
         self._jumped_ns = stamp_ns
 
@@ -253,8 +253,8 @@ def still_readings(settings: ThermometerSettings) -> int:
 
 class CopyCheck:
     """
-    Finds out whether a sensor repeats the readings of the board, as when one topic is given for
-    both: the gradient would be 0 even in a ramp.
+    Finds out whether a sensor repeats the board's readings, as when one topic is given for both:
+    the sensor's gradient (its temperature less the board's) would be 0 even in a ramp.
     """
 
     def __init__(self) -> None:

@@ -295,8 +295,8 @@ class Thermometer:
         box = half * half / 3.0
         if variance > box:
             return reading, variance * box / (variance - box)
-        # An estimate outside the cell is corrected towards the edge of the cell: all readings in
-        # the time of a predicted change by one sd have together the weight of one measurement.
+        # An estimate outside the reading's cell is corrected to the cell's edge. All readings in
+        # the time of a predicted change by one sd together have the weight of one measurement.
         if abs(expected - reading) > half:
             edge = reading + (half if expected > reading else -half)
             return edge, variance * max(1.0, sqrt(variance) / (abs(move) + 1e-30))
@@ -325,8 +325,8 @@ def mix(state: State, other: State, share: float) -> State:
 
 def predict(state: State, dt: float, lag: float, power: float) -> State:
     """
-    Predict a state `dt` [s] later. The acceleration decays with the time constant `lag` [s]; white
-    noise of the density `power` [K^2/s^5] drives the acceleration.
+    Predict a filter's state `dt` [s] later. The acceleration d2T/dt2 decays with the time constant
+    `lag` [s] and is driven by white noise of the density `power` [K^2/s^5].
     """
     t, v, a, p00, p01, p02, p11, p12, p22 = state
     half = 0.5 * dt * dt

@@ -24,9 +24,9 @@ from .thermometer import RESTART_READINGS, Thermometer
 LOST_GRADIENT_RELATIVE_SD: Final = 0.5
 #: Time without a regime decision after which the regime is unknown / lag of the case thermometer.
 UNWATCHED_SHARE: Final = 0.25
-#: Largest change of the self-heating gradient that does not count as an error of the board
-#: temperature, because the air flow may differ from that in the fit: in K, and relative to the
-#: gradient in the fit.
+#: Largest change of the self-heating gradient since the fit that does not count as an error of the
+#: board temperature, because the air flow may have changed: in K, and relative to the gradient in
+#: the fit.
 SELF_HEATING_CHANGE_K: Final = 1.0
 SELF_HEATING_CHANGE: Final = 0.5
 ANY_RANGE: Final = (-inf, inf)
@@ -300,7 +300,7 @@ class ThermalTracker:
         is_known = name == self.spec.sensors[0] and upper < inf
         usual = 0.5 * (lower + upper) if is_known else 0.0
         gradient = self._rest_gradients.get(name, usual) + lag * rate
-        # Largest change of the case temperature since the end of the board's extrapolation [K].
+        # Largest change of the case temperature since the board's extrapolation ended [K].
         unseen = self.settings.case.fastest_ramp_k_min / 60.0 * self.board.beyond(stamp_ns)
         variance = (
             (LOST_GRADIENT_RELATIVE_SD * gradient) ** 2

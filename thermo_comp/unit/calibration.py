@@ -219,7 +219,7 @@ class Calibration:
     rest_gradient_range_k: Annotated[
         tuple[_Kelvin, _Kelvin] | None,
         'Range in the bags of T_s - T_board - board_lag_s * dT_board/dt of the first sensor s; '
-        'null: unknown. A difference far outside (loose sensor) adds to the sd of T_board.',
+        'null: unknown. Far outside the range (loose sensor) the sd of T_board is increased.',
     ] = None
     soak_gradient_k: Annotated[
         tuple[_Kelvin, _Kelvin] | None,
@@ -250,7 +250,7 @@ class Calibration:
         check_limits(self, parameter_layout(self))
         if self.gyroscope is not None:
             try:
-                rate_triad(self)  # the rules for an accelerometer triad hold for a gyroscope
+                rate_triad(self)  # apply a triad's rules to the gyroscope
             except ValueError as error:
                 raise ValueError(str(error).replace('`', '`gyroscope.', 1)) from error
 

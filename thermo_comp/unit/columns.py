@@ -43,7 +43,7 @@ EVEN_WIDTHS: Final = (0.375, 0.75, 1.5, 3.0, 6.0)
 PLAY_WIDTHS: Final = (0.4, 0.8, 1.6, 3.2, 6.4)
 PLAY_TAUS: Final[tuple[float, ...]] = (0.0, 450.0, 900.0, 1800.0)
 #: Kind bend: time constants [s]; least span of board temperatures per knee (change of slope) [K];
-#: most knees per lag; most knees per lag in the `parts` of `bank`, with a third of the least span.
+#: most knees per lag; most knees per lag if `bank` gets `parts` (with a third of the least span).
 BEND_TAUS: Final = (0.0, *FINE_TAUS[4:11])
 LEAST_KNEE_K, MOST_KNEES, MOST_PART_KNEES = 1.0, 20, 60
 
@@ -146,22 +146,22 @@ class Column:
 
     @property
     def source(self) -> Quantity:
-        """The quantity of the thermal state that the value is computed from."""
+        """The quantity of the thermal state that determines the column's value."""
         return self.term.source(self)
 
     @property
     def part(self) -> Part:
-        """The lag of the part of the unit whose temperature determines the value."""
+        """The lag of the part of the unit whose temperature determines the column's value."""
         return Part(self.tau_s, self.second_tau_s, self.sensor_share, self.lead_s)
 
     @property
     def is_of_sensor(self) -> bool:
-        """Whether the value is computed from readings of `sensor`."""
+        """Whether the column's value depends on readings of `sensor`."""
         return self.source.inputs != (BOARD_INPUT,)
 
     @property
     def is_gradient(self) -> bool:
-        """Whether the value is the gradient of `sensor`."""
+        """Whether the column's value is linear in the gradient of `sensor`, without a lag."""
         return self.term.form is LINE and isinstance(self.source, Gradient)
 
 
@@ -191,8 +191,8 @@ def bank(
     columns += _family('product', ['board'], powers=(1, 2), lags=coarse)
     columns += _family('gradient_x_temperature', ['gradient'], sensors, powers=(1,))
     columns += _family('gradient_x_temperature', ['gradient_lag'], sensors, (1,), coarse_gradient)
-    # A bias that depends on a part, which lags the board by m, is a polynomial of t - m:
-    # (t - m)^2 = t^2 - 2 t m + m^2, (t - m)^3 = t^3 - 3 t^2 m + 3 t m^2 - m^3.
+    # A bias that follows the temperature of a part, t - m with the lag m, is a polynomial of
+    # t - m: (t - m)^2 = t^2 - 2 t m + m^2, (t - m)^3 = t^3 - 3 t^2 m + 3 t m^2 - m^3.
     columns += _family('square', ['square'], powers=(0, 1), lags=coarse)
     columns += _family('square', ['cube'], lags=coarse)
     even = _family('gradient_even', ['gradient_even'], sensors, (0, 1, 2), widths=EVEN_WIDTHS)
@@ -251,7 +251,7 @@ _DURING: Final = ('always', 'static', 'dynamic')
 
 
 class ColumnTable:
-    """Evaluates columns, (n_columns, n), at each of n thermal states, (width, n), by itself."""
+    """Evaluates columns, (n_columns, n), at n independent thermal states, (width, n)."""
 
     def __init__(
         self,
@@ -301,7 +301,7 @@ class ColumnTable:
         return hold(raw, *self._range)
 
     def excess(self, raw: Floats) -> Floats:
-        """Return (1 + e)^(1 / order) - 1, with e the excess of u over its range [half ranges]."""
+        """Return (1 + e)^(1 / order) - 1, e the distance of u from its range [half ranges]."""
         lower, upper = self._range
         excess = np.asarray(np.abs(raw - self.held(raw)) / ((upper - lower) / 2.0))
         for order in {*self._orders.tolist()} - {1}:
@@ -310,7 +310,7 @@ class ColumnTable:
         return excess
 
     def factors(self, board: Floats, weight: Floats) -> tuple[Floats, Floats]:
-        """Return the factor ``phi / u = t^power r``, and its derivative w.r.t. t."""
+        """Return each column's factor ``phi / u = t^power r``, and its derivative w.r.t. t."""
         t = hold(board - self._reference, *self._t_range)
         n_powers = int(self._power.max(initial=0))
         powers = np.multiply.accumulate([np.ones_like(t), *[t] * n_powers])
@@ -325,8 +325,8 @@ class ColumnTable:
 
     def slopes(self, states: Floats) -> tuple[Floats, Floats | None]:
         """
-        Differentiate u, not limited to its range, by the quantity that u is computed from and, at
-        constant lag, by T_board (None if no column is a function of t - lag).
+        Differentiate each column's u, without its limits, by the quantity that determines u and,
+        at constant lag, by T_board (None if no column is a function of t - lag).
         """
         slopes, scaled = np.ones((len(self._places), states.shape[1])), self._scaled(states)
         for rows, term in self._terms:

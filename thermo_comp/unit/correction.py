@@ -32,7 +32,7 @@ from .nonlinearity import ForceCorrection, beyond_force
 #: faster transition is lengthened, by a factor of at most `LONGEST_TRANSITION`.
 GENTLE_RATE = MICRO_G
 LONGEST_TRANSITION = 10.0
-#: Number of board temperatures at which slopes, and dynamic - static differences, are evaluated.
+#: Number of board temperatures at which slopes of curves, and dynamic less static, are evaluated.
 _GAP_TEMPERATURES = 33
 #: Variance of rounding [counts^2]: twice 1/12, as the converter adds the remainder to the next
 #: cycle.
@@ -111,7 +111,7 @@ class Correction:
         self.n_slow = N_ROWS if self.of_force is None else N_ROWS + 15
 
     def _find_columns_of_pairs(self) -> None:
-        """Find the columns that depend on each quantity of the state that has a variance."""
+        """For each quantity of the state with a variance find the columns that depend on it."""
         self.layout = layout = StateLayout(self.memory)
         pair = np.array([layout.pairs.get(c.source, -1) for c in self.table.columns], np.int64)
         columns = np.argsort(pair, kind='stable')
@@ -134,7 +134,7 @@ class Correction:
         return result
 
     def _weigh(self, columns: Floats, start: Floats) -> Floats:
-        """Add ``W @ columns`` to initial values, shape (6, n), column by column."""
+        """Add ``W @ columns`` (W: weights) to `start`, shape (6, n), column by column."""
         if columns.shape[1] > _FEW:
             # With many states the sums are computed without a table of intermediate values.
             total: Floats = start.copy()
@@ -170,7 +170,7 @@ class Correction:
     def by_pairs(self, slopes: Floats) -> Floats:
         """
         Differentiate bias and relative scale w.r.t. the quantities of `StateLayout.pairs`, shape
-        (p, 6, n); `slopes`: derivatives of columns w.r.t. their quantities, (n_columns, n).
+        (p, 6, n); `slopes`: derivative of each column w.r.t. its quantity, (n_columns, n).
         """
         columns = self._pair_columns
         result = np.zeros((len(self._signs), 6, slopes.shape[1]))
@@ -243,25 +243,25 @@ class Correction:
         slow: Floats,
     ) -> tuple[Floats, Floats]:
         """
-        Evaluate a, b, c of each axis' error variance ``a + b x + c x^2``, (3, 3, n), without noise
-        of a sample, and the factor (3, n) by which the variance grows outside the ranges.
+        Evaluate a, b, c of each axis' error variance ``a + b x + c x^2``, (3, 3, n), without
+        sample noise, and the factor (3, n) by which it grows outside the calibrated ranges.
 
         The difference of dynamic and static set (`gap`) is added as an error while the sets are
         blended, outside the calibrated ranges, and while the regime is unknown. While the regime
-        is unknown, the variances of both sets are summed in full.
+        is unknown, the variance is the sum of the variances of both sets.
         """
         board, weight, unknown = states[BOARD], states[WEIGHT], states[UNKNOWN]
         static_weight, beyond_range = 1.0 - weight, raw - held
         excess, _, relative, by_rate = self.curves.excess(states)
         if not self._has_lags:
-            # If columns have lags, the excess of the columns (`columns_out`) replaces the rate's.
+            # If columns have lags, the columns' excess (`columns_out`) replaces that of the rate.
             relative = relative + by_rate
         outside = static_weight * relative[0] + weight * relative[1]
         shares = np.array([static_weight + unknown * weight, weight + unknown * static_weight])
         variances = (shares * states[VAR_BOARD], states[self.layout.variances])
         by_source, direct = self.table.slopes(states)
         by_pair = self.by_pairs(by_source * factors[0])
-        # Derivative of the columns by T_board, on which t^power, gradients and lags depend.
+        # Derivative of the columns by T_board, through t^power, gradients and lags.
         on_board = raw * factors[1]
         if direct is not None:
             on_board = on_board + direct * factors[0]
@@ -272,15 +272,15 @@ class Correction:
         v += slow
         growth = np.ones((3, len(board)))
         is_beyond = bool(beyond_range.any())
-        # A part that lags the board may return into the calibrated range after the board does.
+        # A part that lags the board may return into the calibrated range later than the board.
         parts = np.concatenate((board[np.newaxis], board - states[self._lagged]))
         parts_out = np.abs(parts - hold(parts, *self._span)).max(axis=0)
         if is_beyond or outside.any() or parts_out.any():
             columns_out = np.where(self._is_present, self.table.excess(raw), 0.0)
             columns_out = columns_out.max(axis=1, initial=0.0)
-            # Outside the calibrated range the curves are extrapolated. One error of the
-            # curves is their slope at the edge of the range times the board's distance from the
-            # edge; another is the sd of the slopes times the largest distance of board or part.
+            # Outside the calibrated range the curves are extrapolated, with two errors: slope of
+            # the curves at the edge of the range times the board's distance from the edge; sd of
+            # the slopes times the largest distance of the board or a part from the range.
             v += self._spread(shares * excess * excess, slopes)
             bent = shares * np.maximum(excess * excess, parts_out * parts_out)
             bends = np.broadcast_to(self._bends, (4, *slopes.shape[1:]))
@@ -303,7 +303,7 @@ class Correction:
     def _spread(self, variances: Floats, moved: Floats) -> Floats:
         """
         Return a, b, c of each axis' variance, (3, 3, n), due to p independent errors of variances
-        (p, n); `moved`, (p, 6, n): derivatives of bias and relative scale w.r.t. the errors.
+        (p, n); `moved`, (p, 6, n): derivatives of bias and relative scale w.r.t. these errors.
         """
         variance, bias, scale = variances[:, np.newaxis], moved[:, :3] / self.K, moved[:, 3:]
         parts = np.empty((*bias.shape[:2], 3, bias.shape[2]))
@@ -319,7 +319,7 @@ def memory_of_unit(calibration: Calibration) -> MemorySpec:
 
 
 def is_sound(line: Floats) -> npt.NDArray[np.bool_]:
-    """Whether a result of `Correction.line` gives finite forces: scales not 0, all below 1e140."""
+    """Whether a result of `Correction.line` gives finite forces: no scale 0, numbers < 1e140."""
     scale = line[2:12:4]
     is_finite = (np.abs(line) < _LARGEST).all(axis=0)
     return np.asarray(is_finite & (scale * (scale + line[3:12:4]) > 0.0).all(axis=0))

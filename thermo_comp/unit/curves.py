@@ -34,8 +34,8 @@ class Curves:
             [axis.bias_function for axis in axes] + [axis.scale_function for axis in axes]
             for axes in (part.axes() for part in sets)
         ]
-        # Index of the set whose tangent each set follows at the lower and at the upper end, shape
-        # (2, 2).
+        # For the lower, then the upper end of the ranges: index of the set whose tangent each set
+        # follows, shape (2, 2).
         regimes, (lower, upper) = np.arange(2), self._t_range[:, :, 0]
         self._leads = np.where([lower > lower.min(), upper < upper.max()], 1 - regimes, regimes)
         self._ends = lower.min(), upper.max()
@@ -49,7 +49,7 @@ class Curves:
         self._lacks = [np.array(points).reshape(-1, 4).T for points in lacks]
 
     def excess(self, states: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Return how far T_board [K] and rate [K/s] are out of range, and both in half ranges."""
+        """Return distances of T_board [K] and rate [K/s] from the ranges, also in half ranges."""
         t, rate = states[BOARD] - self._reference, states[RATE]
         over, too_fast = t - hold(t, *self._t_range), rate - hold(rate, *self._rate_range)
         span, rate_span = (edges[1] - edges[0] for edges in (self._t_range, self._rate_range))
@@ -70,7 +70,7 @@ class Curves:
         return result
 
     def _evaluate(self, t: Floats, what: str = 'value') -> Floats:
-        """Evaluate curves or slopes of both sets at t [K from T_ref], one row per set, (2, n)."""
+        """Evaluate curves or slopes of each set at its row of t [K from T_ref], (2, n)."""
         pairs = zip(self._rows, t, strict=True)
         return np.array([[getattr(function, what)(at) for function in row] for row, at in pairs])
 
@@ -122,7 +122,7 @@ class Curves:
 
     def _followed(self, regime: int, place: int, t: Floats, shares: Floats) -> Floats:
         """Differentiate bias or scale beyond the ranges by free coefficients, (n_free, n)."""
-        # Beyond its range a curve is a constant plus either a tangent or the other set's curve.
+        # Beyond its range a curve is a constant plus a tangent, or plus the other set's curve.
         function = self._rows[regime][place]
         own_range, other_range = self._t_range[:, regime], self._t_range[:, 1 - regime]
         bases = (function.basis(hold(at, *own_range)) for at in (t, hold(t, *other_range)))

@@ -25,11 +25,11 @@ from ..quantities import QUANTITIES
 from ..typing import Floats
 from .schema import broken
 
-#: One temperature difference [K], or an array of temperature differences.
+#: A temperature difference [K], or an array of temperature differences.
 Kelvins: TypeAlias = float | Floats
 
 #: Length of the tangent that continues a curve beyond its range / width of the range. A parabola
-#: is 16 times closer to this tangent at the tangent's outer end than at the range's other end.
+#: differs from its tangent 16 times less at the tangent's outer end than at the range's other end.
 TANGENT_SPANS = 0.25
 #: Largest accepted error of a function's value at the reference temperature.
 NORMALISATION_TOLERANCE = 1e-9
@@ -116,7 +116,7 @@ class Polynomial(_Family):
 @dataclass(frozen=True)
 class CubicSpline(_Family):
     """
-    Natural cubic spline through values at rising knots t [K from T_ref]. One knot is 0, with
+    Natural cubic spline through values at rising knots t [K from T_ref]. One knot is t = 0, with
     the value 0 (bias) or 1 (scale). Beyond the outer knots the spline is constant.
     """
 

@@ -25,7 +25,7 @@ from .schema import broken
 if TYPE_CHECKING:
     from .calibration import Calibration
 
-#: Limits of the curves of the relative scale, less and plus the largest effect of all columns.
+#: Limits of the scale's curves less, and plus, the largest effect of all columns on the scale.
 SMALLEST_RELATIVE_SCALE, LARGEST_RELATIVE_SCALE = 0.1, 10.0
 #: Largest bias / full scale; samples in an offset code have a bias of half of their range.
 FULL_SCALES = 2.0
@@ -142,7 +142,7 @@ def _extremes(function: TemperatureFunction, edges: Sequence[float]) -> tuple[fl
 def _regressors(
     functions: Sequence[TemperatureFunction], edges: Sequence[Sequence[float]]
 ) -> list[float]:
-    """Return each function's largest derivatives by its value at T_ref and free coefficients."""
+    """Return each function's largest |derivative| by value at T_ref and by each coefficient."""
     pairs = zip(functions, edges, strict=True)
     both = [function.basis(np.array(ends)) for function, ends in pairs]
     return [size for basis in both for size in (1.0, *(float(np.abs(v).max()) for v in basis))]

@@ -37,7 +37,7 @@ class Posterior:
         str, 'base64 of little-endian float32: one row of `rank` numbers per parameter.'
     ]
     diagonal: Annotated[
-        str, 'base64 of little-endian float32: one variance per parameter, of diag(diagonal).'
+        str, 'base64 of little-endian float32: the vector `diagonal`, a variance per parameter.'
     ]
 
     def __post_init__(self) -> None:
@@ -50,7 +50,7 @@ class Posterior:
 
     @classmethod
     def of(cls, matrix: npt.NDArray[np.floating[Any]], variances: Floats) -> Posterior:
-        """Encode a factor, shape (n_parameters, rank), and the variances of diag(diagonal)."""
+        """Encode a factor, (n_parameters, rank), and the variances to add to the diagonal."""
         return cls(matrix.shape[1], _encoded(matrix), _encoded(variances))
 
     @property
@@ -83,7 +83,7 @@ class Posterior:
 class Block(NamedTuple):
     """
     Indices of the parameters of an axis' bias or scale in the posterior. `static`, `dynamic`:
-    index of the regime's value at T_ref, before the other coefficients of the regime. `response`:
+    index of the regime's value at T_ref, which its other coefficients follow. `response`:
     index of the first weight of the columns; `end`: index after the last weight of the columns.
     """
 

@@ -65,8 +65,8 @@ class SlowUncertainty:
         (width, n). `start_shares`, (n_lags, n): share of each lag's initial state that remains;
         `start_rates`, (n,): largest board rate since the start, if above the present rate [K/s].
         Returns `Correction.n_slow` rows: a, b, c of each axis' error variance ``v(x) = a + b x + c
-        x^2`` [m^2/s^4], then the covariances `BETWEEN` errors of different axes and of the
-        misalignment, then what a nonlinearity adds to the coefficients of x^2 to x^6 of v(x).
+        x^2`` [m^2/s^4], then the covariances of the pairs of errors in `BETWEEN`, then the
+        contributions of a nonlinearity to the coefficients of x^2 to x^6 of v(x).
         """
         cuts = range(_CHUNK, states.shape[1], _CHUNK)
         rates = np.abs(states[RATE])
@@ -201,7 +201,7 @@ def sd_of_states(calibration: Calibration, states: Floats) -> tuple[Floats, Floa
     """
     Predict the sd of bias [m/s^2] and relative scale at thermal states, shapes (n, 3), including
     the sd of the self-heating gradient in a soak. The lack of fit of an axis at 1 g may be an
-    error of the bias or of the scale, so it is included in both sd.
+    error of the bias or of the scale, so the sd of the bias and that of the scale include it.
     """
     correction = Correction(calibration)
     slow = SlowUncertainty(calibration, correction)
@@ -245,7 +245,7 @@ def ramp_states(
 
 
 def _add_gradient(states: Floats, calibration: Calibration, change_k: float) -> None:
-    """Add a constant change of the first sensor's gradient to thermal states, in place."""
+    """Add `change_k` to the first sensor's gradient and its lags in thermal states, in place."""
     layout = StateLayout(memory_of_unit(calibration))
     for quantity, place in layout.places.items():
         if isinstance(quantity, Gradient) and quantity.input == calibration.sensors[0]:

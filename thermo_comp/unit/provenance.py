@@ -18,7 +18,7 @@ class GroupEvidence:
     """Contribution of one group of columns to the correction in the fitted data."""
 
     group: Annotated[str, 'Name of the group, as in the key `response`.']
-    part: Annotated[Literal['bias', 'scale'], 'Whether the group corrects bias or scale.']
+    part: Annotated[Literal['bias', 'scale'], 'Quantity that the group corrects.']
     explains_m_s2: Annotated[_Error, "RMS of the group's correction in the fitted data."]
     effective_parameters: Annotated[
         float, QUANTITIES['number'], 'Effective number of weights determined by the data.'

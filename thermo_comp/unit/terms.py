@@ -7,8 +7,8 @@ The value of a column is ``u = form.value(x)``, ``x = (n - centre) / width``; n 
 the thermal state (`source`) or, if `is_temperature`, ``t - source``: the temperature of a part
 that lags the board by `source`, less T_ref. Notation: ``t = T_board - T_ref``, ``g_s = T_s -
 T_board`` of a sensor s, and ``q_s = g_s - rest``. The constant `rest` is 0, or the gradient in a
-soak if self-heating warms the board above the case. Even functions of q_s have the same value for
-heating and for cooling at the same rate.
+soak if self-heating warms the board above the case. Even functions of the gradient q_s have equal
+values in heating and in cooling at the same rate.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class Form(NamedTuple):
-    """A function of x and its derivative; equal x give equal bits in arrays of any length."""
+    """A function of x, and its derivative: the bits of a result depend only on that x."""
 
     value: Callable[[Floats], Floats]
     slope: Callable[[Floats], Floats]
@@ -90,7 +90,7 @@ class Term:
         return (column.source.largest + abs(self.centre(column))) ** self.order
 
     def steepest(self, column: Column, raw: Floats, flow_k: float) -> float:
-        """Return the largest change of u per kelvin [1/K]; `flow_k` is the RMS of the gradient."""
+        """Return the largest change of a column's value u per kelvin; `flow_k`: RMS gradient."""
         if self.bounds is not None:
             return 1.0 / flow_k
         largest = float(np.abs(raw).max(initial=0.0)) ** (1.0 / self.order)
@@ -126,13 +126,13 @@ def _play(column: Column) -> Quantity:
 
 
 _ALL: Final = (
-    # Effect of the heat flow from a thermometer to the board; no fit makes columns of kind `rate`.
+    # `gradient`: heat flow from a thermometer to the board; `rate`: a fit never uses this kind.
     Term('gradient', 'g_s', _gradient),
     Term('rate', 'dT_board/dt [K/s]', lambda _: state.Rate()),
-    # `board`: a part that lags the board; `gradient_lag`: a part between board and thermometer.
+    # `board`: for a part that lags the board; `gradient_lag`: for a part between thermometers.
     Term('board', 'T_board - lagged T_board', _part, positive=('tau_s',)),
     Term('gradient_lag', 'lagged g_s', _lagged_gradient, positive=('tau_s',)),
-    # With lag: curve over the temperature of a part; without lag: square of a heat flow.
+    # With lag: term of a curve over a part's temperature; without lag: square of a heat flow.
     Term(
         *('square', '(T_board - lagged T_board)^2, or q_s^2 without lag', _part_or_gradient),
         *(_SQUARE, 2, 'rest_k'),
