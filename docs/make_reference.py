@@ -83,8 +83,8 @@ response:                            # columns added to both sets
 The parameters of the posterior are, for each axis x, y, z: first the bias in input units (level of
 the static set, free coefficients of its Fs, level of the dynamic set, free coefficients of its Fs,
 weights of the response in the order of the file); then the parameters of the relative scale in the
-same order. A `nonlinearity` adds, for each axis, the coefficients of its terms, then their changes
-per kelvin. The last three parameters of a posterior are `M[1][0]`, `M[2][0]` and `M[2][1]`. The
+same order. A `nonlinearity` adds parameters for each axis: the coefficients of its terms, then their
+changes per kelvin. The last three parameters of a posterior are `M[1][0]`, `M[2][0]` and `M[2][1]`. The
 covariance of all parameters is `factor @ factor.T + diag(diagonal)`. The posterior of a `gyroscope`
 has only the parameters of the bias, in rad/s and in the order of the accelerometer's bias. The
 `gyroscope` uses the ranges, the reference temperature and the thermometers of the accelerometer.
