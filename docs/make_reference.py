@@ -175,7 +175,7 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | case readings that repeat those of the board (one topic for both), ten changed readings in a row | the readings are used; the gradient expected of the case adds to the covariance, WARN |
 | a sample whose stamp goes back by a second or more, after the force at rest has refuted the calibration | nothing is published until the force at rest agrees with gravity in two windows, ERROR |
 | a board temperature that leads the case temperature in ramps (swapped topics) | the covariance is increased, ERROR |
-| counts constant for `stuck_timeout`, on all axes or on one axis while the others change or show their noise; three zeros | dropped, counted, ERROR |
+| counts constant for `stuck_timeout`, on all axes or on one axis while the others change or show their noise; samples of three zeros | dropped, counted, ERROR |
 | counts that come faster than their conversion cycle | dropped, counted, ERROR |
 | a magnitude of the specific force at rest that differs from gravity by more than `gravity_tolerance` | nothing is published, ERROR |
 | a second publisher of a topic | the topic is not used, ERROR, until one publisher is left or for one second all messages are from one publisher (WARN while the middleware still lists a killed publisher, for 20 s) |
