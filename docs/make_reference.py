@@ -83,8 +83,8 @@ response:                            # columns added to both sets
 The parameters of the posterior are, for each axis x, y, z: first the bias in input units (level of
 the static set, free coefficients of its Fs, level of the dynamic set, free coefficients of its Fs,
 weights of the response in the order of the file); then the parameters of the relative scale in the
-same order. A `nonlinearity` adds, for each axis, the coefficients of its terms, then their changes
-per kelvin. The last three parameters of a posterior are `M[1][0]`, `M[2][0]` and `M[2][1]`. The
+same order. A `nonlinearity` adds parameters for each axis: the coefficients of its terms, then their
+changes per kelvin. The last three parameters of a posterior are `M[1][0]`, `M[2][0]` and `M[2][1]`. The
 covariance of all parameters is `factor @ factor.T + diag(diagonal)`. The posterior of a `gyroscope`
 has only the parameters of the bias, in rad/s and in the order of the accelerometer's bias. The
 `gyroscope` uses the ranges, the reference temperature and the thermometers of the accelerometer.
@@ -175,7 +175,7 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | case readings that repeat those of the board (one topic for both), ten changed readings in a row | the readings are used; the gradient expected of the case adds to the covariance, WARN |
 | a sample whose stamp goes back by a second or more, after the force at rest has refuted the calibration | nothing is published until the force at rest agrees with gravity in two windows, ERROR |
 | a board temperature that leads the case temperature in ramps (swapped topics) | the covariance is increased, ERROR |
-| counts constant for `stuck_timeout`, on all axes or on one axis while the others change or show their noise; three zeros | dropped, counted, ERROR |
+| counts constant for `stuck_timeout`, on all axes or on one axis while the others change or show their noise; samples of three zeros | dropped, counted, ERROR |
 | counts that come faster than their conversion cycle | dropped, counted, ERROR |
 | a magnitude of the specific force at rest that differs from gravity by more than `gravity_tolerance` | nothing is published, ERROR |
 | a second publisher of a topic | the topic is not used, ERROR, until one publisher is left or for one second all messages are from one publisher (WARN while the middleware still lists a killed publisher, for 20 s) |
