@@ -64,7 +64,7 @@ _FAULTS = {
     Fault.FROZEN: 'frozen (equal readings) while the other temperature changes: not used',
     Fault.STEP: 'jumped by {:+.2f} K; its readings are not used',
     Fault.COPY: "repeats the board thermometer's readings: do both read one topic?",
-    Fault.LOOSE: 'is {:.1f} K farther from the case temperature than in the fit: loose sensor?',
+    Fault.LOOSE: 'is {:.1f} K farther from that of the case than in the fit: thermometer loose?',
 }
 
 Finding = tuple[int, str]  # level and text
