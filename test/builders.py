@@ -195,7 +195,7 @@ def batch(compensator, events):
 def assert_equal_bits(unit, config, events, chunk):
     """
     Check that a block of all events, blocks of `chunk` events and single events give equal bits.
-    Return the rows by single events, the block of all events, and the three compensators.
+    Return the output rows of single events, the block of all events, and the three compensators.
     """
     streamed, whole, cut = (Compensator(unit, config) for _ in range(3))
     rows, index = stream(streamed, events)

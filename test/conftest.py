@@ -326,7 +326,7 @@ def equal_tracks_once():
         place = key.digest()
         if place not in known:
             known[place] = track(bag, model, spec)
-            # All fits share these arrays, so no fit may change them.
+            # Tests share the arrays of thermal states, so no fit may change them.
             known[place].states.flags.writeable = known[place].is_known.flags.writeable = False
             if len(known) > 60:
                 del known[next(iter(known))]

@@ -111,8 +111,8 @@ def at_seconds(*events):
     ]
 
 
-# In the explicit examples a stamp is below that of a reading which is a day ahead, or was already
-# applied; only after a fall by over 5 s earlier readings count as readings of another clock.
+# In the examples stamps fall below that of a reading that is a day ahead or already applied. Only
+# if stamps fall by over 5 s, earlier readings count as readings of another clock.
 @given(event_lists, st.integers(3, 30), st.sampled_from([0.0, 5.0]))
 @example(at_seconds('A', 3, 'A', 0, 'B', 2, 'B', 86_400, 'C', 0, 'A', 0), 5, 0.0)
 @example(at_seconds('B', 26, 'B', 21, 'A', 23, 'B', 16.5), 1, 0.0)
@@ -265,7 +265,7 @@ def test_another_transition_time_during_a_transition_causes_no_step_of_the_outpu
 
 def test_a_new_transition_time_does_not_restart_the_check_of_gravity(rng):
     # WHY: after a change of any parameter the check of |f| began again, and samples with a wrong
-    # |f| were published for 13 s at rest, and without a limit in motion.
+    # |f| were published for 13 s at rest, and in motion for as long as it lasted.
     compensator = Compensator(calibration(), CompensatorConfig())
 
     def published(seconds, size):

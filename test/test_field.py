@@ -39,8 +39,8 @@ def test_derivatives_of_a_rest_by_all_parameters_agree_with_finite_differences()
     layout = parameter_layout(unit)
     levels = {block.static: axis for axis, block in enumerate(layout.scale)}
     levels |= {block.dynamic: axis for axis, block in enumerate(layout.scale)}
-    # Test every second parameter. The block of parameters of a bias or scale has an odd length, so
-    # each kind of parameter is tested either in the bias or in the scale.
+    # Test every second calibration parameter. The block of parameters of a bias or scale has an
+    # odd length, so each kind of parameter is tested either in the bias or in the scale.
     for k in range(0, layout.n_parameters, 2):
         step = 1e-7
         moved = values.copy()
@@ -186,7 +186,7 @@ def test_the_sd_of_an_old_calibration_aged_to_the_last_rest_includes_the_random_
     # half and all of the variance of the random walk to the biases of x and y.
     for axis in (x, y):
         assert 0.5 < axis.present_sd / (329.0 * MICRO_G) < 1.5
-    # The sd of z at the last rest must equal the walk of z within 40 ug, two sd of a turn-on.
+    # At the last rest the sd of z must equal the walk of its bias to 40 ug, two sd of a turn-on.
     assert z.present_sd == pytest.approx(abs(walk[-1, 2]), abs=40.0 * MICRO_G)
 
 
@@ -465,7 +465,7 @@ def test_unknown_initial_lag_states_are_not_taken_for_scatter_of_rests(rng, lags
     residual += np.sqrt(series.noise + (3.0 * MICRO_G) ** 2) * rng.standard_normal(3 * n)
     ageing, _, used = learn(replace(series, residual=residual), unit, float(series.time[0]))
     assert len(used) == 3 * n
-    # In six simulations the estimates scattered by 20 % (walk of the bias), 30 % (walk of the
+    # In six simulations the estimated sd scattered by 20 % (walk of the bias), 30 % (walk of the
     # scale) and 15 % (turn-on).
     assert ageing.bias == pytest.approx(15.0 * MICRO_G, rel=0.5)
     assert ageing.scale == pytest.approx(10.0 * MICRO_G, rel=0.7)

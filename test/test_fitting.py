@@ -90,7 +90,7 @@ def test_errors_of_fitted_constants_are_below_4_claimed_sd(response):
     pull = pulls(response, OWN_LAGS)
     assert np.abs(pull).max() < 4.0
     assert np.sqrt(np.mean(pull**2)) < 2.0
-    # The drift is some 100 ug; the claimed sd of bias, scale and M are some ug and ppm.
+    # The raw drift is some 100 ug; the claimed sd of bias, scale and M are some ug and ppm.
     bias_sd, scale_sd, M_sd = claimed(response.calibration)
     assert (bias_sd / np.array(OWN_LAGS.counts_per_micro_g)).max() < 5.0
     assert scale_sd.max() < 10e-6

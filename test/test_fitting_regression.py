@@ -104,7 +104,7 @@ class Dense:
             state.tilt.ravel() / prior.tilt_sd,
             state.turn_on.ravel() / prior.turn_on_sd,
             state.start.ravel() / np.sqrt(prior.start_variance_ratio),
-            # The mean of the initial lag states over all bags has 0.1 of the prior sd of one bag.
+            # The initial lag states averaged over all bags have 0.1 of the prior sd of one bag.
             state.start.mean(axis=0) / (0.1 * np.sqrt(prior.start_variance_ratio)),
         ]
         if len(state.pose):
@@ -431,8 +431,8 @@ def test_scores_of_inactive_columns_agree_with_a_fit_in_which_they_are_active(no
 
 
 def test_inactive_and_active_columns_share_initial_lag_states(solved):
-    # WHY: the sparsity factor S lacked the prior of the sum of initial lag states. For an
-    # inactive column of the scale whose lag also changes the bias, S was 50 times too large.
+    # WHY: the sparsity factor S lacked the prior of the sum of initial lag states. S of an
+    # inactive column of the scale whose lag also changes the bias was 50 times too large.
     regression, prior, mode = solved
     of_scale = np.isin(GROUPS, ('board',)) * [[0.0], [1.0]]
     without = replace(prior, column_sd=np.where(of_scale > 0.0, 0.0, prior.column_sd))

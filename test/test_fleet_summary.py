@@ -184,7 +184,7 @@ class TestDrift:
         drifts = summarise(later, before).drifts
         names = sorted(drift.earlier for drift in drifts)
         assert names == [f'earlier /u00{i}@0' for i in range(3)]
-        # A table of the same calibrations gives no drift.
+        # If the earlier fleet's table has the same calibrations, no drift is computed.
         assert summarise(first, before).drifts == ()
 
 

@@ -186,8 +186,8 @@ def test_the_bias_in_a_soak_includes_the_gradient_by_self_heating():
         soak_gradient_k=(-3.0, 0.2),
     )
     bias, bias_sd, scale, scale_sd = in_a_soak(unit)
-    # In a soak the lagged gradient is the gradient. A part midway between board and case is colder
-    # than the board by half of the gradient.
+    # In a soak the lagged gradient equals the gradient. A part midway between board and case is
+    # colder than the board by half of the gradient.
     by_kelvin = np.array([30.0, 60.0, -45.0]) / 300.0
     assert bias == pytest.approx(-3.0 * by_kelvin)
     assert bias_sd == pytest.approx(0.2 * np.abs(by_kelvin))

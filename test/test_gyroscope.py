@@ -172,7 +172,7 @@ def test_a_gyroscope_is_read_back_from_a_file_bit_for_bit():
     np.testing.assert_array_equal(scale, 1.0)
     sd_bias, sd_scale = sd_of_states(triad, states[1:2])
     np.testing.assert_array_equal(sd_scale, 0.0)
-    # At 20 degC bias and variance are those of the level; a turn-on adds its variance.
+    # At 20 degC the bias is its level; its variance is that of the level plus that of a turn-on.
     np.testing.assert_allclose(bias[1], (0.02 + 1e-5, -0.03, 0.01 + 1e-5))
     np.testing.assert_allclose(
         sd_bias[0], np.hypot((1e-5, 2e-5, 1e-5), np.sqrt(1.01e-10)), rtol=1e-5

@@ -48,7 +48,7 @@ SOAKS = tuple(program(celsius, 25.0) for celsius in (8.0, 19.0, 34.0))
 
 
 def study_of(*name, up=9, corners=HALF, held=HELD, grade=navigation, **given):
-    """Simulate bags of a unit: for a fit, in directions `up` (or their number), and held-out."""
+    """Return a unit and its bags: for a fit, in directions `up` (or their number); held-out."""
     rng = rng_of(*name)
     unit = grade(rng, **given)
     is_mems = grade is not navigation
@@ -140,7 +140,7 @@ def test_lags_of_the_thermometers_themselves_are_fitted(sensors):
         assert shares == pytest.approx([np.mean(shares)] * 3, abs=0.02)
     else:
         assert taus == pytest.approx(unit.part_s, rel=0.02)
-        # `leads / taus` is the lag of the thermometer (60 s) / lag of the part.
+        # Expected `leads / taus`: lag of the thermometer (60 s) / lag of the part.
         assert leads / taus == pytest.approx(60.0 / unit.part_s, abs=0.01)
 
 
@@ -298,7 +298,7 @@ def test_six_faces_in_three_soaks_determine_the_curve_at_other_temperatures():
 @pytest.mark.slow
 def test_the_claimed_sd_between_two_soaks_includes_the_undetermined_curve():
     # WHY: soaks at two temperatures do not determine a curve over temperature. The covariance
-    # lacked the uncertainty of its curvature, and the claimed sd was 1/8 of the error.
+    # lacked the uncertainty of the curve's shape: the claimed sd was 1/8 of the error.
     given = {'held': program(19.0, 90.0), 'grade': consumer_grade}
     _, study = study_of('two soaks', up=18, corners=SOAKS[::2], **given)
     assert judged(strangers.fitted(study), study).ratio < 2.0

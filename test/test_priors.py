@@ -27,7 +27,7 @@ from thermo_comp.unit.prediction import in_a_soak
 
 PROGRAM = parse_cyclogram('20 5min, 33@1 15min, 8@1 15min')
 KIND = triad('products', 1)
-#: The groups that the simulated unit needs are a third of all columns, and halve the fit's time.
+#: Groups of columns that the unit needs: a third of all columns, half of the fit's time.
 OPTIONS = FitOptions(STANDARD_GRAVITY, groups=('curve', 'board', 'product'))
 
 
@@ -250,7 +250,7 @@ def after(change, ups):
 def test_one_to_three_faces_of_an_unchanged_unit_keep_the_calibration(n_faces):
     # WHY: one unchanged face had increased the claimed sd of bias and scale from 0.2 to 424 ug.
     bias, bias_sd, scale, scale_sd = after(lambda counts, _: counts, np.eye(3)[:n_faces])
-    # The limit, 30 ug, is a tenth of the usual repeatability of turn-ons, 300 ug.
+    # Limit of the claimed sd: 30 ug, a tenth of the usual repeatability of turn-ons, 300 ug.
     assert max(bias_sd.max(), scale_sd.max() * STANDARD_GRAVITY) < 30e-6 * STANDARD_GRAVITY
     assert np.abs(bias).max() < 2.0 * bias_sd.max()
     assert np.abs(scale).max() < 2.0 * scale_sd.max()
@@ -272,8 +272,8 @@ def test_three_faces_halve_the_error_of_a_change_of_bias_or_scale(kind):
     bias, bias_sd, scale, scale_sd = after(changed, np.eye(3))
     wrong = np.array([bias / STANDARD_GRAVITY, scale])
     wrong[('bias', 'scale').index(kind)] -= change
-    # The rests determine only the sum of the errors of bias and scale, so each gets half of the
-    # change. Noise of 10 min and unknown initial lag states leave an error of some ug.
+    # The rests determine only the sum of the errors of bias and scale: each gets half of the
+    # change. The noise of a rest and unknown initial lag states leave an error of some ug.
     assert np.abs(wrong.sum(axis=0)).max() < 10e-6
     assert np.abs(np.abs(wrong) / np.abs(change) - 0.5).max() < 0.1
     assert (np.abs(wrong) < 2.0 * np.array([bias_sd / STANDARD_GRAVITY, scale_sd])).all()
@@ -343,7 +343,7 @@ def test_the_calibration_of_another_unit_is_refused_as_a_prior():
     messages = [finding.message for finding in allowed.findings if finding.name == 'prior']
     assert any('allowed: ' in text for text in messages)
     assert any('bags contradict the prior' in text for text in messages)
-    # A prior has curves for each regime, so the fit has no residual of a single curve.
+    # With a prior the model has a curve per regime; residuals of a single curve are not computed.
     assert not allowed.residuals[-1].one_set.n
 
 

@@ -131,7 +131,7 @@ def test_flicker_noise_has_a_flat_allan_deviation():
 
 @pytest.fixture
 def recorded(monkeypatch):
-    """Replace `record` by a stub; return a function that gives the arguments of a bag's call."""
+    """Replace `record` by a stub; return a function that gives the arguments that made a bag."""
     notes = {}
 
     def note(given, corners, up, rng, *, name='bag', **keys):
@@ -295,7 +295,7 @@ def test_the_ratio_is_1_if_errors_have_the_claimed_covariance():
 
 
 def test_the_claimed_sd_of_a_minute_is_the_noise_of_its_mean():
-    # This calibration claims white noise and rounding of counts only.
+    # The calibration claims only white noise and rounding of counts.
     samples = np.tile(300.0 * GRAVITY * LEVEL, (30000, 1))
     samples[::2] += 1.0
     samples[1::2] -= 1.0

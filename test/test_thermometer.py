@@ -116,7 +116,7 @@ def test_a_change_between_steps_of_1_k_determines_the_temperature():
     assert thermometer.var_temperature == pytest.approx(1.0 / 12.0, rel=0.2)
     thermometer.update(600 * SECOND_NS, 21.0)
     assert thermometer.temperature == pytest.approx(20.5, abs=0.03)
-    # The sd at the change is the noise plus the temperature change between two readings.
+    # When the reading changes, the sd is the noise plus the temperature change per reading.
     assert 0.005 < math.sqrt(thermometer.var_temperature) < 0.03
 
 
