@@ -98,7 +98,7 @@ def event_list(seed):
     return events
 
 
-#: Hypothesis draws the seed of a list, because drawing each message would double the time.
+#: Hypothesis draws one seed per list, as drawing each message would double the tests' time.
 event_lists = st.integers(0, 2**64 - 1).map(event_list)
 
 
@@ -356,7 +356,7 @@ def test_a_switch_of_sets_causes_no_step():
 
 @pytest.mark.parametrize(
     ('delta', 'given_s', 'expected_s'),
-    # The output changes by at most 1 ug/s: in 102 s for sets that differ by 0.3 counts = 102 ug.
+    # At 1 ug/s a change by the difference of the sets, 0.3 counts = 102 ug, takes 102 s.
     [(0.01, 30.0, 30.0), (0.3, 30.0, 1e-3 / 9.80665e-6), (0.3, 5.0, 50.0), (0.3, 0.0, 0.0)],
 )
 def test_a_transition_time_above_0_limits_the_change_to_1_ug_per_s(delta, given_s, expected_s):

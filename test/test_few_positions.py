@@ -165,8 +165,8 @@ def test_rests_at_three_temperatures_give_the_bias_slope_despite_a_warm_up_of_th
     # the sensor in a rest is uncertain by 0.1 K.
     np.testing.assert_allclose(slopes, 0.1 * MG * SLOPE, atol=0.002 * MG)
     assert 'misfit' not in names_of(result)
-    # Soaks do not determine the weights of lags. The largest possible weight is the bias slope;
-    # the claimed sd of the weights is between half of this slope and the slope.
+    # Soaks do not determine the weights of lags, which can be as large as the bias slope: their
+    # claimed sd is between half of the bias slope and the bias slope.
     variance, layout = np.diag(calibration.posterior.covariance()), parameter_layout(calibration)
     of_lags = [variance[block.response : block.end].sum() for block in layout.bias]
     assert 0.5 < np.sqrt(np.mean(of_lags) / np.mean(slopes**2)) < 1.0
@@ -273,8 +273,8 @@ def test_the_bias_sd_of_one_recording_contains_the_sd_of_a_turn_on(rng):
 
 @pytest.mark.slow
 def test_the_claimed_variance_of_a_curve_contains_that_of_turn_ons_at_each_temperature(rng):
-    # WHY: turn-ons at three temperatures counted as errors of the mean bias, not of the curve, so
-    # the claimed variance was only 1.6 to 1.9 times the variance of a turn-on.
+    # WHY: turn-on offsets at three temperatures were taken for errors of the mean bias, not of the
+    # curve: the claimed variance was only 1.6 to 1.9 times the variance of a turn-on.
     turn_on, ups, dwell = 5e-3, positions(9, 3), 600
     bags = []
     for celsius in (-15.0, 20.0, 55.0):
@@ -296,7 +296,7 @@ def test_the_claimed_variance_of_a_curve_contains_that_of_turn_ons_at_each_tempe
 
 
 def test_rests_of_one_mounting_do_not_show_how_well_mountings_repeat(rng):
-    # WHY: if each position had several rests, the fitted mounting sd was 1/20 of the true sd.
+    # WHY: with several rests per mounting the fitted mounting sd was 1/20 of the true sd.
     whole, cut = tumbled(9), fit([turned(rng, np.repeat(positions(9, 3), 5, axis=0))], OPTIONS)
     sd, sd_cut = (done.calibration.static.x.residual_sd_m_s2 for done in (whole, cut))
     # Nine values of |f| do not determine the mounting sd, which stays at its prior in both fits.

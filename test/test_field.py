@@ -30,7 +30,7 @@ from thermo_comp.unit.provenance import Provenance
 
 
 def test_derivatives_of_a_rest_by_all_parameters_agree_with_finite_differences():
-    # In a ramp no column is zero, and both coefficient sets have a weight.
+    # The rests are in a ramp, so that every column and both coefficient sets have an effect.
     unit = rich_calibration()
     logged = rests(unit, in_any_attitude, no_error, days=1, rate=0.5 / 60.0)
     series = series_of(logged, unit)
@@ -61,7 +61,7 @@ def test_derivatives_of_a_rest_by_all_parameters_agree_with_finite_differences()
         by_level = series.by_level[:, axis + 3] * unit.gravity_m_s2
         assert np.allclose(slope, by_level, atol=1e-4)
         both = series.by_parameter[:, [block.static, block.dynamic]].sum(axis=1)
-        # A relative change of K has the effect of an equal change of the scale level in both sets.
+        # A relative change of K changes |f| like an equal change of the scale level in both sets.
         assert np.allclose(slope, both, atol=0.02 * abs(slope).max())
 
 
@@ -72,7 +72,7 @@ def test_an_update_with_the_true_variances_equals_a_kalman_filter():
     series = series_of(history.rests, unit)
     best = field_units.BestFilter(process)
     for k in range(len(series)):
-        # The Kalman filter gets the mean of the rests of row k of `series` as one measurement.
+        # The mean of the rests of row k of `series` is one measurement of the Kalman filter.
         first = int(series.n_windows[:k].sum())
         windows = [r for _, r in history.rests[first : first + int(series.n_windows[k])]]
         mean = np.mean([window.mean for window in windows], axis=0) / field_units.K
@@ -207,7 +207,7 @@ def test_a_change_of_gravity_is_not_taken_for_a_change_of_three_scales(day):
     result = update(series_of(stepped(history, size, day), unit), unit)
     ((change, found, sd),) = result.solution.gravity
     assert change.time - field_units.DAY_ZERO == pytest.approx(day + 0.4, abs=0.5)
-    # The random walks of the scales (10 ppm per root day) limit the sd of the step of gravity.
+    # Random walks of the scales (10 ppm per root day) limit how well the gravity step is known.
     assert abs(found - size) < 4.0 * sd < 60.0 * MICRO_G
     for before, after in zip(aged.axis_changes, result.axis_changes, strict=True):
         assert after.scale == pytest.approx(before.scale, abs=30e-6)

@@ -132,7 +132,7 @@ def test_variance_ratio_and_correlation_time_are_estimated(rng, noise):
 
 
 def test_white_noise_is_not_taken_for_gauss_markov_noise(rng):
-    # The fit finds Gauss-Markov noise in 1 % of series of white noise, but not in these ten.
+    # In 1 % of all series of white noise the fit finds Gauss-Markov noise, but not in these ten.
     assert [
         whitener.estimate(series, weight)
         for whitener, weight, series in (drawn(rng, 5, 100, Noise()) for _ in range(10))
@@ -151,7 +151,7 @@ MICRO = 9.80665e-6  # a micro-g [m/s^2]
 
 
 def score(drift, norms=(), by_thermometer=0.0):
-    """Return a score with left-out drifts of equal size and the given errors of |f| [ug]."""
+    """Return a score of equal left-out drifts `drift` and left-out |f| errors `norms` [ug]."""
     drifts = Folds(np.full(18, (drift * MICRO) ** 2), np.full(18, 20.0))
     of_norms = Folds((np.array(norms) * MICRO) ** 2, np.full(len(norms), 20.0))
     none = np.zeros((0, 3))

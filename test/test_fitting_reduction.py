@@ -314,8 +314,8 @@ def soak_ramp_soak(quantum, noise, rng):
 def test_thermometer_settings_are_estimated_from_readings(quantum, noise, rng):
     learned = learn_thermometer([soak_ramp_soak(quantum, noise, rng)], ThermometerSettings())
     assert learned.quantum_c == pytest.approx(quantum, rel=1e-6)
-    # Rounded readings show noise only at the rounding edges that they pass slowly, at the end of
-    # the ramp.
+    # Rounded readings show noise only where they pass a rounding edge slowly, at the end of the
+    # ramp.
     assert learned.noise_sd_c == pytest.approx(noise, rel=0.4 if quantum else 0.1)
     # Means over 60 s determine the lag of the thermometer, 300 s, to a third.
     assert learned.lag_s == pytest.approx(300.0, rel=0.35)
@@ -391,8 +391,8 @@ def test_a_drift_averages_the_error_of_rounding(rng):
 
 @pytest.mark.parametrize('step', [1.0, 0.04])
 def test_steps_of_a_converter_after_a_constant_soak_do_not_divide_a_rest(rng, step):
-    # WHY: the step of the converter was searched in the first 20000 samples only. After 20000
-    # constant samples each step of the converter began a new rest.
+    # WHY: the step of the converter was searched in the first 20000 samples only. If these were
+    # constant, each later change by a converter step began a new rest.
     rest = Rest(rng, duration_s=3600.0, sd=0.0)
     ramp = np.maximum(rest.time - 1800.0, 0.0) / 1800.0
     rest.accel = np.rint(rest.accel / 0.04 + 6.0 * np.outer(ramp, (1.0, -1.3, 0.7))) * step

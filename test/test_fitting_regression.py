@@ -57,7 +57,7 @@ class Dense:
         self.determinant = -2.0 * sum(np.log(np.diag(root)).sum() for root in self.roots)
 
     def state(self, x):
-        """Return the state at the mode of `Regression` plus the parameter changes x."""
+        """Return the state whose parameters differ by x from the mode of `Regression`."""
         layout, at = self.at.layout, self.at.state
         padded = np.append(x, 0.0)
         pose, pose_of = at.pose, at.pose_of
@@ -320,7 +320,7 @@ def test_a_position_that_alone_determines_a_parameter_has_no_left_out_norm(rng):
     score = score_of(regression, mode)
     assert np.isnan(score.force).all()
     assert np.isnan(score.norms.square).all()
-    # The drift of |f| in a left-out position does not need bias and scale, so it has a score.
+    # The drift of |f| in a left-out position is predicted without bias and scale: it has a score.
     # M keeps its prior mean and sd.
     assert np.isfinite(score.positions.square).all()
     np.testing.assert_allclose(mode.state.misalignment, 0.0, atol=1e-6)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Window columns equal those of the compensator, and a calibration file equals the fit."""
+"""Columns of a fit's windows equal the compensator's; a calibration file equals the fit."""
 
 from dataclasses import replace
 from importlib import import_module

@@ -214,7 +214,7 @@ def test_ramp_states_equal_those_of_the_memory_of_the_fit(rate):
         if isinstance(quantity, Gradient):
             assert state[place] == pytest.approx(100.0 * rate)
         elif isinstance(quantity, Lag):
-            # The gradient rises within 1 s in `memory_on_grid`, in a step in `ramp_states`.
+            # In `memory_on_grid` the gradient rises within 1 s, in `ramp_states` it rises at once.
             assert state[place] == pytest.approx(lived[place - first], rel=2e-3), quantity
         elif isinstance(quantity, Play) and not quantity.tau_s:
             # Skip plays of lags: a lag takes half an hour to change by the half-width of a play.

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The parts of a split recording give the fit and the judgement of the whole recording."""
+"""The parts of a split recording give the same fit and judgement as the whole recording."""
 
 from dataclasses import replace
 from itertools import pairwise

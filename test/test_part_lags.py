@@ -102,7 +102,7 @@ def judged(calibration, study):
 
 def test_the_fitted_lag_of_each_axis_is_that_of_its_part(parts):
     unit, study, calibration, _ = parts
-    # In a ramp a part lags by 10 K and changes the bias by 10 ug/K: 1 % of its lag causes 1 ug.
+    # In a ramp a lag of 10 K changes the bias by 100 ug, an error of the lag of 1 % by 1 ug.
     assert np.array(taus_of(calibration)) == pytest.approx(unit.part_s[:, None], rel=0.01)
     # The noise of |f| in a mean over 60 s is 0.65 ug.
     assert judged(calibration, study).norm < 2.0

@@ -151,7 +151,7 @@ def test_readings_that_may_repeat_by_chance_are_no_fault():
 
 @cache
 def in_its_chamber(preset, sensor):
-    """Simulate a unit; return its readings as (stamp, whether of the case, degC)."""
+    """Simulate a unit; return its readings: (stamp [ns], 0 for board or 1 for case, degC)."""
     settings = SENSORS[sensor]
     unit = unit_preset(preset, 1).with_thermometers(
         noise_sd=settings.noise_sd_c, quantum=settings.quantum_c, rate_hz=0.5

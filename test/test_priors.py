@@ -118,7 +118,7 @@ def test_chance_correlations_between_parameters_of_twelve_units_are_reduced(rng)
     n = layout.n_parameters
 
     def share_left(units, k):
-        """Return the variance of parameter k given all others, divided by its variance."""
+        """Return the share of the variance of parameter k that all others do not explain."""
         deviations = (units - units.mean(axis=0)) / np.sqrt(len(units) - 1.0)
         scatter = _scatter(deviations, layout, np.ones(3))
         return 1.0 / (np.linalg.inv(scatter)[k, k] * scatter[k, k])
@@ -131,7 +131,7 @@ def test_chance_correlations_between_parameters_of_twelve_units_are_reduced(rng)
     pair = np.corrcoef(independent[:, [layout.bias[0].static, level]].T)[0, 1]
     assert share_left(independent, level) == pytest.approx(1.0 - pair**2)
     assert share_left(independent, bias) > 0.5
-    # A correlation that all twelve units show is kept.
+    # The prior keeps a correlation that all twelve units show.
     common = rng.standard_normal((12, 1)) + 0.01 * independent
     assert share_left(common, bias) < 0.1
 
@@ -174,8 +174,8 @@ def helped():
 @pytest.mark.slow
 def test_a_fit_begins_with_the_widest_of_its_priors():
     # WHY: a fit that began with the narrow prior of three units found mounting offsets of 190 ug,
-    # a local minimum: |f| - g of a held-out bag was 271 ug, not 0.9 ug. WHAT: a fit begins with
-    # the prior that has the largest variance in all directions.
+    # a local minimum: |f| - g of a held-out bag was 271 ug, not 0.9 ug. WHAT: of all priors it
+    # tries, a fit begins with that of largest variance in all directions.
     *tried, widest = (prior.root.T @ prior.root for prior in helped())
     assert len(tried) > 2
     root = np.sqrt(np.diag(widest))

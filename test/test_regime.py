@@ -78,7 +78,7 @@ def headline():
     [
         ('1 mK', 45.0, 90.0),
         ('10 mK', 150.0, 180.0),
-        # A detection needs two steps of 62.5 mK, on average a change by 94 mK, after 146 +- 6 s.
+        # Two steps of 62.5 mK are detected: a change by 94 mK (mean) is reached after 146 +- 6 s.
         ('1 mK, 62.5 mK steps', 158.0, 180.0),
         ('10 mK, 62.5 mK steps', 150.0, 180.0),
     ],
@@ -168,7 +168,7 @@ def test_three_soaks_of_5_h_have_at_most_two_false_alarms(sensor):
 def test_the_rate_of_false_alarms_is_below_that_of_the_setting():
     # The setting allows 20 false alarms per hour, 1000 in 50 h; the readings are noise only. The
     # threshold is set by Rice's formula for crossings; as crossings come in groups, there are
-    # fewer separate alarms. The lower limit on the alarms excludes a detector that does nothing.
+    # fewer separate alarms. A lower limit of alarms excludes a detector that does nothing.
     settings = ThermometerSettings(0.01, lag_s=LAG_S)
     test = ChangeDetector(settings, 0.2 / 60.0, ripple=0.0, false_alarms=20.0 / 3600.0)
     rng = np.random.default_rng(6)

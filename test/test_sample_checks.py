@@ -72,7 +72,7 @@ def test_few_equal_samples_are_accepted_at_any_sample_rate(rng):
 )
 @settings(max_examples=300, deadline=None)
 def test_constant_samples_are_found_in_batches_of_any_size(parts, cuts, period):
-    # In each part an axis is constant or changes with each sample; some samples of y are NaN.
+    # In each part of the series an axis is constant or changes with each sample; y has some NaN.
     stands = np.repeat([which >> np.arange(3) & 1 for _, which in parts], [n for n, _ in parts], 0)
     sizes = 1.0 + np.arange(len(stands)) % 4
     samples = 1.0 + np.cumsum((1.0 - stands.reshape(-1, 3)) * sizes[:, np.newaxis], axis=0)

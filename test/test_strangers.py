@@ -40,7 +40,7 @@ def unit(**given):
 
 
 def ramp(given, rate, hours, environment=units.CHAMBER):
-    """Ramp the air at `rate` [K/s] after a soak; return times [s] and node temperatures."""
+    """Ramp the air at `rate` [K/s] after a soak; return times [s], thermal nodes' temperatures."""
     A, b, h = units.network(given, environment)
     at = np.arange(0.0, 3600.0 * hours, 10.0)
     return at, units.integrate(A, b, h, rate * at, 10.0, np.linalg.solve(A, -h))
@@ -203,7 +203,7 @@ def of_attitudes(given, board):
 
 
 def curved_unit():
-    """Make a unit whose bias is a cubic, and whose scale is a line, in temperature."""
+    """Make a unit whose bias is a cubic and whose scale is a linear function of temperature."""
     rng = rng_of('curved')
     return unit(
         bias=1500.0 * rng.standard_normal(3), gain=0.01 * rng.standard_normal(3),

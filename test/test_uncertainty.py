@@ -240,8 +240,8 @@ def test_outside_its_range_a_set_follows_the_curve_of_the_other_set():
 
 
 def test_the_sd_beyond_the_range_includes_every_parameter_of_the_tangents(rng):
-    # A change of the parameters must change bias and scale by the regressors times this change.
-    # The ranges are 5 to 35 degC (static) and 0 to 30 degC (dynamic).
+    # A change of the parameters times the regressors must equal the change of bias and scale. The
+    # ranges are 5 to 35 degC (static) and 0 to 30 degC (dynamic).
     spline = CubicSpline((-15.0, 0.0, 15.0), (-4.0, 0.0, 6.0))
     exponential = Exponential(-1.0, (1.0,), (18.0,))
     splined = AxisSet(spline, Polynomial((1.0, 1e-4)))
