@@ -110,7 +110,7 @@ def test_the_value_of_each_kind_of_column_agrees_with_hand_numbers():
     ]
     spec = memory_of(columns, ('case', 'tip'))
     layout = StateLayout(spec)
-    # Board, its variance, rate, weight, unknown; (value, variance) of 2 gradients, 2 lags; a play.
+    # Board, variance, rate, dynamic weight, unknown regime; gradients, lags + variances; a play.
     state = np.array(
         [[23.0, 0.0, 0.01, 0.25, 0.0, 1.2, 0.0, -0.7, 0.0, 0.5, 0.0, -0.3, 0.0, 0.1]]
     ).T

@@ -175,7 +175,7 @@ def test_rests_at_three_temperatures_give_the_bias_slope_despite_a_warm_up_of_th
 @pytest.mark.slow
 def test_the_drift_error_of_a_sensor_that_follows_half_of_a_warm_up_is_within_three_claimed_sd():
     # WHY: a curve fitted to the drifts within rests was wrong by 7 claimed sd over the range of
-    # temperatures. With seed 2 the error of this fit exceeds its claimed sd.
+    # temperatures. With seed 2 the error of the drift exceeds its claimed sd.
     rng, slopes, bags = np.random.default_rng(2), 0.1 * MG * SLOPE, []
     for celsius in (5.0, 20.0, 35.0):
         for up in positions(6, 3):
@@ -202,8 +202,8 @@ def test_tilts_of_two_supports_are_not_taken_for_a_scale_slope_of_a_level_axis(r
     at = np.array([0.0, 10.0])
     # 15000 samples (noise 0.1 mg) determine the mean bias slope of the two rests to 1 ug/K.
     assert np.diff(z.bias_function.value(at))[0] == pytest.approx(MG, abs=0.01 * MG)
-    # At 0.03 g an error of 1 ug/K is a scale slope of 33 ppm/K, that of two rests sqrt(2) times as
-    # much, 47 ppm/K. The limit is 47 ppm/K over 10 K.
+    # At 0.03 g an error of 1 ug/K is a scale slope of 33 ppm/K, that of two rests 47 ppm/K. The
+    # scale may change by 10 times 47 ppm over 10 K.
     assert abs(np.diff(z.scale_function.value(at))[0]) < 10.0 * 47e-6
 
 
@@ -255,7 +255,7 @@ def test_counts_of_32_bits_are_fitted(rng):
 
 
 def test_the_bias_sd_of_one_recording_contains_the_sd_of_a_turn_on(rng):
-    # WHY: the claimed bias sd was 1/6 of the error, as if each position had a separate turn-on.
+    # WHY: the claimed bias sd was 1/6 of the bias error, as if each position had its own turn-on.
     offsets = 5e-3 * rng.standard_normal((8, 3))
     ups = positions(12, 3)
     # `least`: sd of turn-on offsets [m/s^2]: prior sd (noise 0.02 m/s^2 at 100 Hz), or stated sd.
@@ -418,7 +418,7 @@ def test_the_claimed_sd_from_six_faces_contains_the_cross_axis_sensitivity_of_a_
 
 
 def test_six_attitudes_that_hardly_determine_the_scale_factors_give_scale_factors_near_1(rng):
-    # The squared components of these attitudes are almost linearly dependent.
+    # The squared x, y and z components of the attitudes are almost linearly dependent.
     up = [
         [-7, 88, 48],
         [14, -89, -44],

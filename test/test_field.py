@@ -435,8 +435,8 @@ def test_derivatives_of_a_rest_by_initial_lag_states_agree_with_finite_differenc
 
 
 def test_an_unknown_regime_after_a_turn_on_does_not_increase_the_noise_of_a_rest():
-    # The residual sd of a calibration is the scatter of turn-ons. The ageing model estimates this
-    # scatter of turn-ons, so the noise of a rest must not contain the residual sd.
+    # The ageing model estimates the scatter of turn-ons, which is the residual sd of a
+    # calibration, so the noise of a rest must not contain the residual sd.
     unit = field_units.calibration()
     logged = field_units.live('level', 1, 3, field_units.Process()).rests
     unknown = [(s, replace(r, state=(*r.state[:4], 1.0, *r.state[5:]))) for s, r in logged]

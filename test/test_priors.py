@@ -272,8 +272,8 @@ def test_three_faces_halve_the_error_of_a_change_of_bias_or_scale(kind):
     bias, bias_sd, scale, scale_sd = after(changed, np.eye(3))
     wrong = np.array([bias / STANDARD_GRAVITY, scale])
     wrong[('bias', 'scale').index(kind)] -= change
-    # The rests determine only the sum of the errors of bias and scale: each gets half of the
-    # change. The noise of a rest and unknown initial lag states leave an error of some ug.
+    # The rests determine only the sum of bias and scale errors: bias and scale each get half of
+    # the change. The noise of a rest and unknown initial lag states leave an error of some ug.
     assert np.abs(wrong.sum(axis=0)).max() < 10e-6
     assert np.abs(np.abs(wrong) / np.abs(change) - 0.5).max() < 0.1
     assert (np.abs(wrong) < 2.0 * np.array([bias_sd / STANDARD_GRAVITY, scale_sd])).all()

@@ -4,8 +4,8 @@
 The regime detector detects ramps early and with few false alarms (benchmarks/regime.py has long
 runs).
 
-All runs are seeded. The limits allow for the scatter of the median of 12 onset delays: 1.4 s for a
-sensor with 1 mK of noise, 4 s for a sensor with steps of 62.5 mK.
+All runs are seeded. Limits of delays allow for the scatter of the median of 12 onset delays: 1.4 s
+for a sensor with 1 mK of noise, 4 s for a sensor with steps of 62.5 mK.
 """
 
 import math

@@ -172,8 +172,8 @@ def sd_at(unit, board, behind=0.0, force=0.0):
 
 
 def test_beyond_the_range_curve_and_lag_do_not_cancel_in_the_claimed_sd():
-    # Inside the range the slopes of curve and lag over board temperature cancel. Outside of it the
-    # sum of both slopes is unknown, so the claimed sd is that of the curve alone.
+    # Inside the range the slopes of curve and lag over board temperature cancel. Outside of the
+    # range the sum of both slopes is unknown, so the claimed sd is that of the curve alone.
     bias = axis_set((0.0, 0.5), residual_sd_m_s2=1e-6)
     unit = calibration(
         static=regime_set(bias), dynamic=regime_set(bias),
