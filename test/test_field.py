@@ -94,7 +94,7 @@ def test_an_update_with_the_true_variances_equals_a_kalman_filter():
         bias, scale = layout.bias[axis].static, layout.scale[axis].static
         sd = np.sqrt(solved.posterior[bias, bias]) / field_units.K
         expected = best.state[axis] + best.state[15 + axis]
-        # The update averages rests of a turn-on to a few rows, which errs by less than 0.2 sd.
+        # The update averages rests of a turn-on to a few rows: an error of less than 0.2 sd.
         assert abs(solved.shift[bias] / field_units.K - expected) < 0.2 * sd
         P = best.P[np.ix_([axis, 15 + axis], [axis, 15 + axis])].sum()
         assert sd == pytest.approx(np.sqrt(P), rel=0.1)

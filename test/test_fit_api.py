@@ -35,7 +35,7 @@ def columns(recorded, name, thermometers=('board',)):
 
 
 def left_by(groups):
-    """Fit some groups, correct another recording; return the RMS error of means over 60 s [ug]."""
+    """Fit groups of columns; return unit and RMS error of 60 s means in a held-out bag [ug]."""
     rng = np.random.default_rng(8)
     bags = [columns(recording(up, rng), f'rest{k}') for k, up in enumerate(UPS)]
     unit = tc.fit(bags, gravity=G, input='m/s^2', groups=groups, mounting_sd=1e-7)

@@ -205,7 +205,7 @@ def test_the_regression_of_windows_without_noise_gives_the_true_parameters(rng):
     regression, state = begin(windows, up)
     prior = replace(prior_of(truth), sigma=np.full(3, MICRO))
     mode = mode_of(regression, state, prior).state
-    # The priors shift the result by 1e-6 of its sd (about 1 ug).
+    # The priors shift a fitted parameter by 1e-6 of its sd (about 1 ug).
     np.testing.assert_allclose(mode.kappa, truth.kappa, atol=1e-9)
     np.testing.assert_allclose(mode.bias, truth.bias, atol=1e-8)
     np.testing.assert_allclose(mode.misalignment, truth.misalignment, atol=1e-8)

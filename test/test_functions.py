@@ -157,7 +157,7 @@ def test_the_predicted_sd_agrees_with_hand_numbers():
     unit = slope_and_lag({0: 4e-4, 1: 1e-6, 2: 9e-4, 3: 0.0, 4: 1e-6, 5: 1e-12, 6: 4e-12})
     states = ramp_states(unit, np.array([20.0, 30.0]), 0.0, np.inf)
     bias, scale = sd_of_states(unit, states)
-    # At 30 degC the variance is 4e-4 + 100 * 1e-6 counts^2, plus the residual's (30 um/s^2)^2.
+    # Bias variance at 30 degC: 4e-4 + 100 * 1e-6 counts^2, plus the residual's (30 um/s^2)^2.
     expected = np.sqrt([4e-4, 5e-4]) / 300.0
     assert bias[:, 0] == pytest.approx(np.hypot(expected, 3e-5), rel=1e-6)
     assert bias[:, 1] == pytest.approx([3e-5, 3e-5])

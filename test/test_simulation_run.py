@@ -101,7 +101,7 @@ def test_the_sum_of_counts_without_noise_is_the_integral_of_the_truth(unit):
 
 
 def test_simulated_white_noise_has_the_stated_density(unit):
-    """The one-sided spectrum is ``2 density^2``; means over 60 s have ``density / sqrt(60)``."""
+    """The one-sided spectrum is ``2 density^2``, the sd of 60 s means ``density / sqrt(60)``."""
     still = replace(unit, drift=())
     run = simulate(still, parse_cyclogram('soak'), UP, rate_hz=50.0, seed=3)
     accel = run.counts / np.array(unit.scale_factor) / MICRO_G

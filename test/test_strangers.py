@@ -289,7 +289,7 @@ def test_the_ratio_is_1_if_errors_have_the_claimed_covariance():
     claim = np.broadcast_to(root @ root.T, (n, 3, 3))
     out = strangers.Corrected(truth + error, claim, np.zeros(3))
     scores = strangers.score([out], [Minutes(truth, np.zeros(n), truth)], is_drift=False)
-    # The RMS of 20000 windows is uncertain by 0.5 %.
+    # The RMS of the errors in 20000 windows is uncertain by 0.5 %.
     assert (scores.ratio, scores.norm_ratio) == pytest.approx((1.0, 1.0), rel=0.02)
     assert scores.claim == pytest.approx(scores.vector, rel=0.02)
 
