@@ -94,7 +94,7 @@ def force_at(seconds):
 
 @dataclass(frozen=True)
 class Truth:
-    """Temperatures of case and board [degC] and `memory` [K] on a fine grid of times [s]."""
+    """Temperatures of case and board [degC], `memory`: board - lagged board [K], times [s]."""
 
     time: np.ndarray
     case: np.ndarray

@@ -152,7 +152,7 @@ def test_likely_mistakes_are_refused_with_the_name_of_the_refusal(rng, spoil, na
 
 
 def test_the_advice_for_rests_without_noise_names_the_parameter_of_the_node(rng):
-    # WHY: the node rejects equal samples as a stuck converter's, and dropped 60 % of the samples.
+    # WHY: the node takes equal samples for those of a stuck converter: 60 % of all were dropped.
     rests = [Rest(rng, level=tuple(GRAVITY * up), sd=0.3 * MG) for up in positions(7, 3)]
     for rest in rests[:2]:
         # The samples have no noise; a drift of 40 mg changes them by steps of 4 mg.

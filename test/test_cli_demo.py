@@ -51,8 +51,8 @@ def test_the_demonstration_prints_the_output_shown_on_the_pages(tmp_path, monkey
         rows = re.findall(rf'^{section} +([a-z ]+?) +\d+ +([\d.]+) ', printed, re.MULTILINE)
         assert len(rows) == 4, printed
         raw, node, two_sets, one_set = (float(rms) for _, rms in rows)
-        # The node must have a smaller error than a common curve of both regimes, and than a curve
-        # per regime, as neither has lags. Noise is below 10 ug.
+        # The node's error must be below those of two fits without lags: a common curve of both
+        # regimes, and a curve per regime. Noise is below 10 ug.
         assert raw > 150.0
         assert node < 10.0
         assert node < 0.5 * min(one_set, two_sets)

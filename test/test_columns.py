@@ -65,7 +65,7 @@ def test_gradient_even_about_rest_is_an_even_function_of_gradient_less_rest():
     assert {(column.sensor, column.rest_k) for column in change} == {('case', -0.5)}
     table = ColumnTable(change, MemorySpec(('case', 'tip')), 20.0)
     states = np.zeros((StateLayout(MemorySpec(('case', 'tip'))).width, 3))
-    # Gradients of three states: -0.5 K, as in a soak, and 1.5 K above and below -0.5 K.
+    # Gradients of the three states: -0.5 K, that of a soak, and 1.5 K above and below -0.5 K.
     states[GRADIENT] = -0.5, 1.0, -2.0
     values = table.raw(states)
     assert np.all(values[:, 0] == 0.0)
@@ -110,7 +110,7 @@ def test_the_value_of_each_kind_of_column_agrees_with_hand_numbers():
     ]
     spec = memory_of(columns, ('case', 'tip'))
     layout = StateLayout(spec)
-    # Board, its variance, rate, weight, unknown; (value, variance) of 2 gradients, 2 lags; a play.
+    # Board, variance, rate, dynamic weight, unknown regime; gradients, lags + variances; a play.
     state = np.array(
         [[23.0, 0.0, 0.01, 0.25, 0.0, 1.2, 0.0, -0.7, 0.0, 0.5, 0.0, -0.3, 0.0, 0.1]]
     ).T

@@ -98,7 +98,7 @@ def event_list(seed):
     return events
 
 
-#: Hypothesis draws the seed of a list, because drawing each message would double the time.
+#: Hypothesis draws one seed per list, as drawing each message would double the tests' time.
 event_lists = st.integers(0, 2**64 - 1).map(event_list)
 
 
@@ -111,8 +111,8 @@ def at_seconds(*events):
     ]
 
 
-# In the explicit examples a stamp is below that of a reading which is a day ahead, or was already
-# applied; only after a fall by over 5 s earlier readings count as readings of another clock.
+# In the examples stamps fall below that of a reading that is a day ahead or already applied. Only
+# if stamps fall by over 5 s, earlier readings count as readings of another clock.
 @given(event_lists, st.integers(3, 30), st.sampled_from([0.0, 5.0]))
 @example(at_seconds('A', 3, 'A', 0, 'B', 2, 'B', 86_400, 'C', 0, 'A', 0), 5, 0.0)
 @example(at_seconds('B', 26, 'B', 21, 'A', 23, 'B', 16.5), 1, 0.0)
@@ -180,7 +180,7 @@ def test_a_sample_with_a_stamp_20_s_ahead_is_dropped_unless_the_next_stamp_agree
         (np.insert(usual, 2, usual[2] + leap), [0, 1, 3, 4, 5]),
         # After a gap of 20 s the first sample is dropped, and the samples after it are used.
         (np.where(np.arange(5) < 2, usual, usual + leap), [0, 1, 3, 4]),
-        # Two samples stamped 20 s ahead are dropped if others lie between, or their stamps fall.
+        # Two samples stamped 20 s ahead are dropped if samples lie between or their stamps fall.
         (np.insert(usual, [1, 3], usual[[1, 3]] + leap), [0, 2, 3, 5, 6]),
         (np.array([1, 2 + leap, 1 + leap, 3, 4]), [0, 3, 4]),
     ):
@@ -265,7 +265,7 @@ def test_another_transition_time_during_a_transition_causes_no_step_of_the_outpu
 
 def test_a_new_transition_time_does_not_restart_the_check_of_gravity(rng):
     # WHY: after a change of any parameter the check of |f| began again, and samples with a wrong
-    # |f| were published for 13 s at rest, and without a limit in motion.
+    # |f| were published for 13 s at rest, and in motion for as long as it lasted.
     compensator = Compensator(calibration(), CompensatorConfig())
 
     def published(seconds, size):
@@ -356,7 +356,7 @@ def test_a_switch_of_sets_causes_no_step():
 
 @pytest.mark.parametrize(
     ('delta', 'given_s', 'expected_s'),
-    # The output changes by at most 1 ug/s: in 102 s for sets that differ by 0.3 counts = 102 ug.
+    # At 1 ug/s a change by the difference of the sets, 0.3 counts = 102 ug, takes 102 s.
     [(0.01, 30.0, 30.0), (0.3, 30.0, 1e-3 / 9.80665e-6), (0.3, 5.0, 50.0), (0.3, 0.0, 0.0)],
 )
 def test_a_transition_time_above_0_limits_the_change_to_1_ug_per_s(delta, given_s, expected_s):

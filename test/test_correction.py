@@ -225,7 +225,7 @@ def test_the_variance_of_initial_lag_states_is_updated_every_ten_seconds():
         last.setdefault(stamp // 10_000_000_000, []).append((stamp, variance))
     assert len(last) >= 9
     for span in last.values():
-        # Within 10 s only the variance by the thermometer (5 mK at 30 counts/K) changes.
+        # Within 10 s only the variance that the thermometer causes (5 mK at 30 counts/K) changes.
         part = (30.0 / 300.0 * 0.005) ** 2
         stamp, variance = span[0]
         age = (stamp - collected[0][0]) * 1e-9 + 1.0

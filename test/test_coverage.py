@@ -88,7 +88,7 @@ def test_the_next_direction_reduces_the_mean_variance(n, rng):
     before = mean_variance(up, at)
     gain = before - mean_variance(np.vstack([up, proposed]), at)
     others = [before - mean_variance(np.vstack([up, unit]), at) for unit in units(rng, 300)]
-    # A face, easy to hold, is chosen if it reduces the variance by half of the largest reduction.
+    # A face is proposed if it reduces the variance at least half as much as the best direction.
     assert gain > 0.45 * max(others)
     assert np.max(up @ proposed, initial=-1.0) < np.cos(np.radians(20.0))
 

@@ -28,9 +28,9 @@ def walked(rate, bound, axes=1, mean=0.0):
 
 def test_the_probability_of_a_first_passage_agrees_with_closed_forms():
     # A random walk of rate r stays within (-c, c) up to t with the probability: sum over k of
-    # (-1)^k [N((2 k + 1) c / s) - N((2 k - 1) c / s)], s^2 = r t. In three dimensions a walk of
-    # rate r on each axis stays in a ball of radius c up to t with the probability: 2 sum over
-    # k > 0 of (-1)^(k + 1) exp(-(k pi)^2 r t / 2 c^2).
+    # (-1)^k [N((2 k + 1) c / s) - N((2 k - 1) c / s)], s^2 = r t, N: normal distribution. In three
+    # dimensions a walk of rate r on each axis stays in a ball of radius c up to t with the
+    # probability: 2 sum over k > 0 of (-1)^(k + 1) exp(-(k pi)^2 r t / 2 c^2).
     rate, bound = 4.0, 50.0
     k, n = np.arange(-40, 41), np.arange(1, 200)
     for probability, days, of_ball in zip(

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""With a driver's file in config/drivers commands read bags with the topics of this driver."""
+"""Commands that get a driver's file of config/drivers read bags with this driver's topics."""
 
 import csv
 import re

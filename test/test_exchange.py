@@ -137,7 +137,7 @@ def test_the_bias_of_a_gyroscope_is_exported_and_imported(cubic):
     px4 = export_calibration(unit, 'px4')
     value = numbers(px4.text, '\t')
     assert value['TC_G_ENABLE'] == 1.0
-    # PX4 subtracts X0 + X1 d + X2 d^2 + X3 d^3 from the rate [rad/s]; d: temperature - TREF [K].
+    # PX4 subtracts X0 + X1 d + X2 d^2 + X3 d^3 from angular rates [rad/s]; d: temperature - TREF.
     d = celsius[2] - value['TC_G0_TREF']
     for axis in range(3):
         bias = sum(value[f'TC_G0_X{power}_{axis}'] * d**power for power in range(4))

@@ -68,7 +68,7 @@ class Direct:
 
 @cache
 def undisturbed():
-    """Return groups of messages of the undisturbed bag, each with the state before the group."""
+    """Return message groups of the undisturbed bag, each with the `Direct` before it."""
     run, result = Direct(), []
     for lot in (*lots(bag()), []):
         result.append((lot, deepcopy(run)))

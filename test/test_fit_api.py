@@ -11,7 +11,7 @@ G = 9.80665
 MICRO_G = 1e-6 * G
 KNEE_C, SLOPE = 21.3, 20.0  # [degC], [ug/K]
 BIAS = 1e-3 * G
-#: Sd of the samples [m/s^2]: 0.4 ug in the mean of a minute at 0.5 Hz.
+#: Noise of a sample [m/s^2], which gives 0.4 ug in means over 60 s at 0.5 Hz.
 NOISE = 2.0 * MICRO_G
 UPS = np.array(
     [[1, 0, 0], [-1, 0.1, 0], [0, 1, 0.1], [0.1, -1, 0], [0, 0.1, 1], [0, 0, -1],
@@ -35,7 +35,7 @@ def columns(recorded, name, thermometers=('board',)):
 
 
 def left_by(groups):
-    """Fit some groups, correct another recording; return the RMS error of means over 60 s [ug]."""
+    """Fit groups of columns; return unit and RMS error of 60 s means in a held-out bag [ug]."""
     rng = np.random.default_rng(8)
     bags = [columns(recording(up, rng), f'rest{k}') for k, up in enumerate(UPS)]
     unit = tc.fit(bags, gravity=G, input='m/s^2', groups=groups, mounting_sd=1e-7)

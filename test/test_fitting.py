@@ -90,7 +90,7 @@ def test_errors_of_fitted_constants_are_below_4_claimed_sd(response):
     pull = pulls(response, OWN_LAGS)
     assert np.abs(pull).max() < 4.0
     assert np.sqrt(np.mean(pull**2)) < 2.0
-    # The drift is some 100 ug; the claimed sd of bias, scale and M are some ug and ppm.
+    # The raw drift is some 100 ug; the claimed sd of bias, scale and M are some ug and ppm.
     bias_sd, scale_sd, M_sd = claimed(response.calibration)
     assert (bias_sd / np.array(OWN_LAGS.counts_per_micro_g)).max() < 5.0
     assert scale_sd.max() < 10e-6
@@ -264,7 +264,7 @@ def test_misalignments_of_a_mems_unit_are_determined_by_nine_positions():
     # WHY: mounting offsets of 5 mg fit |f| in nine positions as well as misalignments do.
     unit = unit_preset('mems', 0).with_thermometers(rate_hz=0.25)
     records = arrays(unit, plan('chamber-9'), 0, rate_hz=1.0)
-    # A fit with only the groups of the simulated unit takes half the time.
+    # A fit with only the groups of columns that the unit needs takes half the time.
     options = FitOptions(gravity=STANDARD_GRAVITY, groups=('curve', 'set', 'gradient', 'board'))
     calibration = fit(sources_of(records), options).calibration
     M = np.array(calibration.misalignment)

@@ -56,7 +56,7 @@ def test_effects_even_about_the_rest_gradient_are_found(rng):
     programs = ((20.0, 35.0, 5.0, 20.0), (5.0, 25.0, 12.0), (35.0, 15.0, 30.0))
     bags = [recorded(rng, up, f'p{k}', programs[k % 3]) for k, up in enumerate(positions(4, 3))]
     reduced = [reduce_source(bag, full_scale=None) for bag in bags]
-    # Most of the error is due to rates computed over 120 s; noise adds only 0.1 mK.
+    # Rates computed over 120 s cause most of the error of the gradient; noise adds only 0.1 mK.
     assert abs(gradients_at_rest(reduced, ('case',))['case'] + OWN_HEAT_K) < 0.005
     groups = ('curve', 'gradient', 'board', 'gradient_even', 'gradient_even_about_rest')
     about_rest, about_0 = (
@@ -66,7 +66,7 @@ def test_effects_even_about_the_rest_gradient_are_found(rng):
     kept = {column.group for column in about_rest.calibration.response}
     assert 'gradient_even_about_rest' in kept
     assert 'gradient_even' not in kept
-    # Functions even about T_case - T_board = 0 cannot describe the whole effect.
+    # Functions even about T_case - T_board = 0 describe only part of an effect even about -0.6 K.
     floor = NOISE / np.sqrt(30.0)
     assert about_rest.residuals[-1].fitted.rms < 1.1 * floor
     assert about_0.residuals[-1].fitted.rms > 1.5 * floor

@@ -40,7 +40,7 @@ def weight(record, end_condition):
         for stamp, value in zip(stamps.tolist(), values.tolist(), strict=True)
     )
     at, result = 0, []
-    # The weight changes over 300 s, so every fourth sample (2 Hz) suffices.
+    # The dynamic set's weight changes over 300 s, so every fourth sample (2 Hz) suffices.
     for stamp in record.accel_stamp_ns[::4].tolist():
         while at < len(readings) and readings[at][0] <= stamp:
             tracker.read(readings[at][1], readings[at][0], readings[at][2])
@@ -64,7 +64,7 @@ def test_the_evidence_selects_the_condition_that_ends_the_dynamic_regime(end_con
         records.append(replace(record, counts=record.counts + step))
     result = fit(sources_of(records), FitOptions(gravity=STANDARD_GRAVITY, **options))
     assert result.calibration.detector.end_condition == end_condition
-    # The fit estimates the detector settings; with the true settings the switches differ slightly.
+    # The detector settings are estimated, so regime switches differ slightly from the true ones.
     last = result.residuals[-1]
     assert last.fitted.rms < 0.35 * last.raw.rms
 
@@ -132,7 +132,7 @@ def test_variance_ratio_and_correlation_time_are_estimated(rng, noise):
 
 
 def test_white_noise_is_not_taken_for_gauss_markov_noise(rng):
-    # The fit finds Gauss-Markov noise in 1 % of series of white noise, but not in these ten.
+    # In 1 % of all series of white noise the fit finds Gauss-Markov noise, but not in these ten.
     assert [
         whitener.estimate(series, weight)
         for whitener, weight, series in (drawn(rng, 5, 100, Noise()) for _ in range(10))
@@ -151,7 +151,7 @@ MICRO = 9.80665e-6  # a micro-g [m/s^2]
 
 
 def score(drift, norms=(), by_thermometer=0.0):
-    """Return a score with left-out drifts of equal size and the given errors of |f| [ug]."""
+    """Return a score of equal left-out drifts `drift` and left-out |f| errors `norms` [ug]."""
     drifts = Folds(np.full(18, (drift * MICRO) ** 2), np.full(18, 20.0))
     of_norms = Folds((np.array(norms) * MICRO) ** 2, np.full(len(norms), 20.0))
     none = np.zeros((0, 3))
@@ -179,11 +179,11 @@ def test_a_larger_model_must_not_explain_the_errors_of_a_coarse_thermometer():
     curve, parts, bends = (score(drift, (), by_thermometer) for drift in (120.0, 46.0, 20.0))
     assert is_better(curve, parts)
     assert not is_better(parts, bends)
-    # The curve is chosen if it reduces errors of |f| above those by the thermometer, 49 ug.
+    # A curve is chosen if without it |f| errors are far above 49 ug, those by the thermometer.
     flat, curved = (score(46.0, size * np.ones(9), by_thermometer) for size in (3000.0, 60.0))
     assert is_better(flat, curved)
     assert not is_better(curved, score(20.0, 30.0 * np.ones(9), by_thermometer))
-    # For thermometer errors of 5 ug a fall of the left-out drift from 46 to 20 ug is significant.
+    # If the thermometer causes only 5 ug, a fall of the left-out drift from 46 to 20 ug counts.
     assert is_better(score(46.0, (), 5.0), score(20.0, (), 5.0))
 
 

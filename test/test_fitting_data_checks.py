@@ -78,7 +78,7 @@ def test_a_complete_thermal_test_gives_only_good_findings(good):
         ('ramps', lambda w: {'rate': 0.0 * w.rate}, 'no ramp'),
         ('directions', lambda w: {'rate': np.abs(w.rate)}, 'hardly any cooling was recorded'),
         ('soak', lambda w: {'weight': 0.0 * w.weight + 1.0}, 'only 0 % of the windows are static'),
-        # WHY: with soaks at a single temperature the error was 800 ug, the claimed sd 100 ug.
+        # WHY: with soaks at one temperature the force error was 800 ug, the claimed sd 100 ug.
         ('soak', lambda w: {'weight': 1.0 * (np.abs(w.temperature - 20.0) > 3.0)},
          r'% of the windows are static, over [56]\.\d of \d\d\.\d K'),
         ('swapped', lambda w: {'gradient': -w.gradient}, r'exchanged, or is the case thermometer'),

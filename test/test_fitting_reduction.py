@@ -89,7 +89,7 @@ def test_short_rests_of_slow_samples_are_found(rng, rest_s):
 
 @pytest.mark.parametrize('cycle_s', [0.01, 0.02, 0.04, 0.05, 0.1, 0.3, 1.0])
 def test_the_estimated_interval_between_samples_is_right_to_0_1_percent(rng, cycle_s):
-    # WHY: at 10 Hz averages have 33 or 34 samples; the rate was computed as 9.9 Hz.
+    # WHY: at 10 Hz averages have 33 or 34 samples; the sample rate was computed as 9.9 Hz.
     n = round(1800.0 / cycle_s)
     kept = rng.random(n) > 2.0 / n  # a few samples are lost
     samples = 9.8 + 0.01 * rng.standard_normal((n, 3))
@@ -208,7 +208,7 @@ def test_several_samples_with_one_stamp_are_reported(rng):
 
 @pytest.mark.parametrize('n', [0, 1, 70])
 def test_a_few_stamps_that_do_not_rise_are_reported(n, rng):
-    # WHY: if less than 1 % of the stamps did not rise, `info` reported this and `fit` did not.
+    # WHY: if less than 1 % of the stamps did not rise, `info` reported them, but `fit` did not.
     whole = block(still(rng, 300.0, (0.0, 0.0, 3000.0)))
     cycle_ns = int(np.median(np.diff(whole.accel_stamp_ns)))
     # The clock is set back by n cycles, so n samples have stamps that have occurred before.
@@ -314,8 +314,8 @@ def soak_ramp_soak(quantum, noise, rng):
 def test_thermometer_settings_are_estimated_from_readings(quantum, noise, rng):
     learned = learn_thermometer([soak_ramp_soak(quantum, noise, rng)], ThermometerSettings())
     assert learned.quantum_c == pytest.approx(quantum, rel=1e-6)
-    # Rounded readings show noise only at the rounding edges that they pass slowly, at the end of
-    # the ramp.
+    # Rounded readings show noise only where they pass a rounding edge slowly, at the end of the
+    # ramp.
     assert learned.noise_sd_c == pytest.approx(noise, rel=0.4 if quantum else 0.1)
     # Means over 60 s determine the lag of the thermometer, 300 s, to a third.
     assert learned.lag_s == pytest.approx(300.0, rel=0.35)
@@ -392,7 +392,7 @@ def test_a_drift_averages_the_error_of_rounding(rng):
 @pytest.mark.parametrize('step', [1.0, 0.04])
 def test_steps_of_a_converter_after_a_constant_soak_do_not_divide_a_rest(rng, step):
     # WHY: the step of the converter was searched in the first 20000 samples only. After 20000
-    # constant samples each step of the converter began a new rest.
+    # constant samples each change by a converter step began a new rest.
     rest = Rest(rng, duration_s=3600.0, sd=0.0)
     ramp = np.maximum(rest.time - 1800.0, 0.0) / 1800.0
     rest.accel = np.rint(rest.accel / 0.04 + 6.0 * np.outer(ramp, (1.0, -1.3, 0.7))) * step
@@ -401,7 +401,7 @@ def test_steps_of_a_converter_after_a_constant_soak_do_not_divide_a_rest(rng, st
 
 
 def test_a_turn_between_constant_samples_is_not_taken_for_a_step_of_the_converter(rng):
-    # WHY: if samples change only at a turn, this change was taken for the converter's step.
+    # WHY: if samples change only at a turn, the change at the turn counted as a converter step.
     rest = Rest(rng, sd=0.0)
     rest.accel[rest.time > 300.0] = (GRAVITY, 0.0, 0.0)
     bag = reduce_source(rest.source(), full_scale=None)

@@ -57,7 +57,7 @@ class Dense:
         self.determinant = -2.0 * sum(np.log(np.diag(root)).sum() for root in self.roots)
 
     def state(self, x):
-        """Return the state at the mode of `Regression` plus the parameter changes x."""
+        """Return the state whose parameters differ by x from the mode of `Regression`."""
         layout, at = self.at.layout, self.at.state
         padded = np.append(x, 0.0)
         pose, pose_of = at.pose, at.pose_of
@@ -104,7 +104,7 @@ class Dense:
             state.tilt.ravel() / prior.tilt_sd,
             state.turn_on.ravel() / prior.turn_on_sd,
             state.start.ravel() / np.sqrt(prior.start_variance_ratio),
-            # The mean of the initial lag states over all bags has 0.1 of the prior sd of one bag.
+            # The initial lag states averaged over all bags have 0.1 of the prior sd of one bag.
             state.start.mean(axis=0) / (0.1 * np.sqrt(prior.start_variance_ratio)),
         ]
         if len(state.pose):
@@ -205,7 +205,7 @@ def test_the_regression_of_windows_without_noise_gives_the_true_parameters(rng):
     regression, state = begin(windows, up)
     prior = replace(prior_of(truth), sigma=np.full(3, MICRO))
     mode = mode_of(regression, state, prior).state
-    # The priors shift the result by 1e-6 of its sd (about 1 ug).
+    # The priors shift a fitted parameter by 1e-6 of its sd (about 1 ug).
     np.testing.assert_allclose(mode.kappa, truth.kappa, atol=1e-9)
     np.testing.assert_allclose(mode.bias, truth.bias, atol=1e-8)
     np.testing.assert_allclose(mode.misalignment, truth.misalignment, atol=1e-8)
@@ -320,7 +320,7 @@ def test_a_position_that_alone_determines_a_parameter_has_no_left_out_norm(rng):
     score = score_of(regression, mode)
     assert np.isnan(score.force).all()
     assert np.isnan(score.norms.square).all()
-    # The drift of |f| in a left-out position does not need bias and scale, so it has a score.
+    # The drift of |f| in a left-out position is predicted without bias and scale: it has a score.
     # M keeps its prior mean and sd.
     assert np.isfinite(score.positions.square).all()
     np.testing.assert_allclose(mode.state.misalignment, 0.0, atol=1e-6)
@@ -431,8 +431,8 @@ def test_scores_of_inactive_columns_agree_with_a_fit_in_which_they_are_active(no
 
 
 def test_inactive_and_active_columns_share_initial_lag_states(solved):
-    # WHY: the sparsity factor S lacked the prior of the sum of initial lag states. For an
-    # inactive column of the scale whose lag also changes the bias, S was 50 times too large.
+    # WHY: the sparsity factor S lacked the prior of the sum of initial lag states. S of an
+    # inactive column of the scale whose lag also changes the bias was 50 times too large.
     regression, prior, mode = solved
     of_scale = np.isin(GROUPS, ('board',)) * [[0.0], [1.0]]
     without = replace(prior, column_sd=np.where(of_scale > 0.0, 0.0, prior.column_sd))

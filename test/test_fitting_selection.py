@@ -38,7 +38,7 @@ IDLE = np.array(GROUPS) == 'idle'
 
 
 def constants(truth):
-    """Return an initial prior with wrong noise parameters, in which all columns have sd 0."""
+    """Return an initial prior with wrong noise parameters and a weight sd of 0 for all columns."""
     return prior_of(
         truth, (), offset_sd=MICRO, offset_scale=30.0 * MICRO, sigma=np.full(3, 5.0 * MICRO),
         noise=Noise(), misalignment_sd=1e-3,
@@ -137,9 +137,9 @@ def test_estimated_noise_parameters_agree_with_the_truth(noisy):
     _, chosen, truth = noisy
     prior = chosen.posterior.prior
     assert {'curve', 'board'} <= chosen_groups(chosen)
-    # 1080 windows per axis determine the sd of white noise to 2 %, with slow noise less well.
+    # 1080 windows per axis determine the sd of white noise to 2 %, or less well beside slow noise.
     np.testing.assert_allclose(prior.sigma, truth.sigma, rtol=0.15)
-    # A position lasts six correlation times of the noise, and the curves fit part of the noise.
+    # Slow noise is known to a factor of 2, as a position lasts only six correlation times.
     assert 0.5 < prior.noise.ratio / truth.noise.ratio < 2.0
     assert 0.5 < prior.noise.time_s / truth.noise.time_s < 2.0
     # 54 means less 45 unknowns (directions, scale, bias, M) determine the mounting sd to 24 %.
@@ -213,7 +213,7 @@ def test_errors_of_fitted_parameters_in_claimed_sd_have_an_rms_near_1(noisy):
 
 
 def test_the_bayes_factor_of_a_group_is_the_loss_of_evidence_if_the_group_is_removed():
-    # The Savage-Dickey ratio equals the loss of evidence, but for the nonlinearity of attitudes.
+    # The Savage-Dickey ratio equals the loss of evidence if attitudes act linearly.
     truth = Truth()
     windows, up = table_of(truth, 12, np.random.default_rng(8))
     regression, state = begin(without_starts(windows), up)
@@ -287,7 +287,7 @@ def test_outliers_do_not_shift_the_fit(calm):
     dirty.mean[struck] += 1000.0 * rng.normal(0.0, 200.0 * MICRO, (len(struck), 3))
     _, other = selected_of(truth, dirty, calm[1].posterior.state.up)
     sd = np.sqrt(calm_fit.posterior.variance[calm_fit.posterior.layout.bias])
-    # 2 % of the windows have errors of 100 sd; down-weighting reduces their effect to 3 sd each.
+    # 2 % of the windows have errors of 100 sd, but affect the fit only like errors of 3 sd.
     assert np.abs((other.posterior.state.bias - calm_fit.posterior.state.bias) / sd).max() < 1.0
     np.testing.assert_allclose(other.posterior.prior.sigma, truth.sigma, rtol=0.2)
     used, used_with_outliers = (
@@ -378,7 +378,7 @@ def test_thermal_tilts_of_supports_are_separated_from_the_drift_of_the_unit():
     chosen, left = drift_left(windows)
     # 12 positions with 2 angles and 2 columns each determine the sd of tilts to 10 %.
     assert 0.7 < chosen.posterior.prior.tilt_sd / truth.tilt_sd < 1.3
-    # A tilt of 5 urad changes a level axis by 5 ug; 720 windows determine the drift to 0.1 ug.
+    # A tilt of 5 urad changes a level axis' force by 5 ug; 720 windows show a drift of 0.1 ug.
     assert left < 0.5 * MICRO
     assert drift_left(stiff)[1] > 1.0 * MICRO
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Window columns equal those of the compensator, and a calibration file equals the fit."""
+"""Columns of a fit's windows equal the compensator's; a calibration file equals the fit."""
 
 from dataclasses import replace
 from importlib import import_module
@@ -104,7 +104,7 @@ def test_columns_of_the_fit_equal_those_of_the_tracker(bags):
     phi = table.values(np.array(states).T).T
     seconds = (grid - bag.start_ns) * 1e-9
     n_sets = rows.shape[1] - phi.shape[1]
-    # The expected columns are means of the columns of the tracker over windows of 60 s.
+    # The expected columns are 60 s means of the columns computed from the tracker's states.
     mean = np.array([phi[np.abs(seconds - t) <= 30.0].mean(axis=0) for t in time])
     scale = np.sqrt(np.mean(phi**2, axis=0)) + 1e-9
     late = time > 300.0
@@ -164,7 +164,7 @@ def test_windows_with_a_silent_or_stuck_thermometer_are_left_out(bags, name, is_
 
 
 def test_the_derivative_of_a_column_by_its_lag_agrees_with_differences():
-    # The expected derivatives are differences of columns with lags shifted by a microkelvin.
+    # Derivatives must equal differences of the columns for lags shifted by +-1 uK.
     columns = bank(span_k=(-4.0, 12.0))
     spec = memory_of(columns)
     layout, table = StateLayout(spec), ColumnTable(columns, spec, 20.0)

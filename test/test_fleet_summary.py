@@ -20,7 +20,7 @@ MONDAY = datetime(2026, 1, 5)
 
 
 def fleet_of(n, rng, *, lots=('',), day=0.0, like=()):
-    """Draw values of n units, log-normal if compared by logarithm, or add noise to `like`."""
+    """Draw values of n units (log-normal if logarithms are compared) or add noise to `like`."""
     rows = []
     for i in range(n):
         cells = {}
@@ -184,7 +184,7 @@ class TestDrift:
         drifts = summarise(later, before).drifts
         names = sorted(drift.earlier for drift in drifts)
         assert names == [f'earlier /u00{i}@0' for i in range(3)]
-        # A table of the same calibrations gives no drift.
+        # If the earlier fleet's table has the same calibrations, no drift is computed.
         assert summarise(first, before).drifts == ()
 
 

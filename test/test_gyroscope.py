@@ -69,7 +69,7 @@ def unit():
 def fitted(unit):
     """Fit a MEMS unit in nine positions; its gyroscope's drift is the sum of several effects."""
     records = arrays(unit, plan('chamber-9', 2), 2, rate_hz=RATE_HZ)
-    # These groups of columns are half of the model, which halves the time of the fit.
+    # A fit with five groups of columns, half of the model, takes half the time.
     options = replace(OPTIONS, groups=('curve', 'gradient', 'board', 'gradient_lag', 'product'))
     return fit([source_of(record, unit.scale_factor) for record in records], options)
 
@@ -172,7 +172,7 @@ def test_a_gyroscope_is_read_back_from_a_file_bit_for_bit():
     np.testing.assert_array_equal(scale, 1.0)
     sd_bias, sd_scale = sd_of_states(triad, states[1:2])
     np.testing.assert_array_equal(sd_scale, 0.0)
-    # At 20 degC bias and variance are those of the level; a turn-on adds its variance.
+    # At 20 degC the bias is its level; its variance is that of the level plus that of a turn-on.
     np.testing.assert_allclose(bias[1], (0.02 + 1e-5, -0.03, 0.01 + 1e-5))
     np.testing.assert_allclose(
         sd_bias[0], np.hypot((1e-5, 2e-5, 1e-5), np.sqrt(1.01e-10)), rtol=1e-5

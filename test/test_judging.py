@@ -117,7 +117,7 @@ class TestWindows:
         models = [('right', corrected_by(SLOPE)), ('half', corrected_by(SLOPE / 2))]
         judgements = evaluate([bag], models).judgements
         drift = SLOPE * 10.0 / K
-        # The temperature estimate has an error of 1e-7 K, which causes an error of 1e-9 m/s^2.
+        # The estimated board temperature has an error of 1e-7 K: an error of |f| of 1e-9 m/s^2.
         for name, expected in (('right', 0.0), ('half', drift / 2)):
             windows = judgements[name].windows
             np.testing.assert_allclose(windows.raw_residual, drift, atol=1e-9)
@@ -181,7 +181,7 @@ class TestWindows:
         assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.0, abs=0.14)
 
     def test_the_limit_of_noise_at_rest_follows_from_the_calibration(self, tmp_path):
-        # WHY: for a unit with a noise of 100 mg no window counted as rest: the limit was 50 mg.
+        # WHY: for a unit with a noise of 100 mg no window counted as rest (limit: 50 mg).
         bag = resting(tmp_path / 'bag', 20.0, noise=0.1 * K * GRAVITY)
         density = 0.1 * GRAVITY * np.sqrt(0.1)
         unit = dataclasses.replace(calibration().unit, cycle_time_s=0.1)
@@ -260,7 +260,7 @@ class TestVerdict:
         assert 'limit 100 ug' in judgement.reason
 
     def test_the_verdict_on_bags_of_the_fit_states_the_left_out_error_first(self):
-        # WHY: the verdict stated the error in fitted attitudes, 61 ug, not in new ones, 1091 ug.
+        # WHY: the verdict stated the error in fitted, not in new attitudes: 61 ug, not 1091 ug.
         fitted = ResidualSummary('all', 40, 1e-3, 5e-4, 1e-3, left_out_rms_m_s2=300.0 * MICRO_G)
         unit = dataclasses.replace(CLAIMING, provenance=Provenance(residuals=(fitted,)))
         windows = made(50.0, 1000.0, 60.0)

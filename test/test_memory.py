@@ -114,7 +114,7 @@ def test_the_lag_of_a_part_coupled_to_board_and_case_agrees_with_a_solver(rng):
     np.testing.assert_allclose(board - streamed[:, 0], part, atol=1e-5)
     on_grid = memory_on_grid(spec, 30.0, board, [case - board])
     np.testing.assert_allclose(on_grid[:, [0, 2, 4]], streamed[:, [0, 2, 4]], atol=1e-9)
-    # The lagged gradient contributes to the part's lag with a negative sign: covariance < 0.
+    # In a part's lag the lagged gradient has a negative sign: the states' covariance is below 0.
     P = start_covariance(spec.lags)
     assert P[0, 1] < 0.0 < P[0, 0] + 2.0 * P[0, 1] + P[1, 1]
     # The age of a lag with two inputs counts from the first value of the later input.
@@ -182,7 +182,7 @@ def test_a_jump_gives_a_lag_of_two_stages_the_errors_of_both_stages():
     memory.board_step(0, 0.0)
     memory.note_jump(2.0)
     # The lag is a difference of two first-order lags: (900 * lag_900 - 150 * lag_150) / 750.
-    # Errors of +2 K in lag_900 and -2 K in lag_150 give an error of 2 K * 1.4: 1.4 = 1050 / 750.
+    # Errors of +2 K in lag_900 and -2 K in lag_150 add up to 2 K * (900 + 150) / 750 = 2 K * 1.4.
     assert memory.at(0, 0.0, [0.0])[1] == pytest.approx((2.0 * 1.4) ** 2)
 
 

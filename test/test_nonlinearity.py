@@ -31,7 +31,7 @@ def term(kind, x, y, z, slope=0.0):
 
 
 def test_a_nonlinear_term_that_depends_on_temperature_needs_a_thermometer():
-    # WHY: with constant bias and scale a nonlinear term with a slope needed no board temperature.
+    # WHY: if only a nonlinear term had a slope, the calibration needed no board temperature.
     for slope in (0.0, 1e-7):
         square = NonlinearTerm('square', (1e-5,) * 3, (0.0, 0.0, slope), 1e-4)
         value = calibration(nonlinearity=Nonlinearity((0.0, 20.0), 1e-5, (square,)))

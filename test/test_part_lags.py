@@ -48,7 +48,7 @@ SOAKS = tuple(program(celsius, 25.0) for celsius in (8.0, 19.0, 34.0))
 
 
 def study_of(*name, up=9, corners=HALF, held=HELD, grade=navigation, **given):
-    """Simulate bags of a unit: for a fit, in directions `up` (or their number), and held-out."""
+    """Return a unit and its bags: for a fit, in directions `up` (or their number); held-out."""
     rng = rng_of(*name)
     unit = grade(rng, **given)
     is_mems = grade is not navigation
@@ -102,7 +102,7 @@ def judged(calibration, study):
 
 def test_the_fitted_lag_of_each_axis_is_that_of_its_part(parts):
     unit, study, calibration, _ = parts
-    # In a ramp a part lags by 10 K and changes the bias by 10 ug/K: 1 % of its lag causes 1 ug.
+    # In a ramp a lag of 10 K changes the bias by 100 ug, an error of the lag of 1 % by 1 ug.
     assert np.array(taus_of(calibration)) == pytest.approx(unit.part_s[:, None], rel=0.01)
     # The noise of |f| in a mean over 60 s is 0.65 ug.
     assert judged(calibration, study).norm < 2.0
@@ -140,7 +140,7 @@ def test_lags_of_the_thermometers_themselves_are_fitted(sensors):
         assert shares == pytest.approx([np.mean(shares)] * 3, abs=0.02)
     else:
         assert taus == pytest.approx(unit.part_s, rel=0.02)
-        # `leads / taus` is the lag of the thermometer (60 s) / lag of the part.
+        # Expected `leads / taus`: lag of the thermometer (60 s) / lag of the part.
         assert leads / taus == pytest.approx(60.0 / unit.part_s, abs=0.01)
 
 
@@ -231,10 +231,10 @@ def test_the_lags_of_parts_are_found_beside_an_effect_of_the_gradient():
 def test_a_bump_of_the_bias_over_temperature_is_fitted_by_knees():
     # The bump of the bias lasts for 2 min, and must not be taken for motion.
     _, study = study_of('bump', bump=np.array([450.0, -400.0, 500.0]), bump_c=17.0)
-    # Stating the three groups makes the fit three times as fast as a choice among all groups.
+    # With three stated groups of columns the fit is three times as fast as with a choice.
     calibration = strangers.fitted(study, groups=('curve', 'part', 'bend'))
     judgement = judged(calibration, study)
-    # The bump is a bell curve (sd 0.85 K), which the fit approximates by straight lines of 0.5 K.
+    # The bump is a bell curve (sd 0.85 K) of the bias, fitted by straight lines of 0.5 K each.
     assert judgement.norm < 60.0
     assert judgement.norm_ratio < 1.5
 
@@ -298,7 +298,7 @@ def test_six_faces_in_three_soaks_determine_the_curve_at_other_temperatures():
 @pytest.mark.slow
 def test_the_claimed_sd_between_two_soaks_includes_the_undetermined_curve():
     # WHY: soaks at two temperatures do not determine a curve over temperature. The covariance
-    # lacked the uncertainty of its curvature, and the claimed sd was 1/8 of the error.
+    # lacked the uncertainty of the curve's shape: the claimed sd was 1/8 of the error.
     given = {'held': program(19.0, 90.0), 'grade': consumer_grade}
     _, study = study_of('two soaks', up=18, corners=SOAKS[::2], **given)
     assert judged(strangers.fitted(study), study).ratio < 2.0
@@ -351,7 +351,7 @@ def lags_of(calibration):
 def test_lags_of_a_unit_with_a_hidden_node_are_those_of_the_bank():
     # The bias of each axis depends on its part and on a hidden node without a thermometer.
     study = next(third_node(0))
-    # Stating the six groups makes the fit 1.5 times as fast as a choice among all groups.
+    # With six stated groups of columns the fit is 1.5 times as fast as with a choice.
     groups = ('curve', 'part', 'board', 'gradient_lag', 'product', 'square')
     calibration = strangers.fitted(replace(study, bags=study.bags[:8]), groups=groups)
     assert lags_of(calibration) <= {*FINE_TAUS}

@@ -151,7 +151,7 @@ def test_readings_that_may_repeat_by_chance_are_no_fault():
 
 @cache
 def in_its_chamber(preset, sensor):
-    """Simulate a unit; return its readings as (stamp, whether of the case, degC)."""
+    """Simulate a unit; return its readings: (stamp [ns], 0 for board or 1 for case, degC)."""
     settings = SENSORS[sensor]
     unit = unit_preset(preset, 1).with_thermometers(
         noise_sd=settings.noise_sd_c, quantum=settings.quantum_c, rate_hz=0.5
@@ -230,7 +230,7 @@ def test_one_topic_given_for_both_thermometers_is_named_and_claimed(order):
     # In a ramp of 1 K/min the case of a unit with a board lag of 900 s is 15 K above the board.
     assert abs(state[GRADIENT]) < 0.1
     assert state[VAR_GRADIENT] ** 0.5 == pytest.approx(15.0, rel=0.2)
-    # The fault ends with case readings that differ from board readings.
+    # A case reading that differs from the board reading ends the fault.
     tracker.read('board', 300 * SECOND_NS, 25.0)
     tracker.read('case', 300 * SECOND_NS, 25.1)
     assert not tracker.copies['case'].is_copy

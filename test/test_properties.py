@@ -98,7 +98,7 @@ factors = st.integers(-60, 60).map(lambda power: 2.0**power)
 
 
 class Edited(dict[str, Any]):
-    """A calibration file with changed values; hypothesis prints only the changed values."""
+    """The content of a calibration file, of which hypothesis prints only the changed values."""
 
     edits: tuple[Any, ...] = ()
 

@@ -127,7 +127,7 @@ def test_the_error_of_the_freezer_run_on_held_out_minutes(
         ]
         calibration = fit(seen, OPTIONS).calibration
         for part in held_out:
-            # Some parts have no minute at rest, because the freezer was knocked.
+            # Some held-out parts have no minute at rest, because the freezer was knocked.
             with suppress(RecordingError):
                 judged = evaluate([bag], [('unit', calibration)], topics=Topics(part=part))
                 windows = judged.judgements['unit'].windows

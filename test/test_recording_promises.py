@@ -217,7 +217,7 @@ def listed(messages):
     return list(zip(*(column.tolist() for column in columns), strict=True))
 
 
-#: Contents of messages that look like records.
+#: Contents of messages that look like MCAP records.
 DECEITFUL = [
     b'\x05' * 40, message(1, 5, b'\x05' * 9), (message(1, 7, b'') * 3)[:40],
     struct.pack('<BQ', MESSAGE, 22 + 40) * 4, bytes(40),

@@ -4,8 +4,8 @@
 The regime detector detects ramps early and with few false alarms (benchmarks/regime.py has long
 runs).
 
-All runs are seeded. The limits allow for the scatter of the median of 12 onset delays: 1.4 s for a
-sensor with 1 mK of noise, 4 s for a sensor with steps of 62.5 mK.
+All runs are seeded. Limits of delays allow for the scatter of the median of 12 onset delays: 1.4 s
+for a sensor with 1 mK of noise, 4 s for a sensor with steps of 62.5 mK.
 """
 
 import math
@@ -46,7 +46,7 @@ def case_and_board(t, corners, lag=LAG_S, start=20.0):
 
 
 def onsets(noise, quantum, rate_k_min, lag, n, *, dt=1.0, end_s=1500.0, soak_s=1500.0):
-    """Run n ramps; return regime switches after each onset, and how many were static before."""
+    """Run n ramps; return switches after each onset, and the number of onsets while static."""
     settings = detector_settings(noise, quantum, lag)
     collected, n_static = [], 0
     for seed in range(n):
@@ -78,7 +78,7 @@ def headline():
     [
         ('1 mK', 45.0, 90.0),
         ('10 mK', 150.0, 180.0),
-        # A detection needs two steps of 62.5 mK, on average a change by 94 mK, after 146 +- 6 s.
+        # Two steps of 62.5 mK are detected: a change by 94 mK (mean) is reached after 146 +- 6 s.
         ('1 mK, 62.5 mK steps', 158.0, 180.0),
         ('10 mK, 62.5 mK steps', 150.0, 180.0),
     ],
@@ -94,8 +94,8 @@ def test_the_onset_of_a_ramp_is_detected_early(headline, sensor, median_s, late_
 
 @pytest.mark.parametrize(('sensor', 'threshold'), [('1 mK', 9.65), ('10 mK', 8.87)])
 def test_the_onset_delay_is_below_twice_that_of_a_cusum_test(headline, sensor, threshold):
-    # A CUSUM test that knows ramp, baseline and noise has the shortest delay. `threshold`: its log
-    # likelihood ratio for one false alarm in 50 h, from docs/regime.md.
+    # A CUSUM test that knows ramp, baseline and noise has the shortest delay. `threshold`: log
+    # likelihood ratio at which this CUSUM gives one false alarm in 50 h.
     noise = SENSORS[sensor][0]
     rng = np.random.default_rng(4)
     k = np.arange(1.0, 121.0)
@@ -129,7 +129,7 @@ def test_each_ramp_switches_the_regime_to_dynamic_once(noise, quantum, rate_k_mi
     delays, _ = onsets(noise, quantum, rate_k_min, lag, 2 if dt < 1.0 else 3, dt=dt, end_s=end_s)
     for each in delays:
         assert [regime for _, regime, _ in each] in ([DYNAMIC], [STATIC, DYNAMIC])
-        # A detection takes longest for two steps of 1 K at 0.2 K/min behind a lag of 15 min.
+        # The slowest detection needs two steps of 1 K at 0.2 K/min behind a lag of 15 min.
         assert each[-1][0] < 0.5 * end_s
 
 
@@ -166,9 +166,9 @@ def test_three_soaks_of_5_h_have_at_most_two_false_alarms(sensor):
 
 
 def test_the_rate_of_false_alarms_is_below_that_of_the_setting():
-    # The setting allows 20 alarms per hour, 1000 in 50 h; the signal is noise. The threshold is
-    # set by Rice's formula for crossings; as crossings come in groups, there are fewer separate
-    # alarms. The lower limit on the alarms excludes a detector that does nothing.
+    # The setting allows 20 false alarms per hour, 1000 in 50 h; the readings are noise only. The
+    # threshold is set by Rice's formula for crossings; as crossings come in groups, there are
+    # fewer separate alarms. A lower limit of alarms excludes a detector that does nothing.
     settings = ThermometerSettings(0.01, lag_s=LAG_S)
     test = ChangeDetector(settings, 0.2 / 60.0, ripple=0.0, false_alarms=20.0 / 3600.0)
     rng = np.random.default_rng(6)
@@ -190,7 +190,7 @@ def test_the_rate_of_false_alarms_is_below_that_of_the_setting():
 @pytest.mark.parametrize('dt', [0.1, 1.0, 10.0])
 def test_the_threshold_follows_from_the_noise_of_the_filter(dt):
     # Expected threshold: filter gain by the Riccati equation, noise and correlation by the impulse
-    # response, alarms by Rice's formula. `_tune` neglects second-order terms, up to 4 %.
+    # response, alarms by Rice's formula. `_tune`'s first-order formulas err by up to 4 %.
     test = ChangeDetector(ThermometerSettings(0.01, lag_s=LAG_S), 0.2 / 60.0, 0.0, 0.02 / 3600.0)
     test._tune(dt)
     for threshold, power in zip(test._thresholds, test._powers, strict=True):
@@ -288,7 +288,7 @@ def test_the_dynamic_regime_ends_by_the_case_or_the_board(sensor):
     assert early[1] == late[1]
     assert late[2][0] - early[2][0] == pytest.approx(earlier, abs=300.0)
     # With the end condition 'case' the regime switches as without a board thermometer. Without a
-    # case thermometer both end conditions use the board thermometer.
+    # case thermometer both end conditions of the dynamic regime use the board thermometer.
     assert early == switches(board_too, t, case, None)
     t, board = t[:3000], board[:3000]
     assert switches(case_alone, t, None, board) == switches(board_too, t, None, board)

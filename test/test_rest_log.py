@@ -103,8 +103,8 @@ def test_logged_windows_are_means_over_10_s_at_rest():
 
 @pytest.mark.parametrize('rate', [1.0, 2.0, 3.3, 5.0, 50.0, 2000.0])
 def test_rests_are_found_at_any_rate_of_samples(rate, rng):
-    # Rests of one minute in two attitudes, with jitter of the stamps. Up to `RATE_HZ` all rates
-    # have the same noise of a sample, above `RATE_HZ` the same noise density.
+    # Rests of one minute in two attitudes, with jitter of the stamps. Samples at rates up to
+    # `RATE_HZ` have equal noise, at higher rates an equal noise density.
     n = round(120 * rate)
     cycles = np.arange(n) + 0.1 * rng.uniform(-1.0, 1.0, n)
     stamps = START_NS + np.rint(cycles * SECOND_NS / rate).astype(np.int64)

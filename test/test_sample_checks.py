@@ -72,7 +72,7 @@ def test_few_equal_samples_are_accepted_at_any_sample_rate(rng):
 )
 @settings(max_examples=300, deadline=None)
 def test_constant_samples_are_found_in_batches_of_any_size(parts, cuts, period):
-    # In each part an axis is constant or changes with each sample; some samples of y are NaN.
+    # In each part of the series an axis is constant or changes with each sample; y has some NaN.
     stands = np.repeat([which >> np.arange(3) & 1 for _, which in parts], [n for n, _ in parts], 0)
     sizes = 1.0 + np.arange(len(stands)) % 4
     samples = 1.0 + np.cumsum((1.0 - stands.reshape(-1, 3)) * sizes[:, np.newaxis], axis=0)
@@ -177,7 +177,7 @@ def test_no_sample_of_a_working_sensor_is_stuck_whatever_its_bandwidth(correlati
 
 @pytest.mark.parametrize('step', [1.0, 2.0, 5.0])
 def test_a_sensor_that_is_quieter_than_its_calibration_is_not_stuck(step, rng):
-    # Noise was calibrated in a vibrating chamber; at rest it is far below the converter's step.
+    # The calibrated noise is of a vibrating chamber; at rest noise is far below a converter step.
     compensator = Compensator(noisy_unit(3.0))
     edge = np.array([0.5, 0.0, 0.5])
     centre = step * (np.round(K * GRAVITY * np.array(UP) / step) + edge)
@@ -278,7 +278,7 @@ def test_a_jump_back_in_time_does_not_restore_a_refuted_calibration(rng, is_mend
     stream(compensator, events(0.0 if is_mended else 100.0))
     assert compensator.counters.n_time_jumps == 1
     if is_mended:
-        # The first window of 5 s has no predecessor to compare with; two more restore the output.
+        # The first 5 s window has no predecessor to compare with; two more windows restore output.
         assert compensator.counters.n_out - n_out == pytest.approx(4500, abs=200)
     else:
         assert compensator.counters.n_out == n_out
@@ -305,7 +305,7 @@ def watch(rng, *, bias=0.0, seconds=60, motion=0.0, rate_hz=100, monitor=None):
 
 def test_the_residual_of_a_good_calibration_is_near_0_and_its_sd_is_right(rng):
     result = watch(rng)
-    # The limit is 5 sd of the mean of 1500 samples; a window has 99 samples.
+    # Limit of the residual: 5 sd of the mean of 1500 samples; a window has 99 samples.
     assert abs(result.residual) < 5 * NOISE_SD / math.sqrt(100 * 15)
     assert result.residual_sd == pytest.approx(math.hypot(BIAS_SD, NOISE_SD / math.sqrt(99)))
     assert result.n_windows == 59  # the first of 60 windows has no predecessor to compare with

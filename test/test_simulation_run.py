@@ -101,7 +101,7 @@ def test_the_sum_of_counts_without_noise_is_the_integral_of_the_truth(unit):
 
 
 def test_simulated_white_noise_has_the_stated_density(unit):
-    """The one-sided spectrum is ``2 density^2``; means over 60 s have ``density / sqrt(60)``."""
+    """The one-sided spectrum is ``2 density^2``, the sd of 60 s means ``density / sqrt(60)``."""
     still = replace(unit, drift=())
     run = simulate(still, parse_cyclogram('soak'), UP, rate_hz=50.0, seed=3)
     accel = run.counts / np.array(unit.scale_factor) / MICRO_G
@@ -186,7 +186,7 @@ def test_two_parts_follow_a_ramp_like_the_closed_solution():
     trace, determinant = -(g0 + g1) / c0 - g1 / c1, g0 * g1 / (c0 * c1)
     root = math.sqrt(trace * trace - 4.0 * determinant)
     modes = np.array([(trace + root) / 2.0, (trace - root) / 2.0])
-    # In a ramp, heat for case and board flows from the air, heat for the board from the case.
+    # In a ramp the air heats the case and, through the case, the board.
     lag = np.array([(c0 + c1) / g0, (c0 + c1) / g0 + c1 / g1])
     shapes = np.array([modes + g1 / c1, [g1 / c1, g1 / c1]])
     amplitude = np.linalg.solve(shapes, lag)

@@ -40,7 +40,7 @@ def unit(**given):
 
 
 def ramp(given, rate, hours, environment=units.CHAMBER):
-    """Ramp the air at `rate` [K/s] after a soak; return times [s] and node temperatures."""
+    """Ramp the air at `rate` [K/s] after a soak; return times [s], thermal nodes' temperatures."""
     A, b, h = units.network(given, environment)
     at = np.arange(0.0, 3600.0 * hours, 10.0)
     return at, units.integrate(A, b, h, rate * at, 10.0, np.linalg.solve(A, -h))
@@ -131,7 +131,7 @@ def test_flicker_noise_has_a_flat_allan_deviation():
 
 @pytest.fixture
 def recorded(monkeypatch):
-    """Replace `record` by a stub; return a function that gives the arguments of a bag's call."""
+    """Replace `record` by a stub; return a function that gives the arguments that made a bag."""
     notes = {}
 
     def note(given, corners, up, rng, *, name='bag', **keys):
@@ -203,7 +203,7 @@ def of_attitudes(given, board):
 
 
 def curved_unit():
-    """Make a unit whose bias is a cubic, and whose scale is a line, in temperature."""
+    """Make a unit whose bias is a cubic and whose scale is a linear function of temperature."""
     rng = rng_of('curved')
     return unit(
         bias=1500.0 * rng.standard_normal(3), gain=0.01 * rng.standard_normal(3),
@@ -289,13 +289,13 @@ def test_the_ratio_is_1_if_errors_have_the_claimed_covariance():
     claim = np.broadcast_to(root @ root.T, (n, 3, 3))
     out = strangers.Corrected(truth + error, claim, np.zeros(3))
     scores = strangers.score([out], [Minutes(truth, np.zeros(n), truth)], is_drift=False)
-    # The RMS of 20000 windows is uncertain by 0.5 %.
+    # The RMS of the errors in 20000 windows is uncertain by 0.5 %.
     assert (scores.ratio, scores.norm_ratio) == pytest.approx((1.0, 1.0), rel=0.02)
     assert scores.claim == pytest.approx(scores.vector, rel=0.02)
 
 
 def test_the_claimed_sd_of_a_minute_is_the_noise_of_its_mean():
-    # This calibration claims white noise and rounding of counts only.
+    # The calibration claims only white noise and rounding of counts.
     samples = np.tile(300.0 * GRAVITY * LEVEL, (30000, 1))
     samples[::2] += 1.0
     samples[1::2] -= 1.0

@@ -116,7 +116,7 @@ def test_a_change_between_steps_of_1_k_determines_the_temperature():
     assert thermometer.var_temperature == pytest.approx(1.0 / 12.0, rel=0.2)
     thermometer.update(600 * SECOND_NS, 21.0)
     assert thermometer.temperature == pytest.approx(20.5, abs=0.03)
-    # The sd at the change is the noise plus the temperature change between two readings.
+    # When the reading changes, the sd is the noise plus the temperature change per reading.
     assert 0.005 < math.sqrt(thermometer.var_temperature) < 0.03
 
 
@@ -219,7 +219,7 @@ def test_readings_that_are_not_finite_or_not_newer_do_not_change_the_state(stamp
 
 
 def test_a_reading_15_sd_from_its_prediction_is_down_weighted():
-    # A reading 6 to 30 sd off counts as noisier, hence 6 sd off; beyond 30 sd it is not used.
+    # Readings 6 to 30 sd off get a noise that puts them 6 sd off; beyond 30 sd they are not used.
     thermometer = settled()
     assert thermometer.update(600 * SECOND_NS, 20.015)
     assert abs(thermometer.temperature - 20.0) < 0.004

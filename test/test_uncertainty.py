@@ -30,9 +30,9 @@ from thermo_comp.unit.prediction import SlowUncertainty, ramp_states, sd_of_stat
 
 
 def test_the_claimed_sd_covers_a_start_in_a_ramp():
-    # WHY: after a restart in a ramp the claimed sd was a third of the error. At the start the lag
-    # of a part is unknown: in this ramp it is 1 K (rate times time constant); in a soak its sd is
-    # 0.4 K. The claimed sd must not change if the ramp ends 40 s after the start.
+    # WHY: after a restart in a ramp the claimed sd was a third of the error. A part's lag at the
+    # start is unknown: 1 K in this ramp (rate times time constant), with an sd of 0.4 K in a soak.
+    # The claimed sd must not change if the ramp ends 40 s after the start.
     unit = calibration(response=(term('board', (30.0, 0.0, 0.0), tau_s=60.0),))
     sd = {}
     for rate, end in ((0.0, 60), (1.0 / 60.0, 60), (1.0 / 60.0, 40)):
@@ -172,8 +172,8 @@ def sd_at(unit, board, behind=0.0, force=0.0):
 
 
 def test_beyond_the_range_curve_and_lag_do_not_cancel_in_the_claimed_sd():
-    # The slopes of curve and lag over board temperature cancel inside the range. Their sum outside
-    # of the range is unknown, so that the claimed sd is that of the curve alone.
+    # Inside the range the slopes of curve and lag over board temperature cancel. Outside of the
+    # range the sum of both slopes is unknown, so the claimed sd is that of the curve alone.
     bias = axis_set((0.0, 0.5), residual_sd_m_s2=1e-6)
     unit = calibration(
         static=regime_set(bias), dynamic=regime_set(bias),
@@ -230,7 +230,7 @@ def test_outside_its_range_a_set_follows_the_curve_of_the_other_set():
     )
     celsius = [-20.0, -7.5, -3.0, 0.0, 5.0, 30.0, 35.0, 38.0, 42.5, 60.0]
     static, dynamic = curves_at(unit, celsius)[:, 0]
-    # Beyond an end of the common range, 5 to 30 degC, the sets differ by as much as at this end.
+    # Beyond an end of the common range, 5 to 30 degC, both curves differ by as much as there.
     np.testing.assert_allclose((dynamic - static)[:5], dynamic[4] - static[4], rtol=1e-12)
     np.testing.assert_allclose((dynamic - static)[5:], dynamic[5] - static[5], rtol=1e-12)
     wavy, bent = np.polynomial.Polynomial(WAVY), np.polynomial.Polynomial(BENT)
@@ -240,8 +240,8 @@ def test_outside_its_range_a_set_follows_the_curve_of_the_other_set():
 
 
 def test_the_sd_beyond_the_range_includes_every_parameter_of_the_tangents(rng):
-    # A change of the parameters must change bias and scale by the regressors times this change.
-    # The ranges are 5 to 35 degC (static) and 0 to 30 degC (dynamic).
+    # A change of the parameters times the regressors must equal the change of bias and scale. The
+    # ranges are 5 to 35 degC (static) and 0 to 30 degC (dynamic).
     spline = CubicSpline((-15.0, 0.0, 15.0), (-4.0, 0.0, 6.0))
     exponential = Exponential(-1.0, (1.0,), (18.0,))
     splined = AxisSet(spline, Polynomial((1.0, 1e-4)))
@@ -290,8 +290,8 @@ def test_the_claimed_sd_grows_with_the_distance_from_the_range():
 
 
 def test_with_lags_the_sd_in_a_ramp_does_not_depend_on_the_calibrated_rates():
-    # WHY: after bags of soaks, with rates below 0.1 K/min, the variance in a ramp was multiplied
-    # by several hundred, although it already contained the variance of the lag in the ramp.
+    # WHY: for a unit fitted to soaks (rates below 0.1 K/min) the claimed variance in a ramp was
+    # multiplied by several hundred, although it already contained the variance of the lag.
     axis = axis_set(residual_sd_m_s2=1e-5)
     soaks = regime_set(axis, rate_range_k_min=(-0.1, 0.1))
     sds = []
@@ -301,8 +301,8 @@ def test_with_lags_the_sd_in_a_ramp_does_not_depend_on_the_calibrated_rates():
         state[BOARD], state[RATE] = 20.0, 2.0 / 60.0
         line = correction.line(state, state, np.zeros(N_ROWS), 0.0)
         sds.append(math.sqrt(line[VARIANCES[0]] - correction.noise[0]))
-    # The rate, 2 K/min, is 19 times 0.1 K/min beyond the calibrated rates of up to 0.1 K/min: only
-    # the unit without lags gets additional variance.
+    # The rate, 2 K/min, exceeds the largest calibrated rate, 0.1 K/min, by 19 times 0.1 K/min:
+    # only the unit without lags gets additional variance.
     assert sds == pytest.approx([1e-5 * math.hypot(1.0, 19.0), 1e-5], rel=1e-6)
 
 
