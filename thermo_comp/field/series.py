@@ -321,8 +321,8 @@ def _uncertainty(
     weight, unknown = at.states[:, WEIGHT], at.states[:, UNKNOWN]
     regimes = np.array([1.0 - weight, weight])
     unexplained = correction.curves.unexplained(at.states[:, BOARD])
-    # The ageing model has separate terms for the residual sd and the lack of fit: subtract the
-    # variances of both from `slow`, in an unknown regime those of the static and dynamic sets.
+    # The ageing model has separate terms for the residual sd and the lack of fit: subtract both
+    # variances from `slow`, which in an unknown regime has those of the static and dynamic sets.
     of_sets = regimes + unknown * regimes[::-1]
     slow -= (at.v.T**2 * (of_sets[:, np.newaxis] * unexplained).sum(axis=0)).sum(axis=0)
     residual = [[a.residual_sd_m_s2**2 for a in part.axes()] for part in calibration.regime_sets()]
@@ -331,7 +331,7 @@ def _uncertainty(
 
 
 def _variance_along(correction: Correction, slow: SlowUncertainty, at: _Geometry) -> Floats:
-    """Return the variance of |f| due to `slow`, without the noise of a sample, (n,)."""
+    """Return the variance of |f| from `slow` and all else but the noise of a sample, (n,)."""
     columns, x = at.states.T, at.x.T
     line = list(correction.line(columns, columns, slow.at(columns, at.shares.T), 0.0))
     if correction.of_force is None:

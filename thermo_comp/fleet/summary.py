@@ -48,7 +48,7 @@ class Spread(NamedTuple):
     values: Floats
     is_counted: Bools
     middle: float
-    sd: float  # 1.4826 times the median absolute deviation (for logarithms, times `middle`)
+    sd: float  # 1.4826 times the median absolute deviation; of logarithms, also times `middle`
     z: Floats
     limit: float = float('inf')  # smallest |z| of an outlier; infinite below eight units
 
@@ -176,7 +176,7 @@ def _determined(quantity: TableColumn, values: Floats, own_sd: Floats) -> Bools:
 
 
 def _deviations(quantity: TableColumn, values: Floats, middle: float) -> Floats:
-    """Return the deviations of values, ppm or logarithms (`TableColumn.by`) from the median."""
+    """Return deviations from the median: of values, in ppm, or of logarithms (`quantity.by`)."""
     if quantity.by == 'ppm':
         return (values / middle - 1.0) * 1e6
     if quantity.by == 'logarithm':

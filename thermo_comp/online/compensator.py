@@ -361,7 +361,7 @@ class Compensator:
 
     @property
     def scale_sd(self) -> tuple[float, ...]:
-        """Sd of each axis' relative scale in the present segment; () before the first segment."""
+        """Relative sd of each scale factor in the present segment; () before the first segment."""
         line = self._segment[1]
         return tuple(math.sqrt(max(0.0, line[place])) for place in SCALE_VARIANCES if line)
 

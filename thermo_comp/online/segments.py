@@ -6,7 +6,7 @@ Owns the segments: time intervals between temperature readings, with a correctio
 A segment ends at a temperature reading, or after one second. The correction is evaluated at both
 ends of a segment and interpolated, so a sample costs a few operations, and the output has no steps
 between two readings. The slowly varying variance due to parameters and initial lag states is
-evaluated every 10 s; soon after a start, in each segment.
+evaluated every 10 s; soon after the board readings begin, in each segment.
 """
 
 from collections.abc import Sequence
@@ -84,7 +84,7 @@ class Model:
         self.inputs = (BOARD_INPUT, *calibration.sensors)
 
     def slow_rows(self, held: Sequence[SlowState]) -> Floats:
-        """Evaluate the slowly varying variances, (rows, n): of force (`n_slow` rows), of rate."""
+        """Evaluate the slowly varying variances, of force (`n_slow` rows) and angular rate."""
         states, shares, rates = (np.array(part).T for part in zip(*held, strict=True))
         return np.concatenate([part.at(states, shares, rates) for part in self.uncertainty])
 
@@ -149,7 +149,7 @@ class ThermalSide:
         unit, rate = self.calibration.unit, copy(self.rate)
         self._use(model, config)
         if self.calibration.unit == unit:
-            # A new calibration of the same unit does not end a stop of output by the rate check.
+            # With a new calibration of the same unit, output stopped by the rate check stays off.
             self.rate = rate
         self.queue.keep(lambda entry: entry[2] in self.inputs)
         is_same = self.calibration.detector == old.settings
@@ -246,7 +246,7 @@ class ThermalSide:
         return Segment(start_ns, is_new, rate.is_too_fast, rate.noise_excess, start, end, slow)
 
     def bias_sd(self, correction: Correction, variances: Sequence[float]) -> tuple[float, ...]:
-        """Return each axis' bias sd: the root of the output's variance less that of the noise."""
+        """Return each axis' bias sd: the root of the output variance less the noise variance."""
         excess = 1.0 + self.rate.noise_excess
         pairs = zip(variances, correction.noise, strict=False)
         return tuple(sqrt(max(0.0, whole - excess * noise)) for whole, noise in pairs)

@@ -318,7 +318,7 @@ def _reply(service: Service, request: Any, answer: Callable[[Any], None]) -> Non
 def read_parameter(message: ParameterMessage) -> Parameter:
     """Read a received parameter; integers become floats if the parameter is a float."""
     if not message.name:
-        # rclpy would treat the empty name as declared.
+        # rclpy would treat a parameter with an empty name as declared.
         raise ParameterError('a parameter without a name')
     try:
         given = Parameter.from_parameter_msg(message)

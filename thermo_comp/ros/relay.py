@@ -4,7 +4,7 @@
 Owns the processing of samples in the node in order of arrival, whenever the loop wakes up.
 
 Messages do not identify their publisher. While several publishers may send on a topic, the topic's
-messages are dropped. The first batch after a publisher has left is also dropped.
+messages are dropped, as is the first batch of messages after a publisher has left.
 """
 
 from bisect import bisect_left, bisect_right
@@ -181,7 +181,7 @@ class Relay:
             self.gather()
 
     def gather(self) -> None:
-        """Sum the samples that wait for the rest log."""
+        """Sum the samples since the last call, for the rest log."""
         if self.rests is not None and self.waiting:
             messages, self.waiting = self.waiting, []
             self.rests.gather(messages, self.running.loaded, self.running.compensator)

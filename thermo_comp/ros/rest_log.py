@@ -42,7 +42,7 @@ _JUMP_NS = 10**9
 # First bytes of a message in little-endian CDR; offsets of counts, force and angular rate from the
 # end of a message [bytes].
 _PLAIN, _COUNTS, _FORCE, _RATE = (0, 1, 0, 0), -24, -96, -192
-_SHORTEST = {False: 44, True: 316}  # shortest message [bytes], by whether it is an Imu
+_SHORTEST = {False: 44, True: 316}  # length of the shortest message [bytes]; True: Imu
 
 
 class RestLog:
@@ -153,7 +153,7 @@ class RestKeeper:
     def gather(
         self, messages: list[bytes], loaded: LoadedCalibration, compensator: Compensator
     ) -> None:
-        """Sum messages that the compensator has processed; queue the rests that they complete."""
+        """Sum messages that the compensator has processed; queue the completed rests."""
         # All messages are summed with the present calibration, also messages that were corrected
         # with the old calibration before a reload.
         self._use(loaded, compensator)
@@ -222,7 +222,7 @@ def samples_of(messages: Sequence[bytes], *, is_imu: bool) -> tuple[Stamps, Floa
     at = size + (_FORCE if is_imu else _COUNTS)
     samples = rows[:, at : at + 24].view('<f8')
     if is_imu:
-        # An angular rate and the first element of its covariance, which is -1 without a rate.
+        # Angular rate and the first element of its covariance, which is -1 if there is no rate.
         rate = rows[:, size + _RATE : size + _RATE + 32].view('<f8')
         if (rate[:, 3] != -1.0).all():
             samples = np.hstack((samples, rate[:, :3]))
