@@ -295,7 +295,7 @@ def force(
 def fitting(
     where: dict[str, float] = site,
     model: Literal['response', 'golovach'] = option(
-        'response: two sets of coefficients and thermal response; golovach: the two sets alone.',
+        'response: coefficients for soaks and ramps, and thermal response; golovach: no response.',
         'response',
         metavar='MODEL',
     ),

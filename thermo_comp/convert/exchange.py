@@ -4,7 +4,7 @@
 Owns the export of calibrations to the files of other tools, and the import of such files.
 
 All tools correct a reading N to a specific force ``a = A (N - b)``. In autopilots the bias b
-depends on temperature and the matrix A is 1; in tools for tumble tests b and A are constant. The
+depends on temperature and A is the identity; in tools for tumble tests b and A are constant. The
 notes of an export name the parts of the calibration that are lost, most with the resulting error.
 """
 
@@ -186,7 +186,7 @@ def _losses(calibration: Calibration) -> list[str]:
     if static != dynamic:
         notes.append('the dynamic coefficients are lost: the static ones are used in ramps, too')
     if calibration.nonlinearity is not None and calibration.nonlinearity.terms:
-        notes.append('the nonlinear terms over specific force are lost')
+        notes.append('the terms nonlinear in specific force are lost')
     return notes
 
 

@@ -106,9 +106,9 @@ def read_rests(
     Read the rest logs of a calibration's unit.
 
     Returns the rests, a `Source` for the provenance of an update by these rests, and notes.
-    `ahead` is the time of ageing in the update's covariance [days]. Rests before the date of the
-    calibration are left out, unless all are before this date. Rests of an earlier update are left
-    out if `is_for_update`. Raises RecordingError if no rest remains.
+    `ahead`: number of days of ageing that the covariance of the update will include. Rests before
+    the date of the calibration are left out, unless all are before this date. Rests of an earlier
+    update are left out if `is_for_update`. Raises RecordingError if no rest remains.
     """
     files: list[Path] = []
     for path in paths:
@@ -264,7 +264,7 @@ def series_of(
 
 
 def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
-    """Return the indices in `memory` of the state elements and of the lags of `wanted`."""
+    """Return the indices of the state elements of `wanted`, and of its lags, in `memory`."""
     try:
         logged, target = StateLayout(memory).numbers, StateLayout(wanted).numbers
         places = np.array([logged.index(number) for number in target], np.int64)

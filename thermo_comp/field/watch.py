@@ -3,9 +3,9 @@
 """
 Owns the drift watch: comparison of ``|f| - g`` in a rest log with the claimed sd, and a forecast.
 
-A unit is within its claim while the RMS of its errors along gravity, over attitudes and starts, is
-at most `LIMIT` times the sd that its calibration claims for these errors. The verdict follows from
-the rests of the last week and from the error at the last rest by the ageing model. The forecast is
+A unit is within its claim while the RMS of its errors along gravity, over attitudes and node
+starts, is at most `LIMIT` times the sd that its calibration claims for them. The verdict follows
+from the rests of the last week and the error at the last rest by the ageing model. The forecast is
 the distribution of the time at which the RMS first exceeds the limit, for random walks of bias and
 scale that begin at the present estimate and have the variances estimated from the log.
 """
@@ -202,7 +202,7 @@ def _forecasts(
     of_parameters, of_levels = np.split(root, [recent.by_parameter.shape[1]], axis=1)
     walk = of_levels * np.repeat([ageing.bias, ageing.scale], 3)
     bias, scale = (float((part**2).sum()) for part in np.split(walk, 2, axis=1))
-    # The offsets of the starts add to the error, so their variance is subtracted from the square
+    # Bias offsets of node starts add to the error, so their variance is subtracted from the square
     # of the limit. After a disturbance the ageing model may overestimate the offsets' variance:
     # use the variance of |f| - g at the recent rests instead, if this variance is smaller.
     scatter = ageing.turn_on**2 * float((of_levels[:, :3] ** 2).sum()) + ageing.rest**2

@@ -23,8 +23,8 @@ _FALSE_ALARMS = 0.05
 _UNITS_NEEDED = 8
 # Efficiency of the median absolute deviation relative to the sample sd, for a normal distribution.
 _MAD_EFFICIENCY = 0.37
-# Largest ratio of a value's sd (by the unit's fit) to the spread over the units at which the data
-# determine the value; with a larger ratio the value is about the prior mean of the fit.
+# The data determine a unit's value if its sd by the fit is at most this multiple of the spread
+# over the units; a value of larger sd is about the prior mean of the fit.
 _LARGEST_SD = 5.0
 # Residuals [ug] and noises [ug/sqrt(Hz)] are raised to this limit before taking logarithms.
 _LEAST = 1e-12

@@ -196,7 +196,7 @@ class ThermalSide:
             self.counters.n_case_rejected += n_readings
 
     def flush(self, stamp_ns: int) -> None:
-        """Apply the waiting readings up to a stamp."""
+        """Apply the waiting temperature readings up to a stamp."""
         for reading_ns, _, name, _, celsius in self.queue.due(stamp_ns):
             self._apply(name, reading_ns, celsius)
 

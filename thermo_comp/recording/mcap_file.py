@@ -248,7 +248,7 @@ class McapFile(BagFile):
 
 
 def _in_order(pieces: Iterable[tuple[int, Messages, int | None]]) -> Iterator[Messages]:
-    """Merge pieces by log time; a piece: its number, messages, next piece's first log time."""
+    """Merge pieces by log time; a piece: place in file, messages, next piece's first log time."""
     # Messages before the first log time of the next piece are final; later messages are held.
     held: dict[int, Messages] = {}
     for row, piece, next_ns in pieces:

@@ -71,7 +71,7 @@ class Messages:
             yield data[at : at + size]
 
     def take(self, which: Ints | Bools | slice) -> Messages:
-        """Select messages; the result shares `data`."""
+        """Select messages; the result shares the bytes in `data`."""
         return Messages(
             self.data, self.start[which], self.size[which], self.channel[which], self.log_ns[which]
         )

@@ -275,7 +275,7 @@ class ParameterRequests:
                 future = (self._slow if waits else self._quick).submit(self._read, group)
                 future.add_done_callback(lambda done: self._loop.call_soon(partial(end, done)))
             return
-        # At most `PARAMETERS_LIMIT` results: writing one takes as long as reading a parameter.
+        # Send at most `PARAMETERS_LIMIT` results: each takes as long as reading a parameter.
         results += [_refusal(reason)] * min(len(groups), PARAMETERS_LIMIT)
         respond()
 

@@ -26,7 +26,7 @@ from ..thermal.state import StateLayout
 from ..typing import Floats, Stamps
 from .reader import LoadedCalibration
 
-#: Number of messages in a summed block; a block is shorter if a report is due earlier.
+#: Number of messages that are summed at a time; fewer if a report is due earlier.
 BLOCK = 1024
 #: Largest size of the file of a day, and of the folder [bytes]; a month takes at most 10 MB.
 DAY_BYTES, FOLDER_BYTES = 320_000, 64_000_000
