@@ -240,7 +240,7 @@ def _print_fit(
 
 
 def _behind_s(parts: Sequence['Part']) -> list[float]:
-    """Return how far each part's temperature lags its surroundings in a steady ramp [s]."""
+    """Return the time by which each part's temperature lags its surroundings in a ramp [s]."""
     return [part.tau_s + part.second_tau_s for part in parts]
 
 

@@ -375,7 +375,7 @@ class Solution:
     gravity: tuple[tuple[Change, float, float], ...] = ()
 
     def before(self, row: int) -> Floats:
-        """Return the parameters' shift due to the equations before `row`."""
+        """Return the shift of the file parameters due to the equations before number `row`."""
         return np.asarray(self.gains[:row].T @ self.innovations[:row])
 
 

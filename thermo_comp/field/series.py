@@ -298,7 +298,7 @@ def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
 
 
 class _Geometry(NamedTuple):
-    """Thermal states, remaining shares of lag states, and u, v, x of this module's docstring."""
+    """Thermal states, remaining shares of initial lag states, and the module's u, v, x."""
 
     states: Floats
     shares: Floats

@@ -34,7 +34,7 @@ from .status import CompensatorConfig, Counters
 #: Longest segment [ns].
 SEGMENT_NS: Final = 1_000_000_000
 SLOW_NS: Final = 10_000_000_000  # longest use of a `SlowState` and its variance [ns]
-YOUNG_READINGS: Final = 30  # number of board readings that determine the board's rate
+YOUNG_READINGS: Final = 30  # number of readings that determine the rate of the board temperature
 EVER_NS: Final = -NEVER_NS  # a stamp earlier than any real stamp
 #: Sd of the temperature of a unit without thermometer about the reference temperature [K].
 UNMEASURED_SD_K: Final = 10.0
@@ -43,7 +43,7 @@ UNMEASURED_SD_K: Final = 10.0
 class SlowState(NamedTuple):
     """
     Arguments of the variance due to parameters and initial lag states: thermal state, remaining
-    shares of the lags' unknown initial states, largest board rate since the start [K/s].
+    shares of the unknown initial lag states, largest rate of the board since the start [K/s].
     """
 
     state: tuple[float, ...]
@@ -260,8 +260,8 @@ class ThermalSide:
 
     def _slow_at(self, start_ns: int, end_state: tuple[float, ...]) -> SlowState:
         """Return the arguments of the slowly varying variance; they are at most `SLOW_NS` old."""
-        # The unknown initial lag states depend on the board's rate, which the first readings after
-        # a start do not determine: evaluate the variance in each segment.
+        # The unknown initial lag states depend on the rate of the board temperature, which the
+        # first readings do not determine: evaluate the variance in each segment meanwhile.
         is_young = self.tracker.board.n_in_row < YOUNG_READINGS
         key = start_ns // (SEGMENT_NS if is_young else SLOW_NS)
         if key != self._slow_key:

@@ -33,7 +33,7 @@ from .waitloop import WaitLoop
 
 # Time without samples until waiting readings are used [s]; Fast DDS may deliver samples 3 s late.
 IDLE_S = 5.0
-#: Readings stamped later than the samples by more than this time use another clock [s].
+#: A temperature reading stamped later than the samples by over this time [s] has another clock.
 AHEAD_S = 5.0
 #: Samples have stopped if none arrives for this number of conversion cycles and this time [s].
 SILENT_CYCLES, SILENT_S = 5.0, 0.5

@@ -259,7 +259,7 @@ class Relay:
             self.traffic.n_flags += 1
 
     def _count_unpublished(self) -> None:
-        """Count a message that the middleware refused; raise after the shutdown."""
+        """Count a message that the middleware refused; raise an error if ROS has shut down."""
         if not self._loop.node.context.ok():
             raise ExternalShutdownException
         self.traffic.n_unpublished += 1

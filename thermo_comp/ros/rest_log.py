@@ -32,7 +32,7 @@ BLOCK = 1024
 DAY_BYTES, FOLDER_BYTES = 320_000, 64_000_000
 #: Smallest size of the files that are thinned if the folder is too large [bytes].
 _UNTHINNED_BYTES = 16_000
-#: Largest number of lines that wait for the disk.
+#: Largest number of lines that wait to be written to the disk.
 _WAITING = 1000
 #: Stamps before 2000-01-01 [ns] are times since the start of a driver, not dates: rests with such
 #: stamps get the time of this computer.
