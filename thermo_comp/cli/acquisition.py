@@ -23,7 +23,7 @@ from ..unit.gravity import STANDARD_GRAVITY
 
 # Minimum length of a rest [s], unless the wanted soak is shorter.
 _REST_S = 10.0
-# Shortest cell of averaged samples [s]; number of samples from which the cells are laid out.
+# Shortest cell of averaged samples [s]; number of first samples that set the length of a cell.
 _CELL_S, _SAMPLES_TO_BEGIN = 0.5, 30
 # Number of earlier cells that each search for rests includes, besides the new cells.
 _LOOKED_BACK = 200

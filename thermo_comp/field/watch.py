@@ -6,8 +6,8 @@ Owns the drift watch: comparison of ``|f| - g`` in a rest log with the claimed s
 A unit is within its claim while the RMS of its errors along gravity, over attitudes and node
 starts, is at most `LIMIT` times the sd that its calibration claims for them. The verdict follows
 from the rests of the last week and the error at the last rest by the ageing model. The forecast is
-the distribution of the time at which the RMS first exceeds the limit, for random walks of bias and
-scale that begin at the present estimate and have the variances estimated from the log.
+the distribution of the time at which this RMS first exceeds the limit, for random walks of bias
+and scale that begin at the present estimate and have the variances estimated from the log.
 """
 
 from collections.abc import Sequence
@@ -170,7 +170,7 @@ def watch(series: RestSeries, calibration: Calibration, tolerance: float | None 
 
 def _smoothed(day: Ints, ratio: Floats) -> tuple[Ints, Floats]:
     """
-    Return, for the week that ends on each day, the index of its first day and its robust RMS.
+    Return, for the week that ends on each day, the index of its first day and its RMS of `ratio`.
 
     If a week has only one day with rests, the preceding day with rests is added. The largest daily
     RMS of a week, perhaps of a disturbed day, is replaced by the second largest.

@@ -6,9 +6,9 @@ Owns still intervals: sums samples in short cells (count, mean, variance) and fi
 Two tests are relative to the noise of the bag's quiet cells: the variance inside a cell
 (vibration, handling) and the step of the mean between adjacent cells (a turn, a knock). A step
 starts a new interval, because a tilt by a microradian changes a sample by a micro-g. Temperature
-tilts a unit at rest, too: a steady change of several means by at most 50 micro-g/s is a drift, no
-step. Two tests have absolute limits, because the quietest tenth of a flight is not a rest: at rest
-the sd of samples is below `still_sd`, and the angular rate within 1 deg/s of its median.
+tilts a unit at rest, too: a steady change of the mean by at most 50 micro-g/s in several cells is
+a drift, no step. Two tests have absolute limits, as the quietest tenth of a flight is not a rest:
+at rest the sd of samples is below `still_sd`, the angular rate within 1 deg/s of its median.
 """
 
 from collections.abc import Sequence
