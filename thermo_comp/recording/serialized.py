@@ -57,7 +57,7 @@ class Messages:
 
     @classmethod
     def of_rows(cls, rows: Bytes, channel: NDArray[np.uint16], log_ns: Ints) -> Messages:
-        """Take the messages from rows of bytes, shape (n, size)."""
+        """Make messages of rows of bytes, shape (n, size), a message per row."""
         size = np.full(len(rows), rows.shape[1])
         return cls(rows.ravel(), np.cumsum(size) - size, size, channel, log_ns)
 

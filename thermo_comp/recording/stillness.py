@@ -90,7 +90,7 @@ class Cells:
 class CellAccumulator:
     """
     Reduces streamed samples to cells of `cell_s`, or of `least` samples if these last longer.
-    A whole number of cells fills a window of `window_s`, or up to 60 windows if cells are longer.
+    A whole number of cells fills a window of `window_s` or, if cells last longer, 2 to 60 windows.
     """
 
     def __init__(

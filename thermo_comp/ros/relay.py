@@ -217,7 +217,7 @@ class Relay:
                 self._readings.append((received, (name, *reading)))
 
     def _relay_with_readings(self, messages: list[bytes], received_ns: list[int]) -> list[bytes]:
-        """Relay samples and readings by arrival; return the samples after the last reading."""
+        """Relay samples and readings as they arrived; return samples after the last reading."""
         start, push = 0, self.running.compensator.push
         self._readings.sort(key=itemgetter(0))
         n = bisect_right(self._readings, received_ns[-1], key=itemgetter(0))
