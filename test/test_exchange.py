@@ -233,8 +233,8 @@ def test_losses_of_an_export_are_noted(cubic):
         'cubics replace',
         '1000 urad',
         r'response is lost (gradient): ',
-        'dynamic set is lost',
-        'nonlinear terms over specific force are lost',
+        'dynamic coefficients are lost',
+        'the terms nonlinear in specific force are lost',
     ):
         assert any(expected in note for note in text.notes), expected
         assert expected in text.text

@@ -39,12 +39,12 @@ def fit(
     output: Path = options.NEW_CALIBRATION,
     settings: dict[str, Any] = options.fitting,
     static_curve: Curve | None = option(
-        'Curve of bias and scale over temperature in the static set: linear, quadratic, cubic, '
-        'spline or exponential; default: cubic, or linear for --model golovach.',
+        'Curve of bias and scale over temperature in a soak: linear, quadratic, cubic, spline '
+        'or exponential; default: cubic, or linear for --model golovach.',
         metavar='CURVE',
     ),
     dynamic_curve: Curve | None = option(
-        'Curve of bias and scale over temperature in the dynamic set; default: the static curve '
+        'Curve of bias and scale over temperature in ramps; default: the curve in a soak '
         'plus a quadratic; for --model golovach: quadratic.',
         metavar='CURVE',
     ),
@@ -240,7 +240,7 @@ def _print_fit(
 
 
 def _behind_s(parts: Sequence['Part']) -> list[float]:
-    """Return how far each part's temperature lags its surroundings in a steady ramp [s]."""
+    """Return the time by which each part's temperature lags its surroundings in a ramp [s]."""
     return [part.tau_s + part.second_tau_s for part in parts]
 
 
@@ -384,7 +384,7 @@ def _of_axes(values: Iterable[float], shown: Callable[[float], str | None]) -> s
 def _steps(
     rows: Iterable[Any], steps: Iterable[str], shown: Callable[[float], str | None], axes: int = 1
 ) -> list[tuple[Cell, ...]]:
-    """Return a table row per section: its number of windows, and the RMS of each of `steps`."""
+    """Return a table row per section: number of windows, RMS residual of each of `steps`."""
     return [
         (row.section, row.fitted.n // axes, *(shown(getattr(row, x).rms) for x in steps))
         for row in rows

@@ -264,11 +264,11 @@ def update(
     """
     Update a calibration in the field, by rests that the node has logged.
 
-    The calibration is the prior; the ageing since the fit is estimated from
-    the rests, which may be in any attitude. Old and new calibration are
-    compared on days left out of the update. The new calibration is written only
-    if the rests determine an axis and lower the mean square of |f| - g by more than
-    its standard error; else the exit code is 3, and the sds with ageing are printed.
+    The calibration is the prior; the ageing since the fit is estimated from the
+    rests, which may be in any attitude. Old and new calibration are compared on
+    days left out of the update. The new calibration is written only if the rests
+    determine an axis and the mean decrease of (|f| - g)^2 on these days exceeds
+    its standard error; else the exit code is 3, and sds with ageing are printed.
 
     Example:
       thermo_comp update unit42.yaml rests -o unit42_new.yaml

@@ -295,7 +295,7 @@ def force(
 def fitting(
     where: dict[str, float] = site,
     model: Literal['response', 'golovach'] = option(
-        'response: two sets of coefficients and thermal response; golovach: the two sets alone.',
+        'response: coefficients for soaks and ramps, and thermal response; golovach: no response.',
         'response',
         metavar='MODEL',
     ),
@@ -327,7 +327,7 @@ def fitting(
         'or if some rests are not at 1 g, else no nonlinearity.',
         min=1e-6,
     ),
-    allow: list[str] | None = option('Refusal to override, by its name in the error message.'),
+    allow: list[str] | None = option('Name of a refusal to override, as in the error message.'),
 ) -> dict[str, Any]:
     """Return keywords of `FitOptions`."""
     given = locals() | where

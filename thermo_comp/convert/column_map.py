@@ -198,7 +198,7 @@ def table_log(path: Path, columns: ColumnMap) -> ForeignLog:
 
 
 def _without_wraps(table: Table, unit: TimeUnit | None) -> tuple[Ints, tuple[int, ...]]:
-    """Continue 32-bit times after an overflow; return stamps, and lines just after overflows."""
+    """Continue 32-bit times beyond overflows; return stamps, numbers of lines after overflows."""
     stamp_ns, rows = table.stamp_ns.copy(), np.flatnonzero(table.stamp_ns != NO_STAMP)
     if unit not in ('ms', 'us') or not len(rows):
         return stamp_ns, ()

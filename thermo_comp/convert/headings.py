@@ -79,7 +79,7 @@ class Headings:
     accel_unit: str
     gyro: Triple | None
     gyro_unit: str
-    thermometers: dict[str, tuple[str, str]]  # column and unit by thermometer
+    thermometers: dict[str, tuple[str, str]]  # by thermometer: its column and unit
 
 
 def read_headings(
@@ -113,8 +113,8 @@ def _thermometers(
     headings: Sequence[str], names: Container[str], is_plausible: Callable[[str, str], bool]
 ) -> dict[str, tuple[str, str]]:
     """
-    Return column and unit by thermometer. A column whose heading only names a place, like `board`,
-    is used only if no other column is this thermometer. `names`: all headings, after `_plain`.
+    Return each thermometer's column and unit. A column whose heading is a place, like `board`, is
+    used only if its thermometer has no other column. `names`: `_plain` of all headings.
     """
     units = {heading: _stated(heading, _DEGREES) or 'degC' for heading in headings}
     warm, places = [], []

@@ -339,7 +339,7 @@ def _array(value: object, key: str, size: int) -> Floats:
 
 @dataclass(frozen=True)
 class Tool:
-    """Functions for a tool's file: biases over temperature (`is_thermal`) or a constant triad."""
+    """Writer and reader of a tool's files, of bias curves (`is_thermal`) or of constants."""
 
     write: Callable[[Content, int | None, int], str]
     read: Callable[[str, int | None], Content | None]  # returns None for the file of another tool

@@ -163,7 +163,7 @@ def rows_of(series: RestSeries, scatter: float) -> Rows:
     searched = rows.start[rows.rank < _SEARCH_ROWS]
     if len(searched) <= _MOST_ROWS:
         return rows
-    # The oldest starts are left out: they tell little about the present bias and scale.
+    # The oldest node starts are left out: they tell little about the present bias and scale.
     return rows.at(rows.start > searched[-_MOST_ROWS])
 
 
@@ -299,7 +299,7 @@ def learn(
 
 def _best(candidates: Iterable[Change], is_gravity_certain: bool) -> Change | None:
     """
-    Return the most probable change, or None if no log Bayes factor reaches `_LEAST_GAIN`. The
+    Return the most probable `Change`, or None if no log Bayes factor reaches `_LEAST_GAIN`. The
     log Bayes factor of a gravity jump must exceed that of any other change by `_LEAST_LEAD`.
     """
     every = list(candidates)
@@ -319,7 +319,7 @@ def _gain(change: Change | None) -> float:
 
 
 def _candidates(model: Model, inverse: Floats) -> Iterator[Change]:
-    """Yield jumps before each start and a change of the bias slopes, with log Bayes factors."""
+    """Yield jumps before each node start, and a change of bias slopes, with log Bayes factors."""
     rows = model.rows
     alpha, by_jump = inverse @ rows.y, rows.by_jump
     _, first = np.unique(rows.start, return_index=True)
@@ -330,7 +330,7 @@ def _candidates(model: Model, inverse: Floats) -> Iterator[Change]:
         for i in range(width):
             precision[:, :, i, j] = np.add.reduceat(by_jump[:, [i]] * half, first, axis=0)
     gradient = np.add.reduceat(by_jump * alpha[:, np.newaxis], first, axis=0)
-    # A jump before a start shifts |f| at this start and at all later starts.
+    # A jump before a node start shifts |f| at this start and at all later starts.
     after = np.cumsum(np.cumsum(precision[::-1, ::-1], axis=0), axis=1)[::-1, ::-1]
     gradient = np.cumsum(gradient[::-1], axis=0)[::-1]
     known = {(change.kind, change.time) for change in model.changes}
@@ -375,7 +375,7 @@ class Solution:
     gravity: tuple[tuple[Change, float, float], ...] = ()
 
     def before(self, row: int) -> Floats:
-        """Return the parameters' shift due to the equations before `row`."""
+        """Return the shift of the file parameters due to the equations before number `row`."""
         return np.asarray(self.gains[:row].T @ self.innovations[:row])
 
 
@@ -398,7 +398,7 @@ def solve(model: Model, ageing: Ageing, to_file: Floats, bend: Floats, ahead: fl
     gravity = []
     for change in model.changes:
         columns = change.columns(rows)
-        if change.kind == 'gravity':  # the calibration file has no parameter for a jump of gravity
+        if change.kind == 'gravity':  # a jump of local gravity changes no calibration parameter
             gain = change.sd**2 * solve_triangular(lower, columns[:, 0], lower=True)
             variance = max(float(change.sd**2 - gain @ gain), 0.0)
             gravity.append((change, float(gain @ innovations), float(np.sqrt(variance))))

@@ -38,7 +38,7 @@ StateNow = Callable[[], _State | None]
 
 @dataclass
 class _Cell:
-    """Sums, over the seconds `begin` to `last`, of samples less the first sample, `origin`."""
+    """Sums of the samples less the first sample, `origin`, from second `begin` to `last`."""
 
     begin: int
     last: int

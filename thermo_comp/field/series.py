@@ -106,9 +106,9 @@ def read_rests(
     Read the rest logs of a calibration's unit.
 
     Returns the rests, a `Source` for the provenance of an update by these rests, and notes.
-    `ahead` is the time of ageing in the update's covariance [days]. Rests before the date of the
-    calibration are left out, unless all are before this date. Rests of an earlier update are left
-    out if `is_for_update`. Raises RecordingError if no rest remains.
+    `ahead`: number of days of ageing that the covariance of the update will include. Rests before
+    the date of the calibration are left out, unless all are before this date. Rests of an earlier
+    update are left out if `is_for_update`. Raises RecordingError if no rest remains.
     """
     files: list[Path] = []
     for path in paths:
@@ -264,7 +264,7 @@ def series_of(
 
 
 def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
-    """Return the indices in `memory` of the state elements and of the lags of `wanted`."""
+    """Return the indices of the state elements of `wanted`, and of its lags, in `memory`."""
     try:
         logged, target = StateLayout(memory).numbers, StateLayout(wanted).numbers
         places = np.array([logged.index(number) for number in target], np.int64)
@@ -298,7 +298,7 @@ def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
 
 
 class _Geometry(NamedTuple):
-    """Thermal states, remaining shares of lag states, and u, v, x of this module's docstring."""
+    """Thermal states, remaining shares of initial lag states, and the module's u, v, x."""
 
     states: Floats
     shares: Floats
@@ -321,8 +321,8 @@ def _uncertainty(
     weight, unknown = at.states[:, WEIGHT], at.states[:, UNKNOWN]
     regimes = np.array([1.0 - weight, weight])
     unexplained = correction.curves.unexplained(at.states[:, BOARD])
-    # The ageing model has separate terms for the residual sd and the lack of fit: subtract the
-    # variances of both from `slow`, in an unknown regime those of the static and dynamic sets.
+    # The ageing model has separate terms for the residual sd and the lack of fit: subtract both
+    # variances from `slow`, which in an unknown regime has those of the static and dynamic sets.
     of_sets = regimes + unknown * regimes[::-1]
     slow -= (at.v.T**2 * (of_sets[:, np.newaxis] * unexplained).sum(axis=0)).sum(axis=0)
     residual = [[a.residual_sd_m_s2**2 for a in part.axes()] for part in calibration.regime_sets()]
@@ -331,7 +331,7 @@ def _uncertainty(
 
 
 def _variance_along(correction: Correction, slow: SlowUncertainty, at: _Geometry) -> Floats:
-    """Return the variance of |f| due to `slow`, without the noise of a sample, (n,)."""
+    """Return the variance of |f| from `slow` and all else but the noise of a sample, (n,)."""
     columns, x = at.states.T, at.x.T
     line = list(correction.line(columns, columns, slow.at(columns, at.shares.T), 0.0))
     if correction.of_force is None:

@@ -29,9 +29,9 @@ from .series import RestSeries, last_rest, valid_since
 
 #: Conclusions that `--allow` excludes: gravity is not as stated; the rests are of another unit.
 OVERRIDES = ('gravity', 'unit')
-#: Limits of the RMS of |f| - g over the rests of a start: relative to gravity (1 mg, as after a
-#: shock), and in claimed sd (30, some milli-g for a poor sensor). Rests with an RMS above both
-#: limits are taken for rests of another unit.
+#: The rests of a node start are taken for those of another unit if their RMS of |f| - g exceeds
+#: this fraction of gravity (1 mg, as after a shock) and this number of claimed sds (some milli-g
+#: for a poor sensor).
 _LARGEST_PART, _LARGEST_SIGMAS = 1e-3, 30.0
 
 
@@ -146,7 +146,7 @@ def update(
     determined, by_axis = _axis_changes(used, calibration, model, solution, ageing)
     judged = _judged(used, model, solution, determined)
     shift, kept = solution.shift * determined, solution.shift * ~determined
-    # Parameters that are not updated keep the estimated shift as an error: add its square.
+    # The estimated shift of a parameter that is not updated is an error: add its square.
     covariance = solution.posterior + solution.future + np.outer(kept, kept)
     turn_on = float(np.hypot(ageing.turn_on, ageing.rest))
     new = _shifted(calibration, shift, covariance)
@@ -242,7 +242,7 @@ def _axis_changes(
 
 
 def _judged(series: RestSeries, model: Model, solution: Solution, determined: Bools) -> Judged:
-    """Score updates by earlier rests on each day (if under 5 days, on each node start)."""
+    """For each day (if under 5: node start) score the update by rests of earlier starts."""
     over, labels = 'days', series.day
     if len(np.unique(labels)) < 5:
         over, labels = 'starts', series.start
@@ -275,7 +275,7 @@ def _gravity_part(series: RestSeries, solution: Solution) -> Floats:
 
 
 def refuse_another_unit(result: Update) -> None:
-    """Raise FitError if a start's RMS of |f| - g exceeds 1 mg and 30 claimed sds."""
+    """Raise FitError if the RMS of |f| - g at a node start exceeds 1 mg and 30 claimed sds."""
     series = result.series
     residual = series.residual - _gravity_part(series, result.solution)
     rms, claim = (np.sqrt(means_by(series.start, part**2)) for part in (residual, series.claim))

@@ -3,11 +3,11 @@
 """
 Owns the drift watch: comparison of ``|f| - g`` in a rest log with the claimed sd, and a forecast.
 
-A unit is within its claim while the RMS of its errors along gravity, over attitudes and starts, is
-at most `LIMIT` times the sd that its calibration claims for these errors. The verdict follows from
-the rests of the last week and from the error at the last rest by the ageing model. The forecast is
-the distribution of the time at which the RMS first exceeds the limit, for random walks of bias and
-scale that begin at the present estimate and have the variances estimated from the log.
+A unit is within its claim while the RMS of its errors along gravity, over attitudes and node
+starts, is at most `LIMIT` times the sd that its calibration claims for them. The verdict follows
+from the rests of the last week and the error at the last rest by the ageing model. The forecast is
+the distribution of the time at which this RMS first exceeds the limit, for random walks of bias
+and scale that begin at the present estimate and have the variances estimated from the log.
 """
 
 from collections.abc import Sequence
@@ -24,8 +24,8 @@ from .update import Update, update
 
 #: Largest RMS error that agrees with the claim, in claimed standard deviations.
 LIMIT = 2.0
-#: Number of days whose RMS decides the verdict: long enough to average the scatter of single
-#: starts, and far shorter than the time in which a unit drifts to the limit.
+#: Number of days whose RMS of |f| - g decides the verdict: enough to average the scatter of node
+#: starts, and far less than the time in which a unit drifts to the limit.
 _WINDOW_DAYS = 7
 #: Smallest number of starts of the node whose attitudes the forecast uses.
 _LEAST_STARTS = 10
@@ -49,7 +49,7 @@ class Row:
 
     @property
     def is_within(self) -> bool:
-        """Whether the RMS is at most the limit: the tolerance, or `LIMIT` times the claimed sd."""
+        """Whether the RMS of |f| - g is at most the tolerance, or `LIMIT` times the claimed sd."""
         return self.rms <= self.limit
 
 
@@ -142,9 +142,9 @@ def watch(series: RestSeries, calibration: Calibration, tolerance: float | None 
         ageing = updated.ageing
         forecast, interval = _forecasts(updated, tolerance)
     is_out, is_row_out = recent > 1.0, np.array([not row.is_within for row in days])
-    # The RMS of a week responds late to a change. If the error by the ageing model is above the
-    # limit, one day above the limit suffices for 'outside its claim'; if that error is within the
-    # limit, two days within the limit suffice for 'within its claim'.
+    # The RMS of |f| - g over a week responds late to a change. If the error by the ageing model is
+    # above the limit, a last day above the limit suffices for 'outside its claim'; if the model's
+    # error is within the limit, two last days within the limit suffice for 'within its claim'.
     is_error_out = bool(forecast) and forecast[1] == 0.0
     is_out[-1] &= is_error_out or is_row_out[-2:].any()
     is_out[-1] |= is_error_out and is_row_out[-1]
@@ -156,8 +156,8 @@ def watch(series: RestSeries, calibration: Calibration, tolerance: float | None 
         outside_since = next((row.name for row in window if not row.is_within), window[-1].name)
         forecast = ()
     elif (recent > 1.0).any():
-        # The week above the limit is not the last one, or the last two days are within the limit:
-        # a day follows the week's last day above the limit.
+        # The last day above the limit is followed by another day, because either a later week or
+        # the last two days are within the limit.
         until = int(np.flatnonzero(recent > 1.0)[-1])
         inside_since = days[int(np.flatnonzero(is_row_out[: until + 1])[-1]) + 1].name
     periods = _rows(series, firsts, ordered[::together].tolist(), tolerance)
@@ -170,7 +170,7 @@ def watch(series: RestSeries, calibration: Calibration, tolerance: float | None 
 
 def _smoothed(day: Ints, ratio: Floats) -> tuple[Ints, Floats]:
     """
-    Return the index of the first day, and the robust RMS, of the week that ends on each day.
+    Return, for the week that ends on each day, the index of its first day and its RMS of `ratio`.
 
     If a week has only one day with rests, the preceding day with rests is added. The largest daily
     RMS of a week, perhaps of a disturbed day, is replaced by the second largest.
@@ -202,7 +202,7 @@ def _forecasts(
     of_parameters, of_levels = np.split(root, [recent.by_parameter.shape[1]], axis=1)
     walk = of_levels * np.repeat([ageing.bias, ageing.scale], 3)
     bias, scale = (float((part**2).sum()) for part in np.split(walk, 2, axis=1))
-    # The offsets of the starts add to the error, so their variance is subtracted from the square
+    # Bias offsets of node starts add to the error, so their variance is subtracted from the square
     # of the limit. After a disturbance the ageing model may overestimate the offsets' variance:
     # use the variance of |f| - g at the recent rests instead, if this variance is smaller.
     scatter = ageing.turn_on**2 * float((of_levels[:, :3] ** 2).sum()) + ageing.rest**2
@@ -271,8 +271,8 @@ def passage(
         error = error + (speed * np.sqrt(step))[:, np.newaxis] * moved
         size = np.sqrt(np.einsum('ij,ij->i', error, error))
         # A Brownian bridge with the distances a and b from the bound at two times crosses the
-        # bound between the times with the probability exp(-2 a b / variance); the variance is
-        # that of the step's component along the error.
+        # bound between the times with the probability exp(-2 a b / variance); variance: of the
+        # walk's change between the times, along the error vector.
         onto_walk = error @ walk
         along = np.einsum('ij,ij->i', onto_walk, onto_walk) * speed**2 * step
         product = left * np.maximum(bound - size, 0.0) * size**2

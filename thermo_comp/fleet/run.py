@@ -239,7 +239,7 @@ class Results:
         return row
 
     def store(self, unit: FoundUnit, options: FleetOptions, outcome: UnitOutcome) -> Row:
-        """Store an outcome, return its row; if the fit failed, an earlier calibration stays."""
+        """Store a unit's outcome, return its table row; a failed fit keeps an old calibration."""
         folder = self.folder_of(unit.name, options.fit.prior)
         row = outcome.row
         if (folder / CALIBRATION).is_file() and not (outcome.calibration and outcome.is_final):

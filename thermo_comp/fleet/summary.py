@@ -23,8 +23,8 @@ _FALSE_ALARMS = 0.05
 _UNITS_NEEDED = 8
 # Efficiency of the median absolute deviation relative to the sample sd, for a normal distribution.
 _MAD_EFFICIENCY = 0.37
-# Largest ratio of a value's sd (by the unit's fit) to the spread over the units at which the data
-# determine the value; with a larger ratio the value is about the prior mean of the fit.
+# The data determine a unit's value if its sd by the fit is at most this multiple of the spread
+# over the units; a value of larger sd is about the prior mean of the fit.
 _LARGEST_SD = 5.0
 # Residuals [ug] and noises [ug/sqrt(Hz)] are raised to this limit before taking logarithms.
 _LEAST = 1e-12
@@ -48,7 +48,7 @@ class Spread(NamedTuple):
     values: Floats
     is_counted: Bools
     middle: float
-    sd: float  # 1.4826 times the median absolute deviation (for logarithms, times `middle`)
+    sd: float  # 1.4826 times the median absolute deviation; of logarithms, also times `middle`
     z: Floats
     limit: float = float('inf')  # smallest |z| of an outlier; infinite below eight units
 
@@ -176,7 +176,7 @@ def _determined(quantity: TableColumn, values: Floats, own_sd: Floats) -> Bools:
 
 
 def _deviations(quantity: TableColumn, values: Floats, middle: float) -> Floats:
-    """Return the deviations of values, ppm or logarithms (`TableColumn.by`) from the median."""
+    """Return deviations from the median: of values, in ppm, or of logarithms (`quantity.by`)."""
     if quantity.by == 'ppm':
         return (values / middle - 1.0) * 1e6
     if quantity.by == 'logarithm':

@@ -139,7 +139,7 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
 def _fitted(
     row: dict[str, Cell], bags: Sequence[ReducedBag], how: FitOptions, has_page: bool
 ) -> tuple[dict[str, Cell], str, str]:
-    """Fit bags; return the complete row, the texts of calibration file and certificate (or '')."""
+    """Fit bags; return the table row, the text of the calibration file, the certificate or ''."""
     from ..report.evidence import evidence_of_fit
     from ..report.page import render_report
 

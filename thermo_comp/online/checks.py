@@ -28,8 +28,8 @@ STUCK_SAMPLES: Final = 50
 #: change in a turn by 1.2 degrees, above the noise and the steps of a converter at rest.
 MOTION: Final = 0.2
 #: An axis that repeats its reading at rest is stuck if the other axes change `NOISY_CHANGES` times
-#: by `NOISY_SDS` sd of their noise from sample to sample. Its own noise must have an sd of at
-#: least `VISIBLE_SDS` steps of the converter: smaller noise would not change the reading.
+#: by `NOISY_SDS` sd of their noise from sample to sample. The noise of the stuck axis must have
+#: an sd of `VISIBLE_SDS` converter steps or more: smaller noise might not change the reading.
 NOISY_CHANGES: Final = 20
 NOISY_SDS: Final = 1.5
 VISIBLE_SDS: Final = 2.0
@@ -75,10 +75,10 @@ class StuckCheck:
     """
     Counts consecutive equal readings of each axis; `timeout_s` [s]: 0 = nothing is stuck.
 
-    After the time-out samples are stuck if all three axes repeat their readings. One axis alone is
-    stuck if it repeats its reading while both other axes change by `motion` [input unit], or while
-    they show noise and this axis would show noise, too. `noise_sds`: sd of the noise of each axis
-    [input unit]. An axis whose noise is below the converter's step may repeat its reading.
+    Samples are stuck if all three axes repeat their readings for over `timeout_s`. One axis alone
+    is stuck if it repeats its reading as long while both other axes change by over `motion` [input
+    unit], or while the other axes show noise and the sd of this axis' noise is two converter steps
+    or more. `noise_sds`: sd of the noise of each axis [input unit].
     """
 
     def __init__(self, timeout_s: float, motion: float, noise_sds: Sequence[float]) -> None:
@@ -197,7 +197,7 @@ class StuckCheck:
 
 
 def _begun(sample: tuple[float, float, float, int]) -> tuple[Run, ...]:
-    """Return the runs of equal readings of the three axes that begin with a sample."""
+    """Return a new run of equal readings for each of the three axes, begun by `sample`."""
     return ((sample, 0, 0.0, 0, math.inf),) * 3
 
 
@@ -220,7 +220,7 @@ class RateCheck:
         return excess if excess > RATE_TOLERANCE else 0.0
 
     def update(self, n_seen: int, stamp_ns: int) -> None:
-        """Update the rate with the number of samples so far and the latest sample's stamp [ns]."""
+        """Update the sample rate by the number of samples so far and the latest stamp [ns]."""
         last = self._last
         self._last = (n_seen, stamp_ns)
         if last is None:
@@ -228,8 +228,8 @@ class RateCheck:
             return
         n, dt = n_seen - last[0], (stamp_ns - last[1]) * 1e-9
         level = self._level + n - LARGEST_RATE * dt / self._cycle_s
-        # Excess samples are counted up to twice the allowance, so that the alarm ends soon after a
-        # long excess.
+        # Count at most twice the allowed number of excess samples, so that the alarm ends soon
+        # after a long excess.
         self._level = min(max(level, 0.0), 2.0 * self._allowance)
         self.is_too_fast = self._counts_cycles and self._level > self._allowance
         n, dt = n_seen - self._window[0], (stamp_ns - self._window[1]) * 1e-9
@@ -252,7 +252,7 @@ class GravityCheck:
     def __init__(self, gravity: float, tolerance: float = 0.0) -> None:
         self.gravity = gravity
         self._tolerance = tolerance or math.inf
-        # Whether |f| of the last windows refutes the calibration.
+        # Whether |f| in the last still windows refutes the calibration.
         self.is_refuted = False
         self._n_agreeing = 0
         self._is_against = False
@@ -291,7 +291,7 @@ class GravityCheck:
     def _watch_step(
         self, stamp_ns: int, force: Sequence[float], covariance: Sequence[float], noise: float
     ) -> None:
-        """Refute the calibration if |f| steps, at rest, beyond the tolerance for `STEP_NS`."""
+        """Refute the calibration if |f| at rest, after a step, misses gravity for `STEP_NS`."""
         rests = self.result and self.result.is_still and self._last_mean
         if self.is_refuted or not (self._off or rests):
             self._off, self._is_resting = [], False

@@ -203,7 +203,7 @@ class Compensator:
         fresh_ns = thermal.fresh_until_ns
         if stamp_ns > fresh_ns:
             thermal.count_unmeasured(1)
-            # Each sample is counted as dropped here until a board temperature arrives.
+            # Until a board temperature arrives, every sample is counted as dropped by this branch.
             self.event_ns = EVER_NS
             self.last_ns = stamp_ns
             return None
@@ -361,7 +361,7 @@ class Compensator:
 
     @property
     def scale_sd(self) -> tuple[float, ...]:
-        """Sd of each axis' relative scale in the present segment; () before the first segment."""
+        """Relative sd of each scale factor in the present segment; () before the first segment."""
         line = self._segment[1]
         return tuple(math.sqrt(max(0.0, line[place])) for place in SCALE_VARIANCES if line)
 

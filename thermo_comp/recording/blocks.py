@@ -269,7 +269,7 @@ def with_stamps(block: Block, last_ns: int) -> tuple[Block, int]:
 
 
 def unstamped(stamp_ns: int) -> str:
-    """Return the message for samples that all have the same stamp."""
+    """Return the warning that all samples have the same stamp."""
     return f'all samples are stamped {stamp_ns * 1e-9:g} s: the driver does not stamp them'
 
 

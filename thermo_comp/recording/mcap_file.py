@@ -3,8 +3,8 @@
 """
 Owns the reading of an MCAP file chunk by chunk, in bounded memory.
 
-The summary of a complete file lists the spans that hold messages. A file without a usable summary,
-or cut off anywhere, is read record by record, and its messages are counted. The `mcap` library
+The summary of a complete file lists its chunks of messages. A file without a usable summary, or
+cut off anywhere, is read record by record, and its messages are counted. The `mcap` library
 reads all other records.
 """
 
@@ -248,7 +248,7 @@ class McapFile(BagFile):
 
 
 def _in_order(pieces: Iterable[tuple[int, Messages, int | None]]) -> Iterator[Messages]:
-    """Merge pieces by log time; a piece: number, messages, first log time of the next piece."""
+    """Merge pieces by log time; a piece: place in file, messages, next piece's first log time."""
     # Messages before the first log time of the next piece are final; later messages are held.
     held: dict[int, Messages] = {}
     for row, piece, next_ns in pieces:

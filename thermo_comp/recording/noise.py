@@ -87,9 +87,9 @@ def spread_of_variances(cells: Cells, plausible: Bools, level: Floats) -> Floats
 def roughest_at_rest(cells: Cells, quiet: Bools, is_coloured: Bools, ratio: float) -> Floats:
     """
     Return the largest roughness of a cell at rest, per axis; infinite for white noise. `ratio`:
-    largest variance at rest / noise variance. Coloured noise hides a step in mean and variance,
-    but not in the changes from sample to sample. The roughness is taken as chi-square distributed,
-    with the degrees of freedom that give the ratio of its tenth percentile to its median.
+    largest variance at rest / noise variance. In coloured noise a step does not show in mean and
+    variance, but in the changes from sample to sample. The roughness is taken as chi-square
+    distributed, with degrees of freedom by the ratio of its tenth percentile to its median.
     """
     result = np.full(3, np.inf)
     for axis in np.flatnonzero(is_coloured) if quiet.any() else ():

@@ -4,11 +4,11 @@
 Owns still intervals: sums samples in short cells (count, mean, variance) and finds still cells.
 
 Two tests are relative to the noise of the bag's quiet cells: the variance inside a cell
-(vibration, handling) and the step between adjacent cells (a turn, a knock). A step starts a new
-interval, because a tilt by a microradian already changes a sample by a micro-g. Temperature also
-tilts a unit at rest, so a steady change over several cells of at most 50 micro-g/s is a drift and
-not a step. Two tests have absolute limits, because the quietest tenth of a flight is not a rest:
-at rest the sd of samples is below `still_sd`, and the angular rate within 1 deg/s of its median.
+(vibration, handling) and the step of the mean between adjacent cells (a turn, a knock). A step
+starts a new interval, because a tilt by a microradian changes a sample by a micro-g. Temperature
+tilts a unit at rest, too: a steady change of the mean by at most 50 micro-g/s in several cells is
+a drift, no step. Two tests have absolute limits, as the quietest tenth of a flight is not a rest:
+at rest the sd of samples is below `still_sd`, the angular rate within 1 deg/s of its median.
 """
 
 from collections.abc import Sequence
@@ -90,7 +90,7 @@ class Cells:
 class CellAccumulator:
     """
     Reduces streamed samples to cells of `cell_s`, or of `least` samples if these last longer.
-    A whole number of cells fills a window of `window_s`, or up to 60 windows if cells are longer.
+    A whole number of cells fills a window of `window_s` or, if cells last longer, 2 to 60 windows.
     """
 
     def __init__(
@@ -164,7 +164,7 @@ class CellAccumulator:
     def cells(self) -> Cells:
         """Return all cells so far, including the unfinished last cell."""
         sums = np.concatenate(self._sums)
-        self._sums = [sums]  # later calls then join only new sums
+        self._sums = [sums]  # later calls then only add the rows of new cells
         index, count = sums[:, 0].astype(np.int64), sums[:, 1]
         total, square = np.split(sums[:, 3:-6], 2, axis=1)
         n_free = np.maximum(count[:, None] - 1.0, 1.0)
@@ -200,8 +200,8 @@ class CellAccumulator:
         step, between = float(np.median(steps)), 0.0
         gaps = steps[steps > 10.0 * step]
         if gaps.sum() > 0.5 * steps.sum():
-            # A driver that polls a buffer sends bursts at a constant interval below 5 s: use cells
-            # of two bursts. Pauses between positions held by hand are irregular or above 5 s.
+            # A driver that polls a buffer sends bursts at a constant interval below 5 s: a cell is
+            # two intervals or longer. Pauses between hand-held positions are irregular or longer.
             usual = float(np.median(gaps))
             is_regular = np.mean(np.abs(gaps - usual) < 0.2 * usual) > 0.9
             if is_regular and usual < 5e9:
@@ -248,7 +248,7 @@ def widened(full_scale: float, samples: Floats) -> float:
 
 
 def _part_of(window_s: float, least: float) -> float:
-    """Return a cell length [ns] such that whole cells fill 1 to 60 windows, or else `least`."""
+    """Return a cell length [ns] of which a multiple is 1 to 60 windows, or else `least`."""
     for stretch in STRETCHES:
         n_cells = int(stretch * window_s * 1e9 / least * (1.0 + 1e-6))
         if n_cells:
@@ -265,7 +265,7 @@ def _quantum_of(samples: Floats, few: list[Floats]) -> Floats:
     for axis in range(3):
         changes = np.abs(np.diff(samples[:, axis]))
         changes = np.sort(np.concatenate((few[axis], changes[changes > 0.0])))
-        # One or two changes of samples may be turns of the unit: wait for further changes.
+        # One or two changes from sample to sample may be turns of the unit: wait for more changes.
         few[axis] = changes[: 3 * (len(changes) < 3)]
         if len(changes) < 3:
             continue

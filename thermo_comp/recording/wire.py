@@ -3,7 +3,7 @@
 """
 Owns the serialized layout of stamped messages: decodes batches to blocks, and encodes columns.
 
-All three input types are a std_msgs/Header followed by float64 numbers alone. In CDR::
+Vector3Stamped, Imu and Temperature consist of a std_msgs/Header and float64 numbers. In CDR::
 
     0   encapsulation: 00, endianness (0 big, 1 little), options
     4   stamp: int32 seconds, uint32 nanoseconds

@@ -33,9 +33,9 @@ from .waitloop import WaitLoop
 
 # Time without samples until waiting readings are used [s]; Fast DDS may deliver samples 3 s late.
 IDLE_S = 5.0
-#: Readings stamped later than the samples by more than this time use another clock [s].
+#: A temperature reading stamped later than the samples by over this time [s] has another clock.
 AHEAD_S = 5.0
-#: Samples have stopped if none arrives for the larger of two times [cycles], [s].
+#: Samples have stopped if none arrives for this number of conversion cycles and this time [s].
 SILENT_CYCLES, SILENT_S = 5.0, 0.5
 #: Largest error of |f| at rest without a warning, in standard deviations of the error.
 GRAVITY_SIGMAS = 5.0
@@ -338,5 +338,5 @@ def _all_well(loaded: LoadedCalibration, status: CompensatorStatus) -> str:
         reference = loaded.calibration.reference_temperature_c
         return f'constants of {reference:g} degC, not corrected for temperature'
     if status.regime == Regime.UNKNOWN:
-        return 'regime not known yet, the static set applies'
+        return 'regime not known yet, the static coefficients apply'
     return f'{status.regime.name.lower()} regime'

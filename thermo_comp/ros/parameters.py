@@ -275,7 +275,7 @@ class ParameterRequests:
                 future = (self._slow if waits else self._quick).submit(self._read, group)
                 future.add_done_callback(lambda done: self._loop.call_soon(partial(end, done)))
             return
-        # At most `PARAMETERS_LIMIT` results: writing one takes as long as reading a parameter.
+        # Send at most `PARAMETERS_LIMIT` results: each takes as long as reading a parameter.
         results += [_refusal(reason)] * min(len(groups), PARAMETERS_LIMIT)
         respond()
 
@@ -318,7 +318,7 @@ def _reply(service: Service, request: Any, answer: Callable[[Any], None]) -> Non
 def read_parameter(message: ParameterMessage) -> Parameter:
     """Read a received parameter; integers become floats if the parameter is a float."""
     if not message.name:
-        # rclpy would treat the empty name as declared.
+        # rclpy would treat a parameter with an empty name as declared.
         raise ParameterError('a parameter without a name')
     try:
         given = Parameter.from_parameter_msg(message)

@@ -66,7 +66,7 @@ class SignalWatch:
         os.close(self._reader)
 
     def on_signal(self, stop: Callable[[], None]) -> None:
-        """Set the function that a signal calls; a signal that has arrived calls it at once."""
+        """Set the function that a signal calls; call it at once if a signal came before."""
         self._stop = stop
         if self._is_over:
             stop()

@@ -4,7 +4,7 @@
 Owns the processing of samples in the node in order of arrival, whenever the loop wakes up.
 
 Messages do not identify their publisher. While several publishers may send on a topic, the topic's
-messages are dropped. The first batch after a publisher has left is also dropped.
+messages are dropped, as is the first batch of messages after a publisher has left.
 """
 
 from bisect import bisect_left, bisect_right
@@ -181,7 +181,7 @@ class Relay:
             self.gather()
 
     def gather(self) -> None:
-        """Sum the samples that wait for the rest log."""
+        """Sum the samples since the last call, for the rest log."""
         if self.rests is not None and self.waiting:
             messages, self.waiting = self.waiting, []
             self.rests.gather(messages, self.running.loaded, self.running.compensator)
@@ -217,7 +217,7 @@ class Relay:
                 self._readings.append((received, (name, *reading)))
 
     def _relay_with_readings(self, messages: list[bytes], received_ns: list[int]) -> list[bytes]:
-        """Relay samples and readings by arrival; return the samples after the last reading."""
+        """Relay samples and readings as they arrived; return samples after the last reading."""
         start, push = 0, self.running.compensator.push
         self._readings.sort(key=itemgetter(0))
         n = bisect_right(self._readings, received_ns[-1], key=itemgetter(0))
@@ -259,7 +259,7 @@ class Relay:
             self.traffic.n_flags += 1
 
     def _count_unpublished(self) -> None:
-        """Count a message that the middleware refused; raise after the shutdown."""
+        """Count a message that the middleware refused; raise an error if ROS has shut down."""
         if not self._loop.node.context.ok():
             raise ExternalShutdownException
         self.traffic.n_unpublished += 1
