@@ -60,7 +60,7 @@ RECORDED = ('sample-bags', 'no-case', 'board-twice', 'cats')
 @dataclass(frozen=True)
 class Corrected:
     """
-    Corrected means over 60 s of a bag.
+    Means over 60 s of a bag's corrected samples.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def fitted(
 
 
 def chosen_by(calibration: thermo_comp.Calibration) -> str:
-    """List the groups of a calibration; groups of the response with their number of columns."""
+    """List the groups of a calibration; add its number of columns to a group of the response."""
     columns = Counter(term.group for term in calibration.response)
     others = {entry.group for entry in calibration.evidence} - set(columns)
     return ' '.join([*sorted(others), *(f'{group}:{n}' for group, n in columns.items())])
@@ -239,7 +239,7 @@ def without_constants(calibration: thermo_comp.Calibration) -> thermo_comp.Calib
 def scored(
     study: Study, model: thermo_comp.Calibration, tests: dict[str, list[Minutes]]
 ) -> dict[str, Score]:
-    """Return the score of a calibration for each set of held-out bags."""
+    """Return the scores (errors and ratios) of a calibration by set of held-out bags."""
     if study.bound is not None:
         return {'': bias_score(model, study)}
     if study.is_drift:
@@ -259,7 +259,7 @@ def run(
     earlier: Mapping[tuple[str, int], Mapping[str, Score]],
 ) -> list[Result]:
     """
-    Fit all models to a study's bags, and score them on held-out bags.
+    Fit all models to a study's bags, and compute their errors on held-out bags.
 
     Parameters
     ----------
@@ -362,7 +362,7 @@ HEAD = (
 
 
 def pair(score: Score | None) -> str:
-    """Format the errors of the norm and of the vector [ug] of a model."""
+    """Format a model's error of the norm and of the vector [ug]."""
     if score is None:
         return '-'
     return ' / '.join('-' if np.isnan(x) else f'{x:.3g}' for x in (score.norm, score.vector))

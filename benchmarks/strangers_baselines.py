@@ -39,7 +39,7 @@ class Minutes:
 
 
 def slots(bag: Bag) -> tuple[Ints, Ints]:
-    """Return the first row of each whole window, and the number of rows of each window."""
+    """Return first row and number of rows of windows of 60 s with at least 95 % of their rows."""
     number = np.floor((bag.time_s - bag.time_s[0]) / WINDOW_S)
     first = np.flatnonzero(np.diff(number, prepend=-1.0))
     size = np.diff(first, append=len(number))
@@ -66,7 +66,7 @@ def minutes(bag: Bag) -> Minutes:
 
 
 def _curved(p: Floats, order: int, samples: Floats, board: Floats) -> Floats:
-    """Correct samples in g; p: bias, scale, misalignment, then curves of bias and of scale."""
+    """Correct samples in g; p: bias, scale, misalignment, then coefficients of both curves."""
     t = ((board - REFERENCE_C) / SPAN_K)[:, None]
     bias, scale = p[:3], 1.0 + p[3:6]
     if order:

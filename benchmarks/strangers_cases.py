@@ -116,7 +116,7 @@ FULL_SCALE = {'full_scale': 8388607.0}
 
 
 def one_test(bags: tuple[Bag, ...]) -> dict[str, tuple[Bag, ...]]:
-    """Return bags as the only set of held-out bags of a study."""
+    """Return bags as the only set of held-out bags, without a name."""
     return {'': bags}
 
 
@@ -208,7 +208,7 @@ def mems(number: int) -> Iterator[Study]:
 def sessions(number: int) -> Iterator[Study]:
     """
     Turn a MEMS unit by hand every 8 min in two recordings, each with a random bias offset of
-    0.3 mg. Fit the first recording, both, and the second with the first fit as prior.
+    0.3 mg. Fit the first recording, both recordings, and the second with the first fit as prior.
     """
     rng, hold_s, rate_hz = rng_of('sessions', number), 480.0, 10.0
     unit, up = consumer_grade(rng), spread(12, rng)
@@ -247,7 +247,7 @@ def kink(number: int) -> Iterator[Study]:
 
 
 def gradient(number: int) -> Iterator[Study]:
-    """Add a bias proportional to case less board temperature; bags of 40 min, fast ramps."""
+    """Add a bias proportional to case less board temperature; record fast ramps of 40 min."""
     rng = rng_of('gradient', number)
     unit = navigation(
         rng,
@@ -340,7 +340,7 @@ def coarse_thermometer(number: int) -> Iterator[Study]:
 
 
 def slow_drift(number: int) -> Iterator[Study]:
-    """Add a random walk of the bias, slow tilts, or a bias of 1 mg (1 sd) that decays."""
+    """Add a random walk of the bias, slow tilts of the support, or a decaying bias (sd 1 mg)."""
     for kind, grade, full_scale, rate_hz, ways in (
         ('bias', navigation, 8388607.0, 0.5, (HALF, HELD)),
         ('support', navigation, 8388607.0, 0.5, (HALF, HELD)),
