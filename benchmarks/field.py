@@ -87,8 +87,8 @@ def worse(after: list, new: Calibration, kalman: Floats) -> tuple[bool, bool]:
     Return whether the updated calibration has a larger RMS of |f| - g on the rests of a day than
     the laboratory's calibration, and whether the Kalman filter has.
 
-    An RMS is larger if the difference exceeds the standard error of an RMS over n turn-ons, which
-    is the claimed sd / sqrt(2 n).
+    An RMS counts as larger if it exceeds the laboratory's by more than the standard error of an
+    RMS over n turn-ons, the claimed sd / sqrt(2 n).
     """
     old, updated = (series_of(after, given) for given in (LABORATORY, new))
     counts = np.array([rest.mean for _, rest in after]) / K

@@ -36,7 +36,7 @@ def leaves(probe: RestSeries, process: Process, bound: float, rng: np.random.Gen
     """Return for 200 simulated futures the time [days] at which the RMS exceeds `bound`."""
     size = np.repeat([process.bias, process.scale * G], 3) / np.sqrt(3.0)
     error, levels = np.full(N_FUTURES, np.inf), np.zeros((N_FUTURES, 6))
-    # The norm of `root @ (1, levels)` is the RMS of |f| - g over the rests of `probe`.
+    # `levels`: random walks of bias and scale; |root @ (1, levels)| is the RMS of |f| - g.
     joined = np.column_stack((probe.residual, probe.by_level)) / np.sqrt(len(probe))
     root = np.asarray(np.linalg.qr(joined, mode='r'))
     for step in range(3 * 3650):

@@ -12,10 +12,10 @@ Units and recordings come from `strangers_units.py` and `strangers_cases.py`, wh
 with the package; the package is used only through `thermo_comp.fit` and `Calibration.correct`.
 Errors are those on held-out recordings, unless the row states otherwise. An error is the RMS of
 means over 60 s in ug: of the norm, ``|f| - g``, and of the vector against the true force. A ratio
-is the RMS of error / claimed sd. Figures are RMS over the units. MISS marks a limit of
-`strangers_limits.py` that a row violates; the exit code is then 1. The baselines fitted by the
-package take most of the time; ``--baselines strangers.json`` reads the scores of the baselines
-from an earlier run.
+is the RMS of error / claimed sd. The table has the RMS of each figure over the units. MISS marks a
+limit of `strangers_limits.py` that a row violates; the exit code is then 1. The baselines fitted
+by the package take most of the time; ``--baselines strangers.json`` reads the scores of the
+baselines from an earlier run.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ PACKAGE: dict[str, dict[str, Any]] = {
     'sets': {'groups': ('curve', 'set')},
 }
 BASELINES = ('constants', 'cubic', 'golovach', 'sets')
-#: A fit passes if at least this share of the minutes is corrected completely; below 1, because
-#: samples before the first reading of a thermometer are not corrected.
+#: Least share of the minutes that a fit must correct completely; below 1, because samples before
+#: the first reading of a thermometer are not corrected.
 LEAST_PUBLISHED = 0.98
 #: Cases of recorded bags, each with a single unit.
 RECORDED = ('sample-bags', 'no-case', 'board-twice', 'cats')
@@ -110,8 +110,8 @@ def corrected(
     out = calibration.correct(bag.time_s, bag.samples, config=config, **given)
     first, size = slots(bag)
     force, claim = means(out.specific_force, first, size), means(out.covariance, first, size)
-    # The published covariance is that of a sample. A mean over a minute reduces white noise and
-    # the rounding of the converter; the other errors are equal in all samples of a minute.
+    # The published covariance is that of one sample. A mean over a minute reduces white noise and
+    # rounding errors of the converter; the other errors are equal in all samples of a minute.
     density = np.square(calibration.noise_density_m_s2_sqrt_hz)
     scale = np.array([axis.scale_factor for axis in calibration.axes])
     rounding = 1.0 / 6.0 if calibration.unit.input == 'counts' else 0.0

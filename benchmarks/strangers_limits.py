@@ -73,13 +73,13 @@ class Result:
 @dataclass(frozen=True)
 class Limit:
     """
-    The limits of a row. By default the error may be 1.05 times the error of the best baseline,
-    and the RMS of error / claimed sd may be 1.5.
+    The limits of a row. By default the error may be up to 1.05 times that of the best baseline,
+    and the RMS of error / claimed sd up to 1.5.
 
     Parameters
     ----------
     norm, vector : float
-        Largest errors [ug].
+        Largest errors of ``|f|`` and of the vector [ug].
     best : float
         Largest error / smallest error of the baselines, for the norm and for the vector.
     low, high : float

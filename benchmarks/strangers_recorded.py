@@ -21,8 +21,8 @@ import thermo_comp
 from thermo_comp.recording.reader import read_recording
 
 ROOT = Path(__file__).resolve().parent.parent
-#: Length of the blocks into which the recording of the real unit is cut, and of the means by which
-#: rests are found [s].
+#: Length of the blocks into which the recording of the real unit is cut, and of the means whose
+#: steps separate rests [s].
 BLOCK_S, MINUTE_S = 10800.0, 60
 #: Largest change of the mean from one minute to the next at rest [m/s^2]. When the real unit was
 #: carried from one room to another its bias changed by 0.1 m/s^2 in a minute.
