@@ -33,7 +33,7 @@ LABORATORY, TOLERANCE, N_FUTURES = calibration(), 200.0 * UG, 200
 
 
 def leaves(probe: RestSeries, process: Process, bound: float, rng: np.random.Generator) -> Floats:
-    """Return for 200 simulated futures the time [days] at which the RMS exceeds `bound`."""
+    """Return the times [days] at which the RMS of |f| - g exceeds `bound` in 200 futures."""
     size = np.repeat([process.bias, process.scale * G], 3) / np.sqrt(3.0)
     error, levels = np.full(N_FUTURES, np.inf), np.zeros((N_FUTURES, 6))
     # `levels`: random walks of bias and scale; |root @ (1, levels)| is the RMS of |f| - g.

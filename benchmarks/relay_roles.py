@@ -34,7 +34,7 @@ SINK_REST_S = 2e-3
 
 COUNTS = struct.Struct('<4siII7s5x3d')
 ENCAPSULATION = b'\0\1\0\0'
-#: frame_id of samples that the sink does not count, and counts; relays copy it to the Imu.
+#: frame_id of warm-up samples and of samples that the sink counts; relays copy it to the Imu.
 WARM_UP, SAMPLE = b'warmup\0', b'sensor\0'
 
 
@@ -89,7 +89,7 @@ def _source(arguments: argparse.Namespace) -> None:
             if wait > 0:
                 time.sleep(wait * 1e-9)
 
-    # Publish samples that the sink does not count until the sink has received an Imu message.
+    # Publish warm-up samples, which the sink does not count, until it has received a message.
     run(sys.maxsize, WARM_UP, lambda: bool(select.select([sys.stdin], [], [], 0)[0]))
     time.sleep(0.5)
     print('start', flush=True)

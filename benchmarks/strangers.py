@@ -95,7 +95,7 @@ def fitted(
 
 
 def chosen_by(calibration: thermo_comp.Calibration) -> str:
-    """List the groups of a calibration; add its number of columns to a group of the response."""
+    """List a calibration's groups of columns; response groups with their number of columns."""
     columns = Counter(term.group for term in calibration.response)
     others = {entry.group for entry in calibration.evidence} - set(columns)
     return ' '.join([*sorted(others), *(f'{group}:{n}' for group, n in columns.items())])
