@@ -74,7 +74,7 @@ class History:
 
 
 def calibration() -> Calibration:
-    """Build a calibration with the sd `PRIOR`, as from a laboratory before the ageing."""
+    """Build a calibration whose parameters have the sd `PRIOR`, as from a laboratory."""
     axis = AxisSet(
         Polynomial((0.0, K * SLOPE)), Polynomial((1.0, SCALE_SLOPE)), residual_sd_m_s2=20 * UG
     )

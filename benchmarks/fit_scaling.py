@@ -65,7 +65,7 @@ def measure(task: str, paths: list[Path]) -> dict[str, float]:
 
 
 def run_task(task: str, paths: list[Path]) -> dict[str, float]:
-    """Read the bags, or fit them, and print time and memory."""
+    """Read the bags, or fit them; return CPU time, peak memory and number of samples."""
     from thermo_comp.fitting import FitOptions, fit
     from thermo_comp.fitting.sources import fit_sources
 

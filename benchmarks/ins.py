@@ -58,7 +58,7 @@ def turned(angles: Floats) -> Floats:
 
 
 def levelled(force: Floats) -> Floats:
-    """Return the attitude, body to east-north-up, in which a mean force (..., 3) is vertical."""
+    """Return the attitude, body to east-north-up, that makes a mean force (..., 3) vertical."""
     up = force / np.linalg.norm(force, axis=-1, keepdims=True)
     east = np.array([1.0, 0.0, 0.0]) - up[..., :1] * up
     east /= np.linalg.norm(east, axis=-1, keepdims=True)

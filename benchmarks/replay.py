@@ -67,13 +67,13 @@ def write_bag(path: Path, n: int, compression: str = 'zstd') -> None:
 
 
 def read(path: Path) -> int:
-    """Read a bag to columns, block by block; return the number of samples."""
+    """Read a bag into columns, block by block; return the number of samples."""
     with open_recording(path) as reader:
         return sum(len(block) for block in reader.blocks())
 
 
 def read_and_compensate(path: Path) -> int:
-    """Read a bag to columns and correct them; return the number of samples."""
+    """Read a bag into columns and correct the samples; return the number of samples."""
     compensator = Compensator(calibration())
     with open_recording(path) as reader:
         return sum(len(process_block(compensator, block).index) for block in reader.blocks())

@@ -80,7 +80,7 @@ def seed_of(text: str) -> int:
 
 
 def unit_of(kind: str, seed: int) -> SimpleNamespace:
-    """Draw the parameters of a unit: coefficients [ug/K^n] and [ppm/K^n], time constants [s]."""
+    """Draw a unit: coefficients of bias [ug/K^n] and scale [ppm/K^n], time constants [s]."""
     draw = np.random.default_rng(seed_of(f'{kind}-{seed}'))
 
     def normal(sd: float) -> Floats:
@@ -243,7 +243,7 @@ def runs_of(
             for celsius in (board, case)
             for sd in [READING_SD * draw.standard_normal(len(read))]
         ]
-        # A sample has the stamp of the end of its cycle.
+        # The stamp of a sample is the end of its sample interval.
         stamps, read_ns = (np.rint(1e9 * (time + 0.5 * SAMPLE_S)).astype(np.int64)
                            for time in (middle, read))  # fmt: skip
         result.append(

@@ -171,8 +171,8 @@ class Soak:
         while not self.n_heard and time.monotonic() < deadline:
             self.send(self.rate // READINGS_HZ)
             time.sleep(1.0 / READINGS_HZ)
-        # Samples before discovery are lost. Wait until two diagnostics reports, at least a report
-        # period apart, state the same number of samples: then no sample is under way.
+        # Samples sent before discovery are lost. Wait until two diagnostics reports, at least a
+        # report period apart, state the same number of samples: then no sample is under way.
         self.wait_for(lambda: int(self.account.get('samples in', 0)) > 0, 'a report')
         n_in = -1
         while n_in != int(self.account['samples in']):
@@ -196,7 +196,7 @@ class Soak:
         self.client.call_async(request).add_done_callback(count)
 
     def run(self, seconds: float, paths: list[str]) -> dict[str, Any]:
-        """Publish samples for the given time; return the counts of messages."""
+        """Publish samples for `seconds`; return message counts, memory and latencies."""
         memory: list[tuple[float, float]] = []
         latency: list[tuple[float, float, float]] = []
         n_reloads = n_sent = 0

@@ -177,7 +177,7 @@ def _drift(forces: Sequence[Floats], bags: Sequence[Minutes]) -> Floats:
 
 
 def scipy_baselines(study: Study) -> dict[str, Callable[[Minutes], Floats]]:
-    """Return the two corrections that scipy fits: constants, and a cubic per axis."""
+    """Return the two corrections that scipy fits: constants alone, and with a cubic per axis."""
     bags = [minutes(bag) for bag in study.baseline_bags or study.bags]
     orders = {'constants': 0, 'cubic': 3}
     if study.is_drift:
@@ -222,8 +222,8 @@ def without_constants(calibration: thermo_comp.Calibration) -> thermo_comp.Calib
     Return a calibration in whose posterior bias, scale and misalignment have no variance.
 
     A single pose determines bias and scale to 50 mg only. The drift in a pose does not depend on
-    these constants, but the claimed variance contains ``a^2`` times the variance of the scale
-    factor, and thereby changes with the noise of the acceleration `a`.
+    bias and scale, but the claimed variance contains ``a^2`` times the variance of the scale
+    factor, and so changes with the noise of the acceleration `a`.
     """
     if calibration.posterior is None:
         return calibration

@@ -21,8 +21,8 @@ from strangers_units import GRAVITY, REFERENCE_C, Bag, Floats
 Ints = npt.NDArray[np.int64]
 
 WINDOW_S = 60.0  # length of the means whose errors are evaluated [s]
-#: Largest bias [g], relative error of the scale and misalignment [rad]. A fit without bounds to
-#: few attitudes finds scale factors that make the forces of all attitudes equal.
+#: Largest fitted bias [g], relative error of the scale and misalignment [rad]. A fit without
+#: bounds to few attitudes finds scale factors that make the forces of all attitudes equal.
 LARGEST = 0.2
 SPAN_K = (
     15.0  # temperatures are divided by this unit [K], so that their powers have equal magnitudes

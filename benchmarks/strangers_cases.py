@@ -52,7 +52,7 @@ HELD = (
 )
 FROST = program(5, 10, (12, 0.5, 60), (28, 0.8, 30))
 ROOM = program(21, 20)
-#: SHORT is from 7 to 33 degC, the programs USE of the held-out bags are from 5 to 35 degC.
+#: Program SHORT spans 7 to 33 degC, the programs USE of the held-out bags span 5 to 35 degC.
 SHORT = program(20, 20, (33, 1, 50), (7, 1, 60), (20, 1, 12))
 USE = (program(20, 20, (35, 0.7, 45), (15, 1.5, 40)), program(20, 20, (5, 1.2, 50), (24, 0.6, 40)))
 #: Programs for MEMS units: of the fit, and of the held-out bags.

@@ -330,8 +330,8 @@ def record(
     lasts_s = float(corners[-1, 0])
     grid = np.arange(-SOAK_S, lasts_s + STEP_S, STEP_S)
     A, b, h = network(unit, environment)
-    # The chamber has a constant error and a ripple, and 5400 s before the recording a temperature
-    # that differs by up to 5 K from the program's first temperature.
+    # The air temperature has a constant error and a ripple, and differs 5400 s before the
+    # recording by up to 5 K from the program's first temperature.
     first_c = corners[0, 1]
     air = np.interp(grid, *corners.T) + 0.2 * rng.standard_normal()
     air += 0.03 * np.sin(2.0 * np.pi * grid / rng.uniform(200, 300) + rng.uniform(0, 2 * np.pi))
@@ -345,7 +345,7 @@ def record(
     states = integrate(A, b, h, air, STEP_S, x)
     n = int(lasts_s * rate_hz)
     stamps = (np.arange(n) + 1.0) / rate_hz
-    # A sample is the mean over a cycle and has the time of the cycle's end as its stamp.
+    # A sample is the mean over a sample interval; its stamp is the end of this interval.
     middle = stamps - 0.5 / rate_hz
     nodes = np.array([np.interp(middle, grid, node) for node in states.T]).T
     parts = np.where(unit.part_s > 0.0, nodes[:, PARTS], nodes[:, [BOARD]])
