@@ -63,7 +63,7 @@ TABLES = {'convert'}
 
 @dataclass(frozen=True)
 class Run:
-    """Exit code, time, peak memory and last output of a command with an input."""
+    """Exit code, time, peak memory and last two lines of stderr of a command with an input."""
 
     input: str
     command: str

@@ -37,8 +37,8 @@ from thermo_comp.unit.gravity import STANDARD_GRAVITY
 # determine this sd, so the fit gets the sd as an option.
 MOUNTING_SD = 1e-6 * STANDARD_GRAVITY
 
-# Groups of columns of each fit, by its name in the table: a curve for both regimes; a curve per
-# regime; the groups that the fit selects, for the calibration that the node uses.
+# Groups of columns by the name of the fit in the printed table: one curve for both regimes; one
+# per regime; None (the fit selects the groups) for the calibration of the node.
 MODELS = {'one set': ('curve',), 'two sets': ('curve', 'set'), 'node': None}
 
 
@@ -99,7 +99,7 @@ def messages(path: Path) -> list[tuple[int, bytes]]:
 
 
 def main() -> int:
-    """Run the demonstration; return 1 if messages are lost or the output differs from replay's."""
+    """Run the demonstration; return 1 if a message is lost or node and `replay` differ."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
     parser.add_argument('--bags', default='bags', help='folder of the sample bags')
     parser.add_argument('--out', default='out', help='folder for the results')

@@ -28,8 +28,8 @@ def exact_unit(seed: int) -> UnitModel:
     """
     Make a unit whose bias and scale are quadratics of the board's temperature alone.
 
-    A calibration states its constants for zero heat flow. The unit has no self-heating, so soaks
-    have no heat flow, and the bound needs no extrapolation.
+    A calibration states its constants for zero heat flow. The unit has no self-heating, so there
+    is no heat flow in soaks, and the bound needs no extrapolation to zero heat flow.
     """
     rng = np.random.default_rng(seed)
 

@@ -35,13 +35,13 @@ class Scene:
 
 
 def first_order(t: Floats, lag: float) -> Floats:
-    """Return the response of a first-order lag to a ramp of slope 1 that starts at time 0."""
+    """Return the output of a first-order lag for a ramp of slope 1 that starts at time 0."""
     x = np.maximum(t, 0.0)
     return x - lag * (1.0 - np.exp(-x / lag))
 
 
 def second_order(t: Floats, lag: float, other: float) -> Floats:
-    """Return the response of two lags in series to a ramp of slope 1 that starts at time 0."""
+    """Return the output of two lags in series for a ramp of slope 1 that starts at time 0."""
     x = np.maximum(t, 0.0)
     decay = lag**2 * np.exp(-x / lag) - other**2 * np.exp(-x / other)
     return x - lag - other + decay / (lag - other)
@@ -70,7 +70,7 @@ def temperatures(
 
 
 def read(truth: Floats, scene: Scene, rng: np.random.Generator) -> Floats:
-    """Return the readings of a sensor [degC], with its noise and rounding."""
+    """Return readings [degC] with the noise and rounding of the scene's sensor."""
     reading = truth + rng.normal(0.0, scene.noise_sd, truth.shape)
     return np.round(reading / scene.quantum) * scene.quantum if scene.quantum else reading
 

@@ -12,10 +12,10 @@ Units and recordings come from `strangers_units.py` and `strangers_cases.py`, wh
 with the package; the package is used only through `thermo_comp.fit` and `Calibration.correct`.
 Errors are those on held-out recordings, unless the row states otherwise. An error is the RMS of
 means over 60 s in ug: of the norm, ``|f| - g``, and of the vector against the true force. A ratio
-is the RMS of error / claimed sd. Figures are RMS over the units. MISS marks a limit of
-`strangers_limits.py` that a row violates; the exit code is then 1. The baselines fitted by the
-package take most of the time; ``--baselines strangers.json`` reads the scores of the baselines
-from an earlier run.
+is the RMS of error / claimed sd. The table has the RMS of each figure over the units. MISS marks a
+limit of `strangers_limits.py` that a row violates; the exit code is then 1. The baselines fitted
+by the package take most of the time; ``--baselines strangers.json`` reads the scores of the
+baselines from an earlier run.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ PACKAGE: dict[str, dict[str, Any]] = {
     'sets': {'groups': ('curve', 'set')},
 }
 BASELINES = ('constants', 'cubic', 'golovach', 'sets')
-#: A fit passes if at least this share of the minutes is corrected completely; below 1, because
-#: samples before the first reading of a thermometer are not corrected.
+#: Least share of the minutes that a fit must correct completely; below 1, because samples before
+#: the first reading of a thermometer are not corrected.
 LEAST_PUBLISHED = 0.98
 #: Cases of recorded bags, each with a single unit.
 RECORDED = ('sample-bags', 'no-case', 'board-twice', 'cats')
@@ -60,7 +60,7 @@ RECORDED = ('sample-bags', 'no-case', 'board-twice', 'cats')
 @dataclass(frozen=True)
 class Corrected:
     """
-    Corrected means over 60 s of a bag.
+    Means over 60 s of a bag's corrected samples.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def fitted(
 
 
 def chosen_by(calibration: thermo_comp.Calibration) -> str:
-    """List the groups of a calibration; groups of the response with their number of columns."""
+    """List a calibration's groups of columns; response groups with their number of columns."""
     columns = Counter(term.group for term in calibration.response)
     others = {entry.group for entry in calibration.evidence} - set(columns)
     return ' '.join([*sorted(others), *(f'{group}:{n}' for group, n in columns.items())])
@@ -110,8 +110,8 @@ def corrected(
     out = calibration.correct(bag.time_s, bag.samples, config=config, **given)
     first, size = slots(bag)
     force, claim = means(out.specific_force, first, size), means(out.covariance, first, size)
-    # The published covariance is that of a sample. A mean over a minute reduces white noise and
-    # the rounding of the converter; the other errors are equal in all samples of a minute.
+    # The published covariance is that of one sample. A mean over a minute reduces white noise and
+    # rounding errors of the converter; the other errors are equal in all samples of a minute.
     density = np.square(calibration.noise_density_m_s2_sqrt_hz)
     scale = np.array([axis.scale_factor for axis in calibration.axes])
     rounding = 1.0 / 6.0 if calibration.unit.input == 'counts' else 0.0
@@ -177,7 +177,7 @@ def _drift(forces: Sequence[Floats], bags: Sequence[Minutes]) -> Floats:
 
 
 def scipy_baselines(study: Study) -> dict[str, Callable[[Minutes], Floats]]:
-    """Return the two corrections that scipy fits: constants, and a cubic per axis."""
+    """Return the two corrections that scipy fits: constants alone, and with a cubic per axis."""
     bags = [minutes(bag) for bag in study.baseline_bags or study.bags]
     orders = {'constants': 0, 'cubic': 3}
     if study.is_drift:
@@ -222,8 +222,8 @@ def without_constants(calibration: thermo_comp.Calibration) -> thermo_comp.Calib
     Return a calibration in whose posterior bias, scale and misalignment have no variance.
 
     A single pose determines bias and scale to 50 mg only. The drift in a pose does not depend on
-    these constants, but the claimed variance contains ``a^2`` times the variance of the scale
-    factor, and thereby changes with the noise of the acceleration `a`.
+    bias and scale, but the claimed variance contains ``a^2`` times the variance of the scale
+    factor, and so changes with the noise of the acceleration `a`.
     """
     if calibration.posterior is None:
         return calibration
@@ -239,7 +239,7 @@ def without_constants(calibration: thermo_comp.Calibration) -> thermo_comp.Calib
 def scored(
     study: Study, model: thermo_comp.Calibration, tests: dict[str, list[Minutes]]
 ) -> dict[str, Score]:
-    """Return the score of a calibration for each set of held-out bags."""
+    """Return the scores (errors and ratios) of a calibration by set of held-out bags."""
     if study.bound is not None:
         return {'': bias_score(model, study)}
     if study.is_drift:
@@ -259,7 +259,7 @@ def run(
     earlier: Mapping[tuple[str, int], Mapping[str, Score]],
 ) -> list[Result]:
     """
-    Fit all models to a study's bags, and score them on held-out bags.
+    Fit all models to a study's bags, and compute their errors on held-out bags.
 
     Parameters
     ----------
@@ -362,7 +362,7 @@ HEAD = (
 
 
 def pair(score: Score | None) -> str:
-    """Format the errors of the norm and of the vector [ug] of a model."""
+    """Format a model's error of the norm and of the vector [ug]."""
     if score is None:
         return '-'
     return ' / '.join('-' if np.isnan(x) else f'{x:.3g}' for x in (score.norm, score.vector))

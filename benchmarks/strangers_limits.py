@@ -73,13 +73,13 @@ class Result:
 @dataclass(frozen=True)
 class Limit:
     """
-    The limits of a row. By default the error may be 1.05 times the error of the best baseline,
-    and the RMS of error / claimed sd may be 1.5.
+    The limits of a row. By default the error may be up to 1.05 times that of the best baseline,
+    and the RMS of error / claimed sd up to 1.5.
 
     Parameters
     ----------
     norm, vector : float
-        Largest errors [ug].
+        Largest errors of ``|f|`` and of the vector [ug].
     best : float
         Largest error / smallest error of the baselines, for the norm and for the vector.
     low, high : float
@@ -202,7 +202,7 @@ def judged_ratio(score: Score) -> float:
 
 
 def rows_of(results: Sequence[Result]) -> list[Row]:
-    """Return a row per title with the RMS of the scores over the units, in order of results."""
+    """Return a row per title with the RMS of the scores over the units, in the results' order."""
     titles = list(dict.fromkeys(result.title for result in results))
     return [_row([result for result in results if result.title == title]) for title in titles]
 
@@ -228,7 +228,7 @@ def _row(results: Sequence[Result]) -> Row:
 
 
 def limit_of(title: str) -> Limit:
-    """Find the limit of a row by the longest beginning of its title."""
+    """Return the limits of a row: those of the longest key with which its title begins."""
     return LIMITS[max((key for key in LIMITS if title.startswith(key)), key=len)]
 
 
@@ -239,7 +239,7 @@ def best_baseline(row: Row, name: str) -> float:
 
 
 def misses(row: Row, others: Sequence[Row]) -> list[str]:
-    """Describe the limits that a row violates; `others` are all rows of the case."""
+    """Return a text for each limit that a row violates; `others` are all rows of the case."""
     exceeded = ['refused'] if row.refused else []
     if 'fit' not in row.scores:
         return exceeded
