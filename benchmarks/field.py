@@ -55,8 +55,8 @@ LABORATORY = calibration()
 
 def probes(kind: str, state: Floats, seed: int) -> tuple[list, Floats, Floats, Floats]:
     """
-    Build noise-free rests in random attitudes of a kind of platform; return the rests, their
-    samples (counts / `K`), board temperatures less the reference [K], and true forces [m/s^2].
+    Build noise-free rests in random attitudes of a platform `kind`; return the rests, their
+    samples / `K` [m/s^2], board temperatures less the reference [K], and true forces [m/s^2].
     """
     rng = np.random.default_rng(seed)
     force = G * np.array([attitude(kind, rng) for _ in range(N_PROBES)])

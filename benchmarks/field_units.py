@@ -119,13 +119,13 @@ def _parts(state: Floats, warmth: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def measured(force: Floats, warmth: Floats, state: Floats) -> Floats:
-    """Return the samples (counts / `K`) of a unit with deviations `state` under forces (n, 3)."""
+    """Return the samples / `K` [m/s^2] of a unit with deviations `state` under forces (n, 3)."""
     bias, scale, M = _parts(state, warmth)
     return np.asarray(np.linalg.solve(M, force.T).T * scale + bias)
 
 
 def corrected(counts: Floats, warmth: Floats, state: Floats) -> Floats:
-    """Correct samples (counts / `K`) of a unit with deviations `state`; return forces [m/s^2]."""
+    """Correct samples / `K` [m/s^2] of a unit with deviations `state`; return forces [m/s^2]."""
     bias, scale, M = _parts(state, warmth)
     return np.asarray((counts - bias) / scale @ M.T)
 
@@ -207,7 +207,7 @@ class BestFilter:
         """
         Update the filter with a rest.
 
-        now: time [days]; counts: mean sample of the rest (counts / `K`); variance: variance of its
+        now: time [days]; counts: mean sample of the rest / `K`; variance: variance of its
         norm [m^2/s^4]; warmth: board temperature less the reference temperature [K]
         """
         process = self.process

@@ -97,7 +97,7 @@ Each number in a calibration is one of the quantities in the table. The bounds a
 calibration within them gives finite results and a positive definite covariance. Further bounds depend on the full scale of
 the unit. The bias at the reference temperature, and its change over temperature, must each be within twice the full scale.
 The effect of a column of the response on the bias, and of a parameter's sd on bias or scale, is at most a million times the
-limit of bias or scale. The relative scale with the largest contributions of all columns must be between 0.1 and 10.
+limit of bias or scale. The relative scale plus or minus all its columns' largest effects must stay between 0.1 and 10.
 """
 
 INTERFACE = """\

@@ -216,7 +216,7 @@ def small_disk(tmp_path, request):
 @pytest.fixture
 def peer():
     """Return a ROS node with publishers, subscribers and clients for the node under test."""
-    pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+    pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
     from ros_helpers import Peer
 
     peer = Peer()

@@ -6,7 +6,7 @@ import struct
 
 import pytest
 
-pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 
 from geometry_msgs.msg import Vector3Stamped
 from hypothesis import given

@@ -16,7 +16,7 @@ pytestmark = pytest.mark.usefixtures('equal_fits_once')
 
 @pytest.fixture(autouse=True)
 def needs_ros():
-    pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+    pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 
 
 @pytest.mark.slow

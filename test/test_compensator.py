@@ -147,7 +147,7 @@ def test_the_covariance_in_an_unknown_regime_contains_the_difference_of_the_sets
     early = compensator.process(SECOND_NS // 2, 0.0, 0.0, 1.0)
     warm(compensator, until_s=1500, start_s=1)
     late = compensator.process(1500 * SECOND_NS, 0.0, 0.0, 1.0)
-    # The static and the dynamic set differ by 3 counts (0.01 m/s^2) on x, and are equal on y.
+    # The dynamic bias exceeds the static bias by 3 counts (0.01 m/s^2) on x, and equals it on y.
     assert early[3] == pytest.approx(NOISE + 0.01**2, rel=1e-6)
     assert early[6] == pytest.approx(NOISE, rel=1e-6)
     assert late[3] == pytest.approx(NOISE, rel=1e-6)
@@ -180,7 +180,7 @@ def test_a_sample_with_a_stamp_20_s_ahead_is_dropped_unless_the_next_stamp_agree
         (np.insert(usual, 2, usual[2] + leap), [0, 1, 3, 4, 5]),
         # After a gap of 20 s the first sample is dropped, and the samples after it are used.
         (np.where(np.arange(5) < 2, usual, usual + leap), [0, 1, 3, 4]),
-        # Two samples stamped 20 s ahead are dropped if samples lie between or their stamps fall.
+        # Two samples 20 s ahead are dropped if others lie between them, or if the second is older.
         (np.insert(usual, [1, 3], usual[[1, 3]] + leap), [0, 2, 3, 5, 6]),
         (np.array([1, 2 + leap, 1 + leap, 3, 4]), [0, 3, 4]),
     ):

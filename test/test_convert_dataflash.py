@@ -12,7 +12,7 @@ from thermo_comp.convert.log import write_log
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording.reader import read_recording
 
-pytest.importorskip('pymavlink', reason='pymavlink is not installed: the extra `ardupilot`')
+pytest.importorskip('pymavlink', reason='pymavlink of the extra `ardupilot` is not installed')
 
 SIZES = {'Q': 8, 'B': 1, 'f': 4, 'I': 4, 'H': 2, 'h': 2, 'c': 2, 'N': 16}
 NEW_IMU = ('QBffffffIIfBBHH', 'TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ,EG,EA,T,GH,AH,GHz,AHz')

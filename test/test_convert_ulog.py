@@ -12,7 +12,7 @@ from thermo_comp.convert.log import write_log
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording.reader import read_recording
 
-pytest.importorskip('pyulog', reason='pyulog is not installed: the extra `px4`')
+pytest.importorskip('pyulog', reason='pyulog of the extra `px4` is not installed')
 
 ACCEL = 'sensor_accel:uint64_t timestamp;uint64_t timestamp_sample;uint32_t device_id;'
 ACCEL += 'float x;float y;float z;float temperature;uint32_t error_count;uint8_t[3] clip_counter;'

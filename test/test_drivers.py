@@ -195,7 +195,7 @@ def warming_unit():
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: path.stem)
 def test_the_node_uses_the_topics_of_the_driver_s_file(path, tmp_path):
-    pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+    pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
     from ros_helpers import Peer, node_arguments, node_in_thread, stamped
     from sensor_msgs.msg import Imu, Temperature
     from std_msgs.msg import Float64

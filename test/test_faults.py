@@ -13,7 +13,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 
 from fault_bench import Heard, bench, lots
 from fault_rig import CONFIG, bag, corrected, force_at, unit

@@ -29,8 +29,8 @@ from thermo_comp.recording.topics import Topics
 from thermo_comp.simulation.presets import unit_preset
 from thermo_comp.unit.calibration_file import load_calibration
 
-distributed = pytest.importorskip('distributed', reason='distributed is not installed: `fleet`')
-pytest.importorskip('pyarrow', reason='pyarrow is not installed: the extra `fleet`')
+distributed = pytest.importorskip('distributed', reason='distributed is not installed (`fleet`)')
+pytest.importorskip('pyarrow', reason='pyarrow of the extra `fleet` is not installed')
 
 
 @pytest.fixture(scope='module')

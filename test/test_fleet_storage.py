@@ -30,7 +30,7 @@ from thermo_comp.fleet.work import process_unit
 from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.calibration_file import parse_calibration
 
-fsspec = pytest.importorskip('fsspec', reason='fsspec is not installed: the extra `fleet`')
+fsspec = pytest.importorskip('fsspec', reason='fsspec of the extra `fleet` is not installed')
 
 
 @pytest.fixture(scope='module')

@@ -14,7 +14,7 @@ from thermo_comp.fleet.run import Results, render_fleet
 from thermo_comp.fleet.summary import QUANTITIES, outlier_limit, summarise
 from thermo_comp.fleet.table import COLUMNS, read_parquet, row_of, write_tables
 
-pa = pytest.importorskip('pyarrow', reason='pyarrow is not installed: the extra `fleet`')
+pa = pytest.importorskip('pyarrow', reason='pyarrow of the extra `fleet` is not installed')
 
 MONDAY = datetime(2026, 1, 5)
 

@@ -40,7 +40,7 @@ def means_of(result):
 
 def test_the_residual_of_handheld_units_is_the_noise_of_their_samples(unit):
     assert 21 <= len(unit.positions) <= 23
-    # In windows of 1 s the noise is 0.48 to 0.57 mg; the fit has windows of 0.5 s.
+    # Means over 1 s have a noise of 0.48 to 0.57 mg; the fit has means over 0.5 s.
     assert 0.5 < unit.residuals[-1].fitted.rms / MG < 0.9
     assert unit.residuals[-1].left_out.rms < 1.15 * unit.residuals[-1].fitted.rms
 

@@ -298,7 +298,7 @@ def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
 
 
 class _Geometry(NamedTuple):
-    """Thermal states, remaining shares of initial lag states, and the module's u, v, x."""
+    """Thermal states, shares left of initial lag states, u = f / |f|, v = M^T u, forces x."""
 
     states: Floats
     shares: Floats

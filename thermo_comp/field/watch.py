@@ -190,7 +190,7 @@ def _forecasts(
     Return the quantiles of the time until the error of the unit exceeds the limit, with the
     present calibration and with an update at the last rest.
 
-    The error is taken in the attitudes of the rests of the last week and of the last ten starts.
+    Error: RMS of |f| - g in the attitudes of rests of the last week or the last ten node starts.
     """
     used, ageing, solution = updated.series, updated.ageing, updated.solution
     is_recent = used.time > used.time[-1] - _WINDOW_DAYS

@@ -37,7 +37,8 @@ def valid_range(values: Floats, smallest_margin: float, order: int = 0) -> Range
     """
     Return the valid range of a quantity that is proportional to a power (`order`) of a heat flow,
     and so of the rate of a ramp: the range of its values with a margin, extended by the factor
-    2^order to ramps of twice the rate. Order 0 is for temperatures: their range is not extended.
+    2^order to ramps of twice the rate. With `order` 0, as for temperatures,
+    only the margin is added.
     """
     ratio = 2.0**order
     lower, upper = float(np.min(values)), float(np.max(values))

@@ -104,7 +104,7 @@ def sum_length(window_s: float) -> float:
 
 
 def usual_window(bags: Sequence[ReducedBag]) -> float:
-    """Return the length of windows: 60 s or more, a multiple of the longest partial sum [s]."""
+    """Return the window length [s]: 60 s rounded up to a multiple of the longest summing time."""
     longest = max(bag.window_s for bag in bags)
     return float(np.ceil(WINDOW_S / longest - 1e-6)) * longest
 

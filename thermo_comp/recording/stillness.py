@@ -398,7 +398,7 @@ def _is_turning(cells: Cells) -> Bools:
 
 
 def _drift(cells: Cells, plausible: Bools) -> Floats:
-    """Return the drift at each step between cells: the median of nine steps, at most 50 ug/s."""
+    """Return the drift from cell to cell: the median of nine steps of the mean, up to 50 ug/s."""
     both = plausible[1:] & plausible[:-1] & (np.diff(cells.index) == 1)
     step = np.where(both[:, None], np.diff(cells.mean, axis=0), 0.0)
     half = _DRIFT_STEPS // 2

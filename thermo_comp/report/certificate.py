@@ -127,7 +127,7 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
         Contribution('gravity', 'B', gravity, info.gravity.source or in_fit),
         Contribution('attitude', 'A', attitude, 'uncertainty of the misalignment of the axes'),
         Contribution('thermometers', 'B', drift, slope),
-        Contribution('model', 'A', model, 'claimed error of the calibration without misalignment'),
+        Contribution('model', 'A', model, 'claimed sd of |f| in excess of noise and attitude'),
         Contribution('repeatability', 'A', excess, beyond),
     )
 

@@ -70,7 +70,7 @@ class ThermalNetwork:
         return {AIR: -1, **{name: i for i, name in enumerate(self.nodes)}}
 
     def system(self) -> tuple[Floats, Floats, Floats]:
-        """Return A, b, p of ``dx/dt = A x + b u + p`` with all exponents 1; A has shape (k, k)."""
+        """Return A, b, p of ``dx/dt = A x + b u + p`` all heat paths linear; A: shape (k, k)."""
         n, index = len(self.nodes), self._places
         size = n + (self.thermostat is not None)
         both, p = np.zeros((size + 1, size + 1)), np.zeros(size)

@@ -25,7 +25,7 @@ from .thermometer import Thermometer
 
 # Second derivative for which a filter is tuned / second derivative at the slowest ramp's onset.
 BEND_SHARES = (1.0, 10.0)
-TUNING: Final = 1.45  # best memory of a filter / (noise sd / second derivative)^0.4, at 1 Hz
+TUNING: Final = 1.45  # best memory of a filter [s] / (noise sd / d2T/dt2)^0.4, readings at 1 Hz
 # Noise variance of the rate / the filter's rate variance, if most noise is that of quantization.
 CELL_NOISE_SHARE: Final = 0.4
 SETTLING_MEMORIES: Final = 5.0  # age / memory of a filter at which the noise is stationary

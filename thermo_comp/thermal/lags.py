@@ -66,8 +66,8 @@ class _Lag(NamedTuple):
 
 class Lag(_Lag, Quantity):
     """
-    The board temperature less that of a part which lags the board, or the lagged gradient of a
-    sensor (`input`) [K]. `tau_s` and `second_tau_s` are the time constants of two stages [s]; the
+    T_board less that of a part which lags the board or, if `input` is a sensor, T_sensor less
+    T_board, lagged [K]. `tau_s` and `second_tau_s` are the time constants of two stages [s]; the
     second is shorter, or 0 for a lag of one stage. A part may lag a temperature between board and
     sensor: that of the board plus `sensor_share` of the gradient of `sensor`. `lead_s`: lag of the
     board thermometer behind the temperature that drives the part [s].

@@ -6,8 +6,8 @@ Owns the columns of the thermal response: the regressors of bias and scale.
 A column is ``phi = u t^power r``. The value u is computed by the column's kind (`unit.terms`), t
 is the board temperature less the reference, and r is 1, 1 - w or w, with w the weight of the
 dynamic regime. u is limited to the column's range, and t to the calibrated temperatures. Outside
-the calibrated temperatures t^power is constant, although the curves of the sets first continue
-along tangents: no recording determines the weights of columns at these temperatures.
+the calibrated temperatures t^power is constant, though the curves over temperature first follow
+tangents: no recording determines the weights of columns there.
 
 The function `bank` makes the columns in groups of one kind or more. The fit makes the group *part*
 from the kinds board, square and cube: the sum of these columns and of a curve over the board
