@@ -117,8 +117,8 @@ def _over_offsets(
     n_mountings = int(windows.mounting[-1]) + 1
     is_single = windows.n_turn_ons == 1 < n_mountings
     if scale <= 0.0:
-        # A sd stated by the user is also that of turn-ons. The mean of m mounting offsets has the
-        # variance sd^2 / m in the regression: add the remaining (1 - 1 / m) sd^2.
+        # An sd stated by the user is that of mounting and turn-on offsets. In the regression the
+        # mean of m mounting offsets has the variance sd^2 / m: add the other (1 - 1 / m) sd^2.
         variance = offset_sd**2 * (1.0 - 1.0 / n_mountings) if is_single else 0.0
         return posterior.covariance, offset_sd, variance
     kind = 'mounting' if is_single or windows.has_turn_ons else 'both'
@@ -207,10 +207,10 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
     Add to the prior the columns that the data do not determine, so that their variance is not 0.
 
     The weight of an inactive column is consistent with 0, but the data bound it only to ``1 /
-    sqrt(S)``, S being the information about the weight given the active columns. If the bound
-    exceeds two sd of a window's noise, the column enters the covariance with weight 0 and an sd
-    that is the smaller of bound and prior sd. Before it is compared with the noise, the bound of a
-    nearly constant column is scaled to the RMS of the board temperature t [K].
+    sqrt(S)``, S being the information about the weight given the active columns. The column gets
+    weight 0 and, as sd, the smaller of this bound and the prior sd, if this sd exceeds two sd of a
+    window's noise. For the comparison with the noise, the sd of a nearly constant column is scaled
+    to the RMS of the board temperature t [K].
     """
     groups, prior = np.array(regression.windows.groups), posterior.prior
     kelvins = regression.windows.kelvins

@@ -238,7 +238,7 @@ def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator
     Report the sd of mounting and turn-on offsets if the fit had to assume this sd.
 
     `offset_sd`: published sd of the bias offset of a mounting [m/s^2]. Nine constants explain |f|
-    in nine positions with any mounting offsets; drifts of scale factors show only large offsets.
+    in nine positions with any mounting offsets; only large offsets show in drifts, too.
     """
     prior = fit.posterior.prior
     n, n_turn_ons = int(fit.windows.data.mounting[-1]) + 1, fit.windows.data.n_turn_ons
@@ -356,8 +356,8 @@ def judge_result(
     else:
         yield Finding('residual', 'good', text)
     alone = overall.two_sets.rms
-    # Two effects do not contradict the prior: a bias shift by up to 2 sd (2 `slow`) at a turn-on,
-    # and a residual due to initial lag states, in which case `sigma` is near the white noise.
+    # Two residuals do not contradict the prior: those by bias shifts of up to 2 sd (2 `slow`), and
+    # those by initial lag states, which the fit estimates, so that its noise `sigma` stays small.
     contradiction, sigma = '', float(np.mean(prior.sigma))
     is_above = overall.fitted.rms > np.hypot(1.5 * alone, 2.0 * slow) and sigma > 1.5 * alone
     if options.prior is not None and is_above:

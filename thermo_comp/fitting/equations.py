@@ -173,7 +173,7 @@ class Equations(Series):
         self, state: State, layout: Layout, base: Base, scaled: int
     ) -> tuple[Ints, Floats | float]:
         """
-        Return index and factor (as in `Tangent`) of each active nonlinear coefficient's series.
+        Return place and factor, see `Tangent`, of each active nonlinear coefficient.
 
         The factor 1 + S s of the scale multiplies the nonlinear terms at the reference
         temperature, but not their changes per kelvin, where its effect is negligible.

@@ -20,7 +20,7 @@ import numpy as np
 
 from ..typing import Bools, Floats, Ints
 
-# Squares of factors of the prior sd of new columns; the factor with the largest gain is used.
+# Squares of factors to try on the prior sd of new columns; that with the largest gain is used.
 _SQUARED_FACTORS = (10.0 ** np.arange(-4.0, 1.01, 0.25))[:, None] ** 2
 
 
@@ -58,7 +58,7 @@ class Inactive:
     Q: Floats
 
     def _in_prior_sd(self, column_sd: Floats, wanted: Bools) -> tuple[Floats, Floats, Ints]:
-        """Return S, Q and column of each weight, in prior sds, of the `wanted` columns."""
+        """Return S and Q of weights in units of prior sds, and the column of each weight."""
         sd = np.repeat(column_sd[self.part, self.column] * wanted[self.column], 3)
         at = np.flatnonzero(sd > 0.0)
         S = self.S[np.ix_(at, at)] * np.outer(sd[at], sd[at])

@@ -113,7 +113,7 @@ def _updated(
         # A change of the sd of offsets counts only if the data determine more than one offset.
         change('offset_sd') * bool(determined[layout.offset].sum() > 1.0),
         change('turn_on_sd') * bool(determined[layout.turn_on].sum() > 1.0),
-        # An error of 15 % of the sd of tilts hardly changes the fit.
+        # A change of the sd of tilts by 15 % hardly changes the fit.
         change('tilt_sd') / 3.0,
         change('pose_sd'),
         change('start_variance_ratio') / 4.0,
@@ -179,7 +179,7 @@ def _toward(
     slope: Floats | float,
     bend: Floats | float,
 ) -> Floats:
-    """Return Newton's step of log sd, within +-2, to solve power / sd^2 = effective + slope."""
+    """Return Newton's step of log sd, within +-2, to ``power / sd^2 = effective + slope``."""
     ratio = power / (sd * sd)
     gradient = ratio - effective - slope
     curvature = 2.0 * np.minimum(ratio, 2.0 * effective + 1.0) + 0.5 * effective + bend

@@ -69,12 +69,12 @@ def constant_calibration(
             f'an axis ({axes}) reads the same in all positions: the axis is dead, or the unit was '
             'never turned about another axis'
         )
-    # If no axis is near up and near down, half ranges are below |f|: try also 1.3 times the scale.
+    # If no axis was held up and down, the largest half range is below 1 g: try 1.3 times it, too.
     scales = (float(np.max(half)) * spread / gravity for spread in (1.0, 1.3))
     starts = (np.where(half * 4.0 > np.max(half), scale, half / gravity) for scale in scales)
     tried = (_refine(means, gravity, bias, scale, misalignment_sd) for scale in starts)
     calibration, rms = min(tried, key=lambda fitted: fitted[1])
-    # Means that are on no ellipsoid may fit a very large one with a far centre: refuse it.
+    # Refuse a very large ellipsoid with a far centre, which means on no ellipsoid may fit.
     is_around = np.all(np.abs(calibration.bias - bias) < 2.0 * np.max(half))
     if not (is_around and rms < largest_rms):
         raise FitError(
@@ -168,7 +168,7 @@ def thermometer_error_of(windows: Windows, scale: Floats, *, beyond_noise: bool 
     change = within_positions(windows.board[:, :1], windows.position)
     power = np.maximum(np.add.reduceat(change**2, first), 1e-12)
     along = np.add.reduceat(change * drift, first)
-    # Under white noise alone, the mean of `along**2 / power` of a position is the noise variance.
+    # White noise adds its variance to the sum of squares that a position's slope explains.
     square = along**2 / power - white_noise_of(windows, scale) ** 2
     slope = np.sqrt(np.maximum(square.sum(axis=0), 0.0) / power.sum())
     variance = float(windows.board[:, 1].mean()) - beyond_noise * windows.board_noise**2

@@ -70,7 +70,7 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
 
     Without a prior, if the positions are whole rests and temperature changes more between than
     within positions, two fits are made: of the curve to the means of the positions, and to all
-    windows. The fit to the means is returned unless the fit to all is better on left-out data.
+    windows. The fit to the means is returned unless the other fit is better on left-out data.
     """
     if problem.options.prior is not None:
         return _regress(windows, problem)
@@ -191,7 +191,7 @@ def _initial_prior(windows: ThermalWindows, problem: Problem) -> Prior:
     """Return the prior of the constants and of the noises, without columns."""
     data, start, options = windows.data, problem.start, problem.options
     drift = within_positions(data.mean / start.scale, data.position)
-    # Initial sd of mounting offsets, and smallest initial white noise: 1 ug [m/s^2].
+    # Smallest initial sd of mounting offsets, and of white noise: 1 ug [m/s^2].
     least = 1e-5
     sigma = max(float(np.sqrt(np.mean(drift**2))), least)
     noise = _noise_in_1_hz(windows, start.scale)
@@ -360,7 +360,7 @@ def sizes_of(windows: ThermalWindows, options: FitOptions) -> Floats:
 
 
 def initial_triad(windows: ThermalWindows, options: FitOptions) -> ConstantCalibration:
-    """Fit constant bias, scale and M or, in few attitudes, the scale only (1 for m/s^2 input)."""
+    """Fit constant bias, scale and M; in few attitudes only one scale (for m/s^2 input: 1)."""
     means, gravity = position_means(windows.data), sizes_of(windows, options)
     norms = np.linalg.norm(means, axis=1)
     if not norms.all() or (len(means) > 1 and not means.any(axis=0).all()):

@@ -116,7 +116,7 @@ def _intervals(parts: Sequence[ReducedBag]) -> tuple[StillInterval, ...]:
         shift_s = 1e-9 * (part.start_ns - parts[0].start_ns)
         is_alike = abs(part.window_s - parts[0].window_s) < 0.01 * parts[0].window_s
         for number, rest in enumerate(part.intervals):
-            # Windows are whole only if their length is within 1 % of that in the first part.
+            # Windows count as whole only if within 1 % as long as windows of the first part.
             n_whole = rest.n_whole if is_alike else 0
             shifted = replace(rest, time=rest.time + shift_s, n_whole=n_whole)
             is_first = bool(result) and number == 0
@@ -132,7 +132,7 @@ def _is_one_rest(before: StillInterval, after: StillInterval, window_s: float) -
     Whether a rest continues in the next part. The gap between the parts is at most three windows
     long. On each axis the step over the gap is at most five times the RMS, or twice the largest,
     of the steps between successive windows of the 20 before and the 20 after the gap (most steps
-    may be 0 by rounding). A rest with fewer than 10 such steps near the gap does not continue.
+    may be 0 by rounding). With fewer than 10 steps between these windows the result is False.
     """
     gap_s = 1e-9 * (after.start_ns - before.end_ns)
     means = before.mean[: before.n_whole][-20:], after.mean[:20]

@@ -216,8 +216,8 @@ def _place_of_step(time: Floats, accel: Floats, quiet_sd: Floats, r: float) -> i
     residual = residual - trend @ (trend.T @ residual)
     candidates = np.arange(_FEWEST_SAMPLES, n - _FEWEST_SAMPLES + 1)
     # A unit step at sample k, whitened for the lag-1 correlation r, is 1 at k and 1 - r after k:
-    # its product with a residual is a sum over the residuals from sample k on. Without the trend
-    # the step's sum of squares is smaller by the squared sums of the trend columns from k on.
+    # its product with a residual is a sum over the residuals from sample k on. Subtraction
+    # of the trend lowers the sum of squares of the step by its squared products with the trend.
     tail = _sums_behind(residual, r)[candidates]
     trend_tail = _sums_behind(trend, r)[candidates]
     square = 1.0 + (1.0 - r) ** 2 * (n - candidates - 1) - (trend_tail**2).sum(axis=1)

@@ -210,9 +210,9 @@ def is_worse_by_norms(before: Score, after: Score) -> bool:
 
 def is_undecided(before: Score, after: Score) -> bool:
     """
-    Whether left-out data do not decide between two models, given that `after` is not better. The
-    drifts then agree to 5 %, and errors of |f| are smaller in `after` by one to two standard
-    errors, or no fold has an error of |f| for both models.
+    Whether left-out data do not decide between two models, given that `after` is not better: the
+    drifts agree to 5 %, and errors of |f| are smaller in `after` by more than one standard error
+    (not significantly), or no fold has an error of |f| for both models.
     """
     *drift, norms = _beyond_thermometer(before, after)
     is_equal = all(abs(gain[0]) < _NEGLIGIBLE_LOG_RATIO for gain in drift if gain)

@@ -59,7 +59,7 @@ class _Shape(NamedTuple):
 # Ratio of the RMS residual to white noise up to which no other shape or lag is tried.
 _EXPLAINED_RATIO = 1.1
 # Shapes of the curves, in the order of the trials. A spline of 4 nodes determines a lag best, but
-# cannot describe a kink of the bias, so the limit of its RMS residual is low.
+# cannot describe a kink of the bias: accept only a residual near the noise (`most_noise`).
 _SHAPES = (
     _Shape(4, _EXPLAINED_RATIO),
     _Shape(4, _EXPLAINED_RATIO, has_gradient=True),
@@ -89,8 +89,8 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> list[Part
 
     Returns [] if the model with one lag per axis does not explain the drift of all axes, or if the
     data do not determine a time constant. If the residual exceeds the noise for all shapes of the
-    curves, a second stage may only describe slow noise or a tilt of the support: the list begins
-    with lags of one stage if these halve the RMS residual of every axis, compared with no lag.
+    curves, a second stage may only describe slow noise or a tilt of the support. The list then
+    begins with lags of one stage, if they at least halve the RMS residual of each axis.
     """
     data, columns = windows.data, windows.model.columns
     if not windows.has_temperature or not any(column.group == 'board' for column in columns):
@@ -185,7 +185,7 @@ class _PartCurves:
     def _is_of_use(
         self, lag: Part, axis: int, noise: float, most_noise: float = 3.0, reduction: float = 4.0
     ) -> bool:
-        """Whether the residual with `lag` is near the noise, or far below that of 0 s."""
+        """Whether the residual with `lag` is near the noise, or far below the one without lag."""
         typical = 1.4826 * np.median(np.abs(self._weighted(lag, axis) / self._root_weight[:, 0]))
         return bool(typical <= most_noise * noise or self.reduction(lag, axis) >= reduction)
 
@@ -229,7 +229,7 @@ class _PartCurves:
         time; or `lag` itself if the residual does not become significantly smaller.
 
         The residual is linearised w.r.t. time constant and share of the gradient, or lead. The
-        decrease of its sum of squares must have a probability below 1e-5 in white noise.
+        residual's sum of squares must decrease by more than white noise allows at p = 1e-5.
         """
         tau = lag.tau_s
         if not tau:
@@ -342,8 +342,8 @@ class _PartCurves:
         ratio = float(np.sqrt((square / noise**2).max()))
         x, y, z = (Part(*map(round, lag, (1, 1, 4, 1))) for lag in lags)
         # Other models are tried if the left-out drift is above `most_drift`: 2 sd of the noise, or
-        # 10 sd for a shape without stress whose residual noise explains, because even then such
-        # a shape extrapolates badly to left-out data.
+        # 10 sd if noise explains the residual of a shape without stress, because such a shape may
+        # fit all data well but extrapolate badly to left-out data.
         is_curve = ratio <= self._shape.most_noise and not self._shape.has_stress
         most_drift = (10.0 if is_curve else 2.0) * float(noise.mean())
         return Parts((x, y, z), factors, most_drift), ratio

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns two checks of a chosen model, after which a fit is repeated: whether its bias at settled
-temperatures is less certain than that of a smaller model, and whether supports tilted slowly.
+Owns two checks after which a fit is repeated: whether at settled temperatures the bias by the
+chosen model is less certain than by a smaller model, and whether supports tilted slowly.
 """
 
 from __future__ import annotations

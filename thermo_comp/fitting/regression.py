@@ -212,9 +212,9 @@ class Point:
     def linear_step(self) -> Floats:
         """Return the step in which damping keeps the nonlinear unknowns almost constant."""
         layout, local, unit = self.layout, self.normal.local.copy(), self.normal.unit.copy()
-        # A factor 1e6 on the diagonal divides the step of nonlinear unknowns by about 1e6. With an
-        # informative prior, which correlates the unknowns, a factor far above 1e6 would cause
-        # errors of double precision.
+        # A factor 1e6 on the Hessian's diagonal divides the steps of nonlinear unknowns by about
+        # 1e6. With an informative prior, which correlates the unknowns, a far larger factor would
+        # cause rounding errors in double precision.
         at = [*range(2 + layout.stretch.shape[1]), *range(layout.of_axis.shape[1], layout.n_local)]
         local[..., at, at] *= 1e6
         end = unit.shape[-1] - 1
@@ -282,7 +282,7 @@ class Regression(Equations):
     _linearised: tuple[State, Layout, Floats, Tangent, Normal] | None = None
 
     def at(self, state: State, prior: Prior, grams: Floats | None = None) -> Point:
-        """Linearise about `state`, with inactive weights 0; `grams`: by default of all windows."""
+        """Linearise about `state`, inactive weights 0; `grams`: see `Point`, None: all windows."""
         layout = self.layout(prior.column_sd > 0.0, prior.nonlinear_sd > 0.0)
         grams = self.products(layout.used).of_positions if grams is None else grams
         return Point(self, without_inactive(state, layout), prior, layout, grams)

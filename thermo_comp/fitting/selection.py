@@ -369,9 +369,9 @@ def finish(
     large = LARGE_OFFSETS * prior.offset_scale
     is_noise = score.rms <= 4.0 * float(np.hypot(score.noise, score.by_thermometer))
     if prior.offset_sd < prior.offset_scale and is_noise:
-        # Nine constants explain |f| in nine positions, whatever the mounting offsets. The
-        # drift of a scale factor is proportional to the specific force along its axis, so drifts
-        # also determine mounting offsets, if the model explains the drifts.
+        # Nine constants explain |f| in nine positions, whatever the mounting offsets. The drift
+        # of a reading due to its scale factor is proportional to the specific force on the axis,
+        # so a model that explains the drifts determines these forces, and mounting offsets.
         prior = replace(prior, offset_sd=large, turn_on_sd=large)
         posterior = settle(regression, posterior.state, prior, candidates)
         score = score_of(regression, posterior)

@@ -155,7 +155,7 @@ def _rate_histories(
         n_bins = int(time[-1] / _BIN_S) if len(time) >= 30 else 0
         if n_bins < 6 * _BINS_PER_SIDE:
             continue
-        # The mean over a minute is the change of the integral over the minute, divided by 60 s.
+        # The mean temperature over a minute is the change of its integral, divided by 60 s.
         integral = cumulative_trapezoid(readings.value, time, initial=0)
         edges = np.interp(np.arange(n_bins + 1) * _BIN_S, time, integral)
         means = (edges[_BINS_PER_SIDE:] - edges[:-_BINS_PER_SIDE]) / side

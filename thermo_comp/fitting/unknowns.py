@@ -305,7 +305,7 @@ class State:
     def tangents(self) -> Floats:
         """
         Two vectors perpendicular to the `up` of each attitude, shape (n, 3, 2). For an attitude
-        with a pose they are the tangents of this pose, projected perpendicular to `up`.
+        with a pose the vectors are the tangents of the pose, projected perpendicular to `up`.
         """
         result = tangent_basis(self.up)
         if self.pose.size:

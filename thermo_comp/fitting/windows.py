@@ -404,7 +404,7 @@ def _kelvins(model: Model, values: Floats, raw: Floats, t: Floats, gradient: Flo
 
 
 def _part_kelvins(values: Floats) -> Floats:
-    """Return the temperature change [K] that changes each `Model.part_sums` by its RMS, (9,)."""
+    """Return the RMS of each power x^p in `Model.part_sums` over its largest slope [K], (9,)."""
     power = np.tile((1, 2, 3), values.shape[1] // 3)
     # The largest slope of x^p is p |x|^(p - 1) at the largest |x|.
     most = np.repeat(np.abs(values[:, ::3]).max(axis=0, initial=0.0), 3)
