@@ -144,7 +144,7 @@ def rough_centre(means: Floats) -> Floats:
 
 
 def geometry(up: Floats, with_misalignment: bool) -> float:
-    """Return the largest ratio of a constant's sd to the noise sd of |f|; inf if not determined."""
+    """Return the largest ratio of a constant's sd to the noise of |f|; inf if not determined."""
     jacobian = norm_columns(up)[:, : 9 if with_misalignment else 6]
     values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
     if values[0] < 1e-9 * values[-1]:

@@ -181,7 +181,7 @@ class _TermFits:
         return self.posterior(used).log_evidence - self.posterior(used - dropped).log_evidence
 
     def left_out_gain(self, used: _Active, dropped: _Active) -> tuple[float, float]:
-        """Return the log ratio of left-out errors of |f| without and with `dropped`, and its sd."""
+        """Return the log ratio, and its sd, of left-out |f| errors without and with `dropped`."""
         return self.score(used - dropped).norms.gain_of(self.score(used).norms) or (0.0, 0.0)
 
     def is_determined(self, used: _Active, at: int) -> bool:
