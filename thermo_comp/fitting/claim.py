@@ -89,7 +89,7 @@ def claim_of(fit: Fit, gravity_sd: float = 0.0, known_offset_sd: float = 0.0) ->
         by_offset = np.array([point.by_offset(axis) for axis in range(3)])
         covariance = covariance + turn_on_variance * (by_offset.T @ by_offset)
     if fit.typical is not None:
-        # `_widened` computes a covariance at one sd of mounting offsets, the mode: add the
+        # `_widened` computes the covariance at the most likely sd of mounting offsets: add the
         # variance of the mixtures, of the jackknife and of the turn-ons to this covariance.
         excess = covariance - posterior.covariance
         layout, covariance = _widened(regression, posterior, fit.typical, fit.of_means)

@@ -238,7 +238,7 @@ def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator
     Report the sd of mounting and turn-on offsets if the fit had to assume this sd.
 
     `offset_sd`: published sd of the bias offset of a mounting [m/s^2]. Nine constants explain |f|
-    in nine positions with any mounting offsets; only large offsets show in drifts, too.
+    in nine positions with any mounting offsets, and drifts show large mounting offsets only.
     """
     prior = fit.posterior.prior
     n, n_turn_ons = int(fit.windows.data.mounting[-1]) + 1, fit.windows.data.n_turn_ons

@@ -179,7 +179,7 @@ def _toward(
     slope: Floats | float,
     bend: Floats | float,
 ) -> Floats:
-    """Return Newton's step of log sd, within +-2, to ``power / sd^2 = effective + slope``."""
+    """Return Newton's step of log sd, within +-2, for ``power / sd^2 = effective + slope``."""
     ratio = power / (sd * sd)
     gradient = ratio - effective - slope
     curvature = 2.0 * np.minimum(ratio, 2.0 * effective + 1.0) + 0.5 * effective + bend

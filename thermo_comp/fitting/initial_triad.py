@@ -74,7 +74,7 @@ def constant_calibration(
     starts = (np.where(half * 4.0 > np.max(half), scale, half / gravity) for scale in scales)
     tried = (_refine(means, gravity, bias, scale, misalignment_sd) for scale in starts)
     calibration, rms = min(tried, key=lambda fitted: fitted[1])
-    # Refuse a very large ellipsoid with a far centre, which means on no ellipsoid may fit.
+    # Readings on no ellipsoid may fit a very large one with a far centre: refuse such a fit.
     is_around = np.all(np.abs(calibration.bias - bias) < 2.0 * np.max(half))
     if not (is_around and rms < largest_rms):
         raise FitError(

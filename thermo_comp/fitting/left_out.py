@@ -211,8 +211,8 @@ def is_worse_by_norms(before: Score, after: Score) -> bool:
 def is_undecided(before: Score, after: Score) -> bool:
     """
     Whether left-out data do not decide between two models, given that `after` is not better: the
-    drifts agree to 5 %, and errors of |f| are smaller in `after` by more than one standard error
-    (not significantly), or no fold has an error of |f| for both models.
+    drifts agree to 5 %, and errors of |f| are smaller in `after` by more than one standard error,
+    or no fold has an error of |f| for both models.
     """
     *drift, norms = _beyond_thermometer(before, after)
     is_equal = all(abs(gain[0]) < _NEGLIGIBLE_LOG_RATIO for gain in drift if gain)
@@ -328,7 +328,7 @@ def _is_drift_determined(
 ) -> bool:
     """
     Whether the fit without a position, of covariance ``root @ root.T``, determines the drift in
-    `rows`: the drift's variance is below 10 (its variance by all positions + noise variance).
+    `rows`: the drift's variance is below 10 times (its variance by all positions + noise).
     """
     regression, sigma = point.regression, point.prior.sigma
     if not point.layout.used[0].any():
@@ -349,7 +349,7 @@ def _is_drift_determined(
 def _is_norm_determined(point: Point, posterior: PosteriorMode, root: Floats, p: int) -> bool:
     """
     Whether the fit without position `p`, of covariance ``root @ root.T``, determines |f| in `p`:
-    the variance of |f| is below 10 (its variance by all positions + variance of the offsets).
+    the variance of |f| is below 10 times (its variance by all positions + that of offsets).
     """
     if not point.regression.gravity:
         return False
