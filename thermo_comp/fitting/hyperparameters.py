@@ -4,8 +4,8 @@
 Owns the estimation of prior sds and noises, and the removal of columns of small log Bayes factor.
 
 Each column has one prior standard deviation of its weights in the bias of all axes and one in the
-scale. Each sd that is not fixed is found by MacKay's fixed point [1]_ with a log-normal hyperprior
-of the sd, of centre sd0 and variance tau^2 of log sd. The mode of log evidence plus log hyperprior
+scale. Newton's steps move each sd that is not fixed to the mode of log evidence [1]_ plus the log
+of a hyperprior, which is log-normal with centre sd0 and variance tau^2 of log sd. This mode
 satisfies ``effective parameters + log(sd / sd0) / tau^2 = sum w^2 / sd^2``, w being the weights of
 the column on the three axes. Without information about a column its prior sd stays at sd0.
 
