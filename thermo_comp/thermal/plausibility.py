@@ -131,7 +131,7 @@ class SensorCheck:
         (first_ns, wrong), (second_ns, second) = first
         step, after = second - wrong, celsius - second
         possible = LARGEST_RATE * (second_ns - first_ns) * 1e-9 + 2.0 * self._quantum
-        # In a ramp of constant rate: the change from the second to the third reading [K].
+        # If the step is due to a ramp: the change from the second to the third reading [K].
         continued = abs(step) * (stamp_ns - second_ns) / (second_ns - first_ns)
         is_step = abs(step) > possible + _NOISE_SDS * self.sensor.settings.noise_sd_c
         return is_step and abs(after) < CONTINUED_SHARE * min(abs(step), continued)
