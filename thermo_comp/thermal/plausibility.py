@@ -282,8 +282,8 @@ class LeadCheck:
     """
     Finds out whether the case or the board temperature changes first (leads) in a ramp.
 
-    While case and board temperature change in the same direction, their changes since the last
-    time of low rates are compared. Heat from outside changes the case temperature first. If the
+    While case and board temperature change in the same direction, their changes since both rates
+    were last low are compared. Heat from outside changes the case temperature first. If the
     board leads, the topics of case and board are swapped or the heat comes from inside; either
     way the gradient terms are wrong. `extra_variance` [K^2]: if the board may lead, the square of
     the difference between the changes of board and case temperature, else 0.
