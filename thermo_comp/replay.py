@@ -246,7 +246,7 @@ def _rows_of(table: AbstractContextManager[WriteRows]) -> Iterator[WriteBlock]:
 
 
 def _imu_of(block: Block, corrected: CompensatedBlock) -> ImuColumns | None:
-    """Return the Imu fields except force; covariance[0] = -1: no angular rate to correct."""
+    """Return the Imu fields except force; a rate with the covariance[0] -1 stays uncorrected."""
     if block.imu is None:
         return None
     imu = block.imu.take(corrected.index)

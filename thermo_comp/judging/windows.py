@@ -99,12 +99,12 @@ class JudgedWindows:
 
 
 def sum_length(window_s: float) -> float:
-    """Return the longest partial sum [s] of at most 10 s that divides `window_s` evenly."""
+    """Return the longest duration [s] of a partial sum, up to 10 s, that divides `window_s`."""
     return window_s / float(np.ceil(window_s / reduction.WINDOW_S))
 
 
 def usual_window(bags: Sequence[ReducedBag]) -> float:
-    """Return the window length [s]: 60 s rounded up to a multiple of the longest summing time."""
+    """Return the window length [s]: 60 s rounded up to a multiple of the longest partial sum."""
     longest = max(bag.window_s for bag in bags)
     return float(np.ceil(WINDOW_S / longest - 1e-6)) * longest
 

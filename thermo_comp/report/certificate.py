@@ -206,8 +206,8 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
         value, sd = evaluate(calibration, program, at)[2:]
         off = value - np.outer(at - calibration.reference_temperature_c, slope)
         value[:, :3] += bias_0 / MICRO_G
-        # Without a stated sd of gravity value and deviation are rounded by the uncertainty due to
-        # all else; if the calibration states no uncertainty, the largest values have 4 digits.
+        # If gravity has no stated sd, value and deviation are rounded by the uncertainty without
+        # gravity; if the calibration states no uncertainty, the largest values have 4 digits.
         largest = np.maximum(np.abs(value).max(axis=0), 1e-3)
         four_digits = 10.0 ** (np.floor(np.log10(largest)) - 2.0)
         digits = np.where(known * sd > 0.0, known * sd, four_digits)
@@ -266,7 +266,7 @@ def _rms(values: Floats) -> float:
 
 
 def programs(calibration: Calibration) -> list[Program]:
-    """List the tabulated cases: a soak and, if ramps differ, ramps at half the largest rates."""
+    """List a soak and, if the correction differs in ramps, ramps at half the largest rates."""
     static, dynamic = calibration.regime_sets()
     result = [Program('soak', static, 0.0)]
     if calibration.response or static != dynamic:

@@ -335,7 +335,7 @@ def span_of(bag: ReducedBag) -> tuple[int, float]:
 def widest(bags: Sequence[ReducedBag]) -> int:
     """Return the index of the bag with the widest range of T_board; if several, the longest."""
     spans = [float(np.ptp(bag.board.value)) if len(bag.board.value) else 0.0 for bag in bags]
-    # Ranges within 5 %, and durations within 1 min, count as equal: then the first bag is taken.
+    # T_board ranges within 5 % count as equal, as do durations within 1 min: the first bag wins.
     candidates = [i for i, span in enumerate(spans) if span >= 0.95 * max(spans)]
     return max(candidates, key=lambda i: (round((bags[i].end_ns - bags[i].start_ns) / 60e9), -i))
 

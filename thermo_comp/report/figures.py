@@ -26,7 +26,7 @@ from .certificate import Curve, curves, slopes
 from .evidence import CHOSEN, LEFT_OUT, RAW, Evidence, Position, ShownBag, required
 from .style import minus, number
 
-# Time at the start of each position in which the mean reading counts as zero drift [s].
+# Time from the start of a position over which the mean reading is the zero of drift [s].
 _ZERO_S = 120.0
 _SHADE = '#E9E9E9'
 # Diameter of the ring of the position with the largest residual [pt].

@@ -70,7 +70,7 @@ class ThermalNetwork:
         return {AIR: -1, **{name: i for i, name in enumerate(self.nodes)}}
 
     def system(self) -> tuple[Floats, Floats, Floats]:
-        """Return A, b, p of ``dx/dt = A x + b u + p`` all heat paths linear; A: shape (k, k)."""
+        """Return A, b, p of ``dx/dt = A x + b u + p``, as if heat paths were linear; A: (k, k)."""
         n, index = len(self.nodes), self._places
         size = n + (self.thermostat is not None)
         both, p = np.zeros((size + 1, size + 1)), np.zeros(size)
@@ -96,7 +96,7 @@ class ThermalNetwork:
         return A, b, p
 
     def convection(self, state: Floats, air: float) -> Floats:
-        """Return the part of ``dx/dt`` due to exponents of heat paths other than 1, shape (k,)."""
+        """Return what exponents of heat paths other than 1 add to ``dx/dt``, shape (k,)."""
         index, at = self._places, np.append(state, air)
         flow = np.zeros(len(at))
         for link in self.links:

@@ -26,8 +26,8 @@ BOARD_INPUT: Final = 'board'
 #: Relative jitter on the diagonal of the start covariance: lags of similar time constants are
 #: almost collinear, and their covariance would not be invertible.
 START_JITTER: Final = 3e-4
-#: Prior sd of a lag's initial state [K], for lags of the board temperature and of a gradient with
-#: the time constant `START_TAU_S` [s].
+#: Prior sd of a lag's initial state [K]: for lags of the board temperature, and for lags of a
+#: gradient, both with the time constant `START_TAU_S` [s].
 START_TAU_S: Final = 3600.0
 BOARD_START_SD: Final = 3.0
 GRADIENT_START_SD: Final = 1.0
@@ -66,11 +66,11 @@ class _Lag(NamedTuple):
 
 class Lag(_Lag, Quantity):
     """
-    T_board less that of a part which lags the board or, if `input` is a sensor, T_sensor less
-    T_board, lagged [K]. `tau_s` and `second_tau_s` are the time constants of two stages [s]; the
-    second is shorter, or 0 for a lag of one stage. A part may lag a temperature between board and
-    sensor: that of the board plus `sensor_share` of the gradient of `sensor`. `lead_s`: lag of the
-    board thermometer behind the temperature that drives the part [s].
+    T_board less the temperature of a part that lags the board or, if `input` is a sensor, the
+    lagged gradient of the sensor [K]. `tau_s` and `second_tau_s` are the time constants of two
+    stages [s]; the second is shorter, or 0 for a lag of one stage. A part may lag a temperature
+    between board and sensor: that of the board plus `sensor_share` of the gradient of `sensor`.
+    `lead_s`: lag of the board thermometer behind the temperature that drives the part [s].
     """
 
     @property
@@ -188,7 +188,7 @@ def start_root(lags: Sequence[tuple[Any, ...]]) -> Floats:
     The factor is also computed for a singular covariance, as of two nearly equal lags. The
     input before the first reading is modelled as a random walk with ``D = 2 sd^2 / START_TAU_S``
     [K^2/s]: lags k, l of one input have the covariance ``P_kl = D tau_k tau_l / (tau_k + tau_l)``,
-    lags of different inputs 0. In a time s P_kl falls by a factor ``exp(-s/tau_k - s/tau_l)``.
+    lags of different inputs 0. P_kl falls in s seconds by a factor ``exp(-s/tau_k - s/tau_l)``.
     """
     all_lags = [Lag(*lag) for lag in lags]
     terms = first_order_lags(all_lags)

@@ -243,7 +243,7 @@ def memory_on_grid(
     """
     Compute the results of `ThermalMemory.at`, except for rounding, on a uniform grid of times.
 
-    Returns (n, 2 * n_lags + n_plays): each lag [K] and a 0, then each play less its input [K].
+    Returns (n, 2 * n_lags + n_plays): each lag [K] and its variance 0, then plays less inputs [K].
     """
     inputs = dict(zip(spec.inputs, (board, *gradients), strict=True))
     first_order: dict[tuple[str, float], Floats] = {}

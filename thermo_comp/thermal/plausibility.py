@@ -131,7 +131,7 @@ class SensorCheck:
         (first_ns, wrong), (second_ns, second) = first
         step, after = second - wrong, celsius - second
         possible = LARGEST_RATE * (second_ns - first_ns) * 1e-9 + 2.0 * self._quantum
-        # In a ramp of constant rate: the change from the second to the third reading [K].
+        # If the step is due to a ramp: the change from the second to the third reading [K].
         continued = abs(step) * (stamp_ns - second_ns) / (second_ns - first_ns)
         is_step = abs(step) > possible + _NOISE_SDS * self.sensor.settings.noise_sd_c
         return is_step and abs(after) < CONTINUED_SHARE * min(abs(step), continued)
@@ -282,8 +282,8 @@ class LeadCheck:
     """
     Finds out whether the case or the board temperature changes first (leads) in a ramp.
 
-    While case and board temperature change in the same direction, their changes since the last
-    time of low rates are compared. Heat from outside changes the case temperature first. If the
+    While case and board temperature change in the same direction, their changes since both rates
+    were last low are compared. Heat from outside changes the case temperature first. If the
     board leads, the topics of case and board are swapped or the heat comes from inside; either
     way the gradient terms are wrong. `extra_variance` [K^2]: if the board may lead, the square of
     the difference between the changes of board and case temperature, else 0.

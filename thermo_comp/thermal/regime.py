@@ -79,8 +79,8 @@ class RegimeDetector:
         is_calm = self._case.is_calm(stamp_ns, case, change.swing)
         is_calm = self._board.is_calm(stamp_ns, board, change.swing) and is_calm
         if is_dynamic and not self._is_grown:
-            # A ramp's onset is detected while the rate is low. Until the rate exceeds a share of
-            # the relaxed rate, only its return to the baseline ends the dynamic state.
+            # A ramp's onset is detected at a low rate. Until the rate exceeds 1.5 times the
+            # relaxed rate, the dynamic state can only end when the rate is back at the baseline.
             self._is_grown = abs(lead.rate) > OBVIOUS_SHARE * self._relaxed_rate
             is_calm = is_calm and change.is_back()
         if not is_calm:
@@ -153,9 +153,8 @@ class _Watch:
         self._relaxed = settings.relaxed_rate_k_min / 60.0
         self._memory_s = 0.25 * sensor.lag_s
         self._stale_ns = round(0.5e9 * sensor.lag_s)
-        # An unchanged reading proves a low rate if it lasts longer than each of two times: in one
-        # the relaxed rate crosses a cell (one quantum); for the other a temperature stays in one
-        # cell while the smallest ramp reverses.
+        # A reading unchanged for `still_s` proves a low rate: the temperature would leave its cell
+        # (one quantum) at the relaxed rate, and also at a second derivative `bend` [K/s^2].
         quantum, bend = sensor.quantum_c, settings.smallest_ramp_k_min / 60.0 / sensor.lag_s
         still_s = max(quantum / self._relaxed, 2.0 * sqrt(2.0 * quantum / bend))
         self._still_ns = round(1e9 * still_s)
@@ -163,7 +162,7 @@ class _Watch:
         self._mean = 0.0
 
     def is_calm(self, stamp_ns: int, sensor: Thermometer | None, lead_swing: float) -> bool:
-        """Update a sensor's mean rate; return whether it is low; True if no reading is fresh."""
+        """Update a sensor's mean rate; return True if the rate is low or no reading is fresh."""
         seen_ns = None if sensor is None else sensor.stamp_ns
         if sensor is None or seen_ns is None or stamp_ns - seen_ns > self._stale_ns:
             return True

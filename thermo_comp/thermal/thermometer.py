@@ -270,7 +270,7 @@ class Thermometer:
         noise = self._noise
         if variance < 4.0 * noise:
             # The sd of the prediction is less than twice the noise: match the moments of the
-            # prediction truncated to the cell. Readings that flicker show the edge of a cell.
+            # prediction truncated to the cell. Flickering readings show the edge between cells.
             spread = variance + noise
             sd = sqrt(spread)
             low = (reading - half - expected) / sd
@@ -295,8 +295,8 @@ class Thermometer:
         box = half * half / 3.0
         if variance > box:
             return reading, variance * box / (variance - box)
-        # An estimate outside the reading's cell is corrected to the cell's edge. All readings in
-        # the time of a predicted change by one sd together have the weight of one measurement.
+        # An estimate outside the reading's cell is corrected to the cell's edge. The readings
+        # taken while the predicted temperature changes by one sd count as one measurement.
         if abs(expected - reading) > half:
             edge = reading + (half if expected > reading else -half)
             return edge, variance * max(1.0, sqrt(variance) / (abs(move) + 1e-30))

@@ -90,7 +90,7 @@ class ThermalTracker:
         usual_s = max(UNWATCHED_SHARE * lag_s, config.case_timeout_s)
         #: Time without a decision after which the regime is unknown [s].
         self._unwatched_s = min(usual_s, max(lag_s, self.settings.board.lag_s))
-        # Set the lag in a copy of the board's check: another tracker may share the original.
+        # Set the lag in a copy of the board's plausibility check: other trackers may share it.
         self.checks = {**self.checks, BOARD_INPUT: copy(self.checks[BOARD_INPUT])}
         self.checks[BOARD_INPUT].lag_s = board_lag_s
 
@@ -300,7 +300,7 @@ class ThermalTracker:
         is_known = name == self.spec.sensors[0] and upper < inf
         usual = 0.5 * (lower + upper) if is_known else 0.0
         gradient = self._rest_gradients.get(name, usual) + lag * rate
-        # Largest change of the case temperature since the board's extrapolation ended [K].
+        # Largest change of the case temperature since the end of the board's extrapolation [K].
         unseen = self.settings.case.fastest_ramp_k_min / 60.0 * self.board.beyond(stamp_ns)
         variance = (
             (LOST_GRADIENT_RELATIVE_SD * gradient) ** 2

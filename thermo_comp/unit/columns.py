@@ -32,8 +32,8 @@ from .terms import GROUPS, LINE, TERMS, Term
 
 UNBOUNDED: Final = (-1e9, 1e9)
 #: Time constants of the columns of `bank` [s], in steps of a factor sqrt(2), from a few reading
-#: intervals to the longest lag that bags determine. Columns linear in a lag have all 15 time
-#: constants: their sums approximate a lag of any time constant. Products and powers of lags
+#: intervals to the longest lag that bags determine. Columns linear in a lag are made for all 15
+#: time constants: sums of them approximate a lag of any time constant. Products and powers of lags
 #: have smaller effects than the lags, so every second time constant suffices for them.
 FINE_TAUS: Final = tuple(np.geomspace(60.0, 7680.0, 15).round(9).tolist())
 BANK_TAUS: Final = FINE_TAUS[::2]
@@ -174,7 +174,7 @@ def bank(
     """
     Return all candidate columns, with ranges that contain every value. `at_rest`: gradient of each
     sensor in a soak [K]; `span_k`: lowest and highest board temperature in the data, less the
-    reference [K]; `parts`: lags of the part of each axis; if given, all lags are from `parts`.
+    reference [K]; `parts`: the lag of the part of each axis; if given, no other lags are used.
     """
     fine, coarse, of_plays, of_bends = (
         list(map(Part, taus)) for taus in (FINE_TAUS, BANK_TAUS, PLAY_TAUS, BEND_TAUS)
@@ -301,7 +301,7 @@ class ColumnTable:
         return hold(raw, *self._range)
 
     def excess(self, raw: Floats) -> Floats:
-        """Return (1 + e)^(1 / order) - 1, e the distance of u from its range [half ranges]."""
+        """Return (1 + e)^(1 / n) - 1; u, of order n in T, is e half ranges outside its range."""
         lower, upper = self._range
         excess = np.asarray(np.abs(raw - self.held(raw)) / ((upper - lower) / 2.0))
         for order in {*self._orders.tolist()} - {1}:

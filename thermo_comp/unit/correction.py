@@ -32,7 +32,7 @@ from .nonlinearity import ForceCorrection, beyond_force
 #: faster transition is lengthened, by a factor of at most `LONGEST_TRANSITION`.
 GENTLE_RATE = MICRO_G
 LONGEST_TRANSITION = 10.0
-#: Number of board temperatures at which slopes of curves, and dynamic less static, are evaluated.
+#: Number of board temperatures at which slopes and dynamic less static curves are evaluated.
 _GAP_TEMPERATURES = 33
 #: Variance of rounding [counts^2]: twice 1/12, as the converter adds the remainder to the next
 #: cycle.
@@ -254,7 +254,7 @@ class Correction:
         static_weight, beyond_range = 1.0 - weight, raw - held
         excess, _, relative, by_rate = self.curves.excess(states)
         if not self._has_lags:
-            # If columns have lags, the columns' excess (`columns_out`) replaces that of the rate.
+            # The rate's distance from its range counts only if no column has a lag.
             relative = relative + by_rate
         outside = static_weight * relative[0] + weight * relative[1]
         shares = np.array([static_weight + unknown * weight, weight + unknown * static_weight])

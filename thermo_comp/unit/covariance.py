@@ -68,7 +68,7 @@ class CovarianceMap:
         factors = sums[:, u, w]
         # The row b of an axis is twice the covariance of its constant error and its scale error.
         factors[:, 1:9:3] /= 2.0
-        # Each coefficient of xx, ..., zz is a weighted sum of few rows: keep indices and weights.
+        # Coefficients of xx, ..., zz are sums of few rows of the covariance of u: keep only these.
         n = int((factors != 0.0).sum(axis=1).max())
         self._places = np.argsort(factors == 0.0, axis=1, kind='stable')[:, :n]
         self._factors = np.take_along_axis(factors, self._places, axis=1)[:, :, np.newaxis]

@@ -204,7 +204,7 @@ class Exponential(_Family):
         return self.amplitudes
 
     def with_free(self, values: tuple[float, ...], at_reference: float) -> Exponential:
-        """Return a sum of the exponentials `e_fold_k`, with the amplitudes `values`."""
+        """Return exponentials of the present e-folds, with the amplitudes `values`."""
         return replace(self, constant=at_reference - math.fsum(values), amplitudes=values)
 
     def _evaluate(self, t: Floats, *, is_slope: bool = False) -> Floats:
@@ -215,7 +215,7 @@ class Exponential(_Family):
         return np.asarray(result)
 
     def basis(self, t: Kelvins) -> list[Floats]:
-        """Evaluate the derivatives w.r.t. the amplitudes; the value at t = 0 stays constant."""
+        """Evaluate derivatives by the amplitudes, at a constant value of the function at t = 0."""
         return [by_element(math.exp, t / e_fold) - 1.0 for e_fold in self.e_fold_k]
 
 

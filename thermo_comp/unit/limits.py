@@ -25,7 +25,7 @@ from .schema import broken
 if TYPE_CHECKING:
     from .calibration import Calibration
 
-#: Limits of the scale's curves less, and plus, the largest effect of all columns on the scale.
+#: Limits of the relative scale: curve less, and plus, the largest effect of all columns.
 SMALLEST_RELATIVE_SCALE, LARGEST_RELATIVE_SCALE = 0.1, 10.0
 #: Largest bias / full scale; samples in an offset code have a bias of half of their range.
 FULL_SCALES = 2.0

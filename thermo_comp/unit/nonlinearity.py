@@ -124,8 +124,8 @@ def unit_of(kind: Kind) -> float:
 def linearised(x: Real, k2: Real, kq: Real, k3: Real) -> Real:
     """
     Solve ``x = f + k2 f^2 + kq |f| f + k3 f^3`` for f by one step of Halley's method from x. The
-    error of the result is about (k^2 - k3) (x - f)^3 with k = k2 + kq sign(f). At f = 10 g it is
-    1e-14 g for k2 = 100 ug/g^2, 1e-11 g for k3 = 10 ug/g^3.
+    error of f is about (k^2 - k3) (x - f)^3 with k = k2 + kq sign(f): at f = 10 g 1e-14 g for
+    k2 = 100 ug/g^2, 1e-11 g for k3 = 10 ug/g^3.
     """
     r = k3 * x * x
     s = k2 * x + kq * abs(x) + r
@@ -172,8 +172,8 @@ def nonlinear_covariance(
 
 class BeyondForce(NamedTuple):
     """
-    The variance of an unknown square term that begins at the force `edge` [m/s^2]. `growth`:
-    this variance / (2 d)^4, with d = |x| - `edge` [m/s^2].
+    The variance of the force due to an unknown square term that begins at the force `edge`:
+    ``growth (2 d)^4`` [m^2/s^4], with d = |x| - `edge` [m/s^2]; 0 below `edge`.
     """
 
     edge: float

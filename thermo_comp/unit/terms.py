@@ -6,9 +6,9 @@ Owns the table of the kinds of regressors of the thermal response.
 The value of a column is ``u = form.value(x)``, ``x = (n - centre) / width``; n is a quantity of
 the thermal state (`source`) or, if `is_temperature`, ``t - source``: the temperature of a part
 that lags the board by `source`, less T_ref. Notation: ``t = T_board - T_ref``, ``g_s = T_s -
-T_board`` of a sensor s, and ``q_s = g_s - rest``. The constant `rest` is 0, or the gradient in a
-soak if self-heating warms the board above the case. Even functions of the gradient q_s have equal
-values in heating and in cooling at the same rate.
+T_board`` of a sensor s, and ``q_s = g_s - rest``. The constant `rest` is 0 or, in a unit that
+heats itself, g_s in a soak. Even functions of q_s have equal values in heating and in cooling at
+the same rate.
 """
 
 from __future__ import annotations
@@ -76,11 +76,11 @@ class Term:
     has_scale: bool = True
 
     def centre(self, column: Column) -> float:
-        """Return the centre in ``x = (n - centre) / width`` of a column."""
+        """Return a column's centre of n, a quantity of the state: ``x = (n - centre) / width``."""
         return float(getattr(column, self.centre_key, 0.0))
 
     def width(self, column: Column) -> float:
-        """Return the width in ``x = (n - centre) / width`` of a column."""
+        """Return a column's width of n, a quantity of the state: ``x = (n - centre) / width``."""
         return float(getattr(column, self.width_key, 1.0))
 
     def largest(self, column: Column) -> float:
@@ -132,7 +132,7 @@ _ALL: Final = (
     # `board`: for a part that lags the board; `gradient_lag`: for a part between thermometers.
     Term('board', 'T_board - lagged T_board', _part, positive=('tau_s',)),
     Term('gradient_lag', 'lagged g_s', _lagged_gradient, positive=('tau_s',)),
-    # With lag: term of a curve over a part's temperature; without lag: square of a heat flow.
+    # `square`: with a lag, a curve over a part's temperature; without, the square of a heat flow.
     Term(
         *('square', '(T_board - lagged T_board)^2, or q_s^2 without lag', _part_or_gradient),
         *(_SQUARE, 2, 'rest_k'),
