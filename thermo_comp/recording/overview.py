@@ -30,7 +30,7 @@ _GAP_INTERVALS = 5.0  # shortest gap, in median intervals between samples
 # Largest share of samples of exactly 0 that is taken for glitches, and share of messages marked as
 # without acceleration above which the whole recording counts as without acceleration.
 _GLITCH_SHARE, _FAULT_SHARE = 0.01, 0.5
-# Ratio of |a| at rest to gravity: range with gravity, upper limit if gravity is subtracted.
+# Ratio |a| / gravity at rest: range if a contains gravity, upper limit if gravity is subtracted.
 _WITH_GRAVITY, _WITHOUT_GRAVITY = (0.8, 1.25), 0.3
 _NO_SAMPLES = (
     'no accelerometer samples: record accel/counts or imu/uncompensated, or name another topic '
