@@ -78,7 +78,7 @@ class RestSeries:
 
     @property
     def day(self) -> Ints:
-        """Day on which the node started, for each rest [days since 1970]."""
+        """Day of the first rest after the start of the node, for each rest [days since 1970]."""
         _, first = np.unique(self.start, return_index=True)
         return np.asarray(np.floor(self.time[first])[self.start], dtype=np.int64)
 
