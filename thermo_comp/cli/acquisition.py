@@ -27,7 +27,7 @@ _REST_S = 10.0
 _CELL_S, _SAMPLES_TO_BEGIN = 0.5, 30
 # Number of earlier cells that each search for rests includes, besides the new cells.
 _LOOKED_BACK = 200
-# Sd of the mean force in a position due to hysteresis, mounting and drift, after any rest [g].
+# Sd of a position's mean force due to hysteresis, mounting and drift, even in a long rest [g].
 _FLOOR_SD = 2e-5
 # A position is 'restless' if its noise is above `_RESTLESS` times the median of all positions. A
 # later still interval is a rest if its noise is below `_LOUDEST` times the noise of the rests.
