@@ -27,7 +27,7 @@ _REST_S = 10.0
 _CELL_S, _SAMPLES_TO_BEGIN = 0.5, 30
 # Number of earlier cells that each search for rests includes, besides the new cells.
 _LOOKED_BACK = 200
-# Sd of the mean force in a position due to hysteresis, mounting and drift, however long the rest.
+# Sd of a position's mean force due to hysteresis, mounting and drift, even in a long rest [g].
 _FLOOR_SD = 2e-5
 # A position is 'restless' if its noise is above `_RESTLESS` times the median of all positions. A
 # later still interval is a rest if its noise is below `_LOUDEST` times the noise of the rests.
@@ -94,7 +94,7 @@ class _Rest:
 
 
 class Acquisition:
-    """A running test; `soak_s`: wanted duration of a rest [s], `offset`: reading at 0 g."""
+    """A running test; `soak_s`: wanted time at rest per position [s], `offset`: reading at 0 g."""
 
     def __init__(self, n_positions: int, soak_s: float, offset: float = 0.0) -> None:
         self._n_wanted, self._soak_s, self._offset = n_positions, soak_s, offset

@@ -33,11 +33,11 @@ _CELSIUS = {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}
 #: Range of plausible intervals between samples [s], which decides the unit of the times.
 _STEPS_S = (5e-5, 0.5)
 #: An interval up to `_SLOW_S` [s] is plausible if the unit turns by over `_TURN` [rad] between
-#: still blocks (`_BLOCK` samples, sd below `_QUIET` [g]): with times in ms, too fast for a hand.
+#: still blocks (`_BLOCK` samples, sd below `_QUIET` [g]): in ms, no hand turns a unit so fast.
 _SLOW_S, _BLOCK, _TURN, _QUIET = 2.0, 12, 0.5, 0.02
 _FASTEST_RAD_S = 20.0  # largest angular rate of a unit that is turned by hand [rad/s]
 #: Stamps of the years 2000 to 2038, and their largest interval [s]. A time since power-up in us,
-#: read as seconds, may be a date of these years, but rises by over 60 s from row to row.
+#: read as seconds, may look like a date up to 2038, but rises by over 60 s from row to row.
 _SINCE_1970_S, _SINCE_1970_STEP_S = (946_684_800.0, 2_147_483_648.0), 60.0
 #: Largest ratio of the range of temperatures in a log to the duration of the log [K/s]; a hair
 #: dryer warms a board by some 0.1 K/s.

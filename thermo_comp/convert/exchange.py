@@ -4,8 +4,8 @@
 Owns the export of calibrations to the files of other tools, and the import of such files.
 
 All tools correct a reading N to a specific force ``a = A (N - b)``. In autopilots the bias b
-depends on temperature and A is the identity; in tools for tumble tests b and A are constant. The
-notes of an export name the parts of the calibration that are lost, most with the resulting error.
+depends on temperature and the matrix A is the identity; in tools for tumble tests b and A are
+constant. An export's notes name the lost parts of the calibration, most with the resulting error.
 """
 
 from dataclasses import replace
@@ -225,7 +225,7 @@ def import_calibration(
         )
     (_, _, _), (yx, _, _), (zx, zy, _) = (matrix * K).tolist()
     if not is_si:
-        # Readings around an offset, such as 32768 counts, reach the offset plus the full scale.
+        # With an offset, such as 32768 counts, readings reach the offset plus the full scale.
         full_scale = full_scale * float(K.max()) + float(np.abs(content.bias[:, 0]).max())
     unity = Polynomial((1.0,))
     x_set, y_set, z_set = (unit.AxisSet(curve, unity) for curve in _curves(content.bias))

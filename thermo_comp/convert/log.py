@@ -231,7 +231,7 @@ def _refuse_wrong_units(log: ForeignLog, stillness: Stillness) -> None:
 def _log_times(stamp_ns: Ints, shifts: Ints | None = None) -> tuple[Ints, Ints]:
     """
     Return log times that never decrease, and the shift added after each restart of the clock [ns].
-    For a thermometer, give the `shifts` of the samples, so that readings get the same shifts.
+    Stamps of readings get the shifts of the samples' stamps, which the caller gives as `shifts`.
     """
     is_restart = np.diff(stamp_ns, prepend=stamp_ns[:1]) < -_RESTART_NS
     if shifts is None or len(shifts) != is_restart.sum():

@@ -127,12 +127,12 @@ class Rows:
 
     @property
     def by_slope(self) -> Floats:
-        """Derivatives by the slopes of the bias over temperature, (n, 3)."""
+        """Derivatives of `y` by the slopes of the bias over temperature, (n, 3)."""
         return np.asarray(self.by_level[:, :3] * self.warmth[:, np.newaxis])
 
     @property
     def by_jump(self) -> Floats:
-        """Derivatives by jumps of bias and scale (times `_JUMP_SHARES`) and of gravity, (n, 7)."""
+        """Derivatives of `y` by jumps: levels (times `_JUMP_SHARES`) and gravity, (n, 7)."""
         return np.column_stack((self.by_level * _JUMP_SHARES, self.by_gravity))
 
     def at(self, chosen: Bools) -> Rows:

@@ -4,10 +4,10 @@
 Owns rests as measurements of the error of a calibration: ``|f| - g`` and its derivatives.
 
 A rest at an unknown attitude measures one number, |f|. Let x be the forces along the axes, f = M
-x, u = f / |f| and v = M^T u. If the bias of axis i in the calibration is too large by d_bias
-[input units] and its scale by d_scale [relative], |f| changes by ``-v_i (d_bias + K_i x_i d_scale)
-/ scale_i``. To first order ``|f| - g`` is the matrix H of derivatives by all parameters times the
-true less the calibrated parameters, plus noise.
+x, u = f / |f| and v = M^T u. A bias of axis i that is too large by d_bias [input units], and a
+scale too large by d_scale [of K_i], change |f| by ``-v_i (d_bias + K_i x_i d_scale) /
+scale_i``, scale_i: scale factor at the rest. To first order ``|f| - g`` is noise plus H times the
+errors of all parameters (true less calibrated); H: derivatives of |f| by these errors.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class RestSeries:
 
     @property
     def day(self) -> Ints:
-        """Day on which the node started, for each rest [days since 1970]."""
+        """Day of the first rest after the start of the node, for each rest [days since 1970]."""
         _, first = np.unique(self.start, return_index=True)
         return np.asarray(np.floor(self.time[first])[self.start], dtype=np.int64)
 
@@ -185,7 +185,7 @@ def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
     includes ageing [both in days since 1970], and whether it is an update.
 
     An update was determined at its last rest, another calibration at the date of the test or file;
-    without a date, the two times are -inf.
+    without a date, both returned times are -inf.
     """
     every = (source.name for source in calibration.provenance.sources)
     names = [name for name in every if name.startswith(_UNTIL)]
@@ -264,7 +264,7 @@ def series_of(
 
 
 def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
-    """Return the indices of the state elements of `wanted`, and of its lags, in `memory`."""
+    """Return the indices in `memory` of the state elements, and of the lags, of `wanted`."""
     try:
         logged, target = StateLayout(memory).numbers, StateLayout(wanted).numbers
         places = np.array([logged.index(number) for number in target], np.int64)
@@ -322,7 +322,7 @@ def _uncertainty(
     regimes = np.array([1.0 - weight, weight])
     unexplained = correction.curves.unexplained(at.states[:, BOARD])
     # The ageing model has separate terms for the residual sd and the lack of fit: subtract both
-    # variances from `slow`, which in an unknown regime has those of the static and dynamic sets.
+    # variances from `slow`; in an unknown regime, those of the static and of the dynamic set.
     of_sets = regimes + unknown * regimes[::-1]
     slow -= (at.v.T**2 * (of_sets[:, np.newaxis] * unexplained).sum(axis=0)).sum(axis=0)
     residual = [[a.residual_sd_m_s2**2 for a in part.axes()] for part in calibration.regime_sets()]
@@ -331,7 +331,7 @@ def _uncertainty(
 
 
 def _variance_along(correction: Correction, slow: SlowUncertainty, at: _Geometry) -> Floats:
-    """Return the variance of |f| from `slow` and all else but the noise of a sample, (n,)."""
+    """Return the variance of |f|, (n,), due to `slow` and all else but the samples' noise."""
     columns, x = at.states.T, at.x.T
     line = list(correction.line(columns, columns, slow.at(columns, at.shares.T), 0.0))
     if correction.of_force is None:

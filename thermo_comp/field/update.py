@@ -146,7 +146,7 @@ def update(
     determined, by_axis = _axis_changes(used, calibration, model, solution, ageing)
     judged = _judged(used, model, solution, determined)
     shift, kept = solution.shift * determined, solution.shift * ~determined
-    # The estimated shift of a parameter that is not updated is an error: add its square.
+    # The shift of a parameter that is not updated remains as an error: add its square.
     covariance = solution.posterior + solution.future + np.outer(kept, kept)
     turn_on = float(np.hypot(ageing.turn_on, ageing.rest))
     new = _shifted(calibration, shift, covariance)
@@ -242,7 +242,7 @@ def _axis_changes(
 
 
 def _judged(series: RestSeries, model: Model, solution: Solution, determined: Bools) -> Judged:
-    """For each day (if under 5: node start) score the update by rests of earlier starts."""
+    """Score on each day (under 5 days: each node start) an update by rests of earlier starts."""
     over, labels = 'days', series.day
     if len(np.unique(labels)) < 5:
         over, labels = 'starts', series.start
@@ -304,7 +304,7 @@ def _shifted(calibration: Calibration, shift: Floats, covariance: Floats) -> Cal
 
 
 def _with_residual(part: RegimeSet, turn_on: float, changes: Sequence[AxisChange]) -> RegimeSet:
-    """Set the residual sd: `turn_on` on determined axes, at least `turn_on` on all others."""
+    """Set each axis' residual sd: `turn_on` if determined, at least `turn_on` if not."""
     axes: dict[str, Any] = {}
     for axis, change in zip(part.axes(), changes, strict=True):
         sd = turn_on if change.is_determined else max(turn_on, axis.residual_sd_m_s2)

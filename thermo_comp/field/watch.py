@@ -250,7 +250,7 @@ def passage(
     size, vectors = np.linalg.eigh(covariance + np.outer(mean, mean) + walk @ walk.T)
     onto = vectors[:, size > 1e-6 * size[-1]].T
     mean, covariance = onto @ mean, onto @ covariance @ onto.T
-    # A triangular factor of the walk's covariance needs one normal variable per direction.
+    # A square factor of the walk's covariance needs only one normal variable per direction.
     walk = np.transpose(np.linalg.qr((onto @ walk).T, mode='r'))
     values, vectors = np.linalg.eigh(covariance)
     initial = vectors * np.sqrt(np.maximum(values, 0.0))
@@ -271,8 +271,8 @@ def passage(
         error = error + (speed * np.sqrt(step))[:, np.newaxis] * moved
         size = np.sqrt(np.einsum('ij,ij->i', error, error))
         # A Brownian bridge with the distances a and b from the bound at two times crosses the
-        # bound between the times with the probability exp(-2 a b / variance); variance: of the
-        # walk's change between the times, along the error vector.
+        # bound between the times with the probability exp(-2 a b / variance), `variance` being
+        # that of the walk's change between the times along the error vector.
         onto_walk = error @ walk
         along = np.einsum('ij,ij->i', onto_walk, onto_walk) * speed**2 * step
         product = left * np.maximum(bound - size, 0.0) * size**2

@@ -124,8 +124,8 @@ def _push(
     while arrivals and arrivals[-1][0] <= place:
         _, _, name, stamp_ns, celsius = arrivals.pop()
         if len(thermal.queue) >= PENDING_LIMIT:
-            # The node applies waiting readings while no samples come; here, old readings of a full
-            # queue are applied: after the first sample, only those stamped up to `due_ns`.
+            # The node applies waiting readings while no samples come; here, if the queue is full,
+            # its old readings are applied: after the first sample, those stamped up to `due_ns`.
             limit_ns = NEVER_NS if compensator.now_ns is None else due_ns
             thermal.flush(min(limit_ns, stamp_ns - DISORDER_NS))
         thermal.push(name, stamp_ns, celsius)

@@ -274,7 +274,7 @@ class GravityCheck:
     def add(
         self, stamp_ns: int, force: Sequence[float], covariance: Sequence[float], noise: float
     ) -> None:
-        """Add a force [m/s^2], its covariance (xx to zz) and the trace of its noise covariance."""
+        """Add a sample: force [m/s^2], covariance (xx to zz), trace of the noise covariance."""
         self._watch_step(stamp_ns, force, covariance, noise)
         since_ns, step_ns = stamp_ns - self._begin_ns, stamp_ns - self._last_ns
         if not (0 <= since_ns < LONGEST_WINDOW_NS and 0 <= step_ns < 3 * WINDOW_NS):

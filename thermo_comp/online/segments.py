@@ -84,7 +84,7 @@ class Model:
         self.inputs = (BOARD_INPUT, *calibration.sensors)
 
     def slow_rows(self, held: Sequence[SlowState]) -> Floats:
-        """Evaluate the slowly varying variances, of force (`n_slow` rows) and angular rate."""
+        """Return the slowly varying variances: `n_slow` rows of force, then angular rate."""
         states, shares, rates = (np.array(part).T for part in zip(*held, strict=True))
         return np.concatenate([part.at(states, shares, rates) for part in self.uncertainty])
 

@@ -29,7 +29,7 @@ _PERIOD_S = 1.0  # shortest pause between two passes over the growing bag [s]
 _NEVER_NS = 2**63 - 1
 #: Hidden name of an unfinished bag: number of the bag, and id of the process that writes the bag.
 _LEFT = re.compile(r'\.(?P<number>\d+)\.(?P<process>\d+)-[0-9a-f]+\.partial\.mcap')
-_SHARE = 0.2  # largest duration of a pass, as a fraction of the pause after the pass
+_SHARE = 0.2  # largest duration of a pass over the bag / pause after the pass
 
 #: A new block with its serialized messages, and a description of its bag (None: live topics).
 News = tuple[Block, RecordingInfo | None]

@@ -201,7 +201,7 @@ class CellAccumulator:
         gaps = steps[steps > 10.0 * step]
         if gaps.sum() > 0.5 * steps.sum():
             # A driver that polls a buffer sends bursts at a constant interval below 5 s: a cell is
-            # two intervals or longer. Pauses between hand-held positions are irregular or longer.
+            # two intervals or longer. Pauses between positions by hand are irregular or over 5 s.
             usual = float(np.median(gaps))
             is_regular = np.mean(np.abs(gaps - usual) < 0.2 * usual) > 0.9
             if is_regular and usual < 5e9:

@@ -32,8 +32,8 @@ from .waitloop import WaitLoop, overrides
 
 NODE_NAME = 'thermo_comp'
 
-#: Pause after a wake-up [s], for best-effort samples at 7 kHz or more. Such a pause saves a third
-#: of the CPU time at 10 kHz, but delays a sample at 5 kHz by more than the correction takes.
+#: Pause after a wake-up [s], for best-effort samples at 7 kHz or more. The pause saves a third
+#: of the CPU time at 10 kHz; at 5 kHz it would delay a sample by more than the correction takes.
 REST_S = 0.2e-3
 
 #: Time within which the process ends after a signal, even if a call hangs [s].

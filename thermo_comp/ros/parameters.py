@@ -30,7 +30,7 @@ from ..recording.topics import Topics, parse_name, read_names
 from ..text import LONGEST_SERIAL, one_line
 from .waitloop import WaitLoop, overrides
 
-#: Largest number of waiting requests, and of parameters in a request.
+#: Largest number of waiting requests with a `calibration_file`, and of parameters in a request.
 WAITING_LIMIT, PARAMETERS_LIMIT = 64, 256
 LONGEST_FRAME = 255  # longest frame name that may be set [bytes]
 _LONGEST_REASON = 1000  # longest reason of a refusal, which may quote the request [characters]

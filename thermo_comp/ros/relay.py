@@ -29,7 +29,7 @@ from .reader import LoadedCalibration
 from .rest_log import BLOCK, RestKeeper
 from .waitloop import RawSubscription, RCLError, WaitLoop
 
-#: Without samples, a reading is used once a reading stamped at least this much later arrives [ns].
+#: While no samples come, a reading is used once another is stamped this much later [ns].
 IDLE_NS = 1_000_000_000
 
 # A received temperature: time of reception [ns]; thermometer, stamp [ns], degC.
@@ -217,7 +217,7 @@ class Relay:
                 self._readings.append((received, (name, *reading)))
 
     def _relay_with_readings(self, messages: list[bytes], received_ns: list[int]) -> list[bytes]:
-        """Relay samples and readings as they arrived; return samples after the last reading."""
+        """Relay samples and readings as they arrived; return the samples after all readings."""
         start, push = 0, self.running.compensator.push
         self._readings.sort(key=itemgetter(0))
         n = bisect_right(self._readings, received_ns[-1], key=itemgetter(0))

@@ -26,7 +26,7 @@ from ..thermal.state import StateLayout
 from ..typing import Floats, Stamps
 from .reader import LoadedCalibration
 
-#: Number of messages that are summed at a time; fewer if a report is due earlier.
+#: Number of messages that the rest log sums at a time; fewer if a report is due earlier.
 BLOCK = 1024
 #: Largest size of the file of a day, and of the folder [bytes]; a month takes at most 10 MB.
 DAY_BYTES, FOLDER_BYTES = 320_000, 64_000_000
@@ -42,7 +42,7 @@ _JUMP_NS = 10**9
 # First bytes of a message in little-endian CDR; offsets of counts, force and angular rate from the
 # end of a message [bytes].
 _PLAIN, _COUNTS, _FORCE, _RATE = (0, 1, 0, 0), -24, -96, -192
-_SHORTEST = {False: 44, True: 316}  # length of the shortest message [bytes]; True: Imu
+_SHORTEST = {False: 44, True: 316}  # length of the shortest message [bytes], by `is_imu`
 
 
 class RestLog:
@@ -209,7 +209,7 @@ class RestKeeper:
 
 
 def samples_of(messages: Sequence[bytes], *, is_imu: bool) -> tuple[Stamps, Floats]:
-    """Read stamps [ns] and samples of the little-endian messages as long as the last one."""
+    """Read stamps [ns], samples of little-endian messages whose length is that of the last."""
     size = len(messages[-1]) if messages else 0
     # A message shorter than one with an empty frame_id is malformed.
     if size < _SHORTEST[is_imu]:
