@@ -110,7 +110,7 @@ def check_mcap(data: bytes) -> None:
             BAG.write_bytes(data)
             with open_recording(BAG, require=()) as reader:
                 n = sum(block.n_messages for block in reader.blocks())
-                # A message has at least 22 bytes, and zstd expands a byte to at most 30 kB.
+                # A message record has at least 31 bytes, and zstd expands a byte to at most 30 kB.
                 assert n <= 1000 * len(data), n
         except RecordingError as error:
             assert '\n' not in str(error), error
