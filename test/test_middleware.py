@@ -115,7 +115,7 @@ def wakes_per_sample(peer, drivers, node_arguments):
 
 
 def test_samples_do_not_wake_the_event_thread(peer, node_arguments, tmp_path, monkeypatch):
-    # With a profile without the node's settings, each sample or group of samples wakes the thread.
+    # With another Fast DDS profile each sample, or group of them, wakes the node's event thread.
     other = tmp_path / 'other.xml'
     other.write_text(OTHER)
     monkeypatch.setenv(VARIABLE, str(other))

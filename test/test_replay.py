@@ -158,7 +158,7 @@ def test_an_imu_is_refused_by_a_calibration_of_counts(tmp_path):
 
 
 def test_memory_does_not_grow_with_the_bag(tmp_path, monkeypatch):
-    # Blocks of 2048 messages give the short bag many blocks; a cycle of 2 ms allows 500 Hz.
+    # With blocks of 2048 messages each bag has many blocks; a unit cycle of 2 ms allows 500 Hz.
     monkeypatch.setattr('thermo_comp.recording.blocks.BLOCK_MESSAGES', 1 << 11)
     calibration = rich_calibration()
     unit = dataclasses.replace(calibration.unit, cycle_time_s=0.002)

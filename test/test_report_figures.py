@@ -76,7 +76,7 @@ def test_position_errors_of_a_navigator_agree_with_hand_numbers():
 def test_the_map_of_the_sphere_preserves_areas():
     assert figures.equal_area((0.0, 0.0, 1.0), 1) == (0.0, 0.0)
     assert figures.equal_area((0.0, 1.0, 0.0), -1) == (0.0, 1.0)
-    # The cap above 45 degrees has 1 - sin 45 of the area of a hemisphere, and of the disc.
+    # The cap above 45 degrees covers 1 - sin 45 of the hemisphere, its map as much of the disc.
     x, y = figures.equal_area((np.sqrt(0.5), 0.0, np.sqrt(0.5)), 1)
     assert x**2 + y**2 == pytest.approx(1.0 - np.sqrt(0.5))
 
@@ -168,7 +168,7 @@ def test_the_figure_of_rates_shows_the_bias_of_the_gyroscope():
         celsius, drawn = np.array(soak.get_data(), dtype=float)
         bias = np.degrees(curve.bias_function.value(celsius - 20.0)) * 1e3
         slope = np.polyfit(celsius, bias, 1)[0]
-        # The figure shows the gyroscope's bias less a line in temperature [mdeg/s].
+        # The figure shows the gyroscope's bias minus its linear fit over temperature [mdeg/s].
         np.testing.assert_allclose(drawn, bias - slope * (celsius - 20.0), atol=1e-9)
         assert f'{slope:+.3g}'.replace('-', '\u2212') in axes.get_title(loc='left')
     names = [figure.name for figure in figures_of(replace(evidence(), calibration=unit))]

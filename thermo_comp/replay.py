@@ -38,8 +38,8 @@ from .topics import FLAGS, IMU_OUT, OUTPUTS, TEMPERATURE, thermometer
 from .typing import Ints
 from .unit.calibration import Calibration
 
-# Quantiles of the board readings that are compared with the calibrated range, so that single
-# wrong readings do not count; excess over the range [K] that thermometer noise can explain.
+# Quantiles of the board readings that are compared with the calibrated range, because single
+# readings may be wrong; largest excess over the range [K] that counts as thermometer noise.
 _BULK, _NOISE_K = (0.01, 0.99), 0.1
 _REGIMES = np.array(['unknown', 'static', 'dynamic'])
 

@@ -91,7 +91,7 @@ def build_calibration(
         nonlinearity=nonlinearity,
     )
     if known is not None and not (known.needs_temperature or windows.has_temperature):
-        # Without a thermometer the calibration must not depend on temperature by rounding errors.
+        # Without a thermometer, the dependence on temperature is a rounding error: remove it.
         places = parameter_layout(blank)
         for block in (*places.bias, *places.scale):
             level = values[block.static]
@@ -171,7 +171,7 @@ def _provenance(
     residuals: Sequence[ResidualRow],
     findings: Sequence[Finding],
 ) -> Provenance:
-    # The left-out RMS of ``|f| - g`` is stated only if left-out fits determine |f| everywhere.
+    # State the left-out RMS of ``|f| - g`` only if left-out |f| is scored in all positions.
     is_norm = bool(np.isfinite(fit.selected.score.norms.square).all())
     now = datetime.now(timezone.utc)
     end_s = 1e-9 * max(bag.end_ns for bag in bags)
@@ -209,7 +209,7 @@ def blank_terms(columns: Iterable[Column]) -> tuple[ResponseTerm, ...]:
 
 
 def parameters_of(calibration: Calibration) -> Floats:
-    """Return the parameters in the order of the file's posterior, 0 for constant scale errors."""
+    """Return the parameters in the posterior's order; constant errors of scale factors are 0."""
     values: list[float] = []
     pairs = zip(calibration.static.axes(), calibration.dynamic.axes(), strict=True)
     for axis, (reference, sets) in enumerate(zip(calibration.axes, pairs, strict=True)):
@@ -233,7 +233,7 @@ def with_parameters(
     """
     Replace the scale factors and the parameters of a calibration.
 
-    `values`: parameters in the order of the posterior; constant scale errors are not used
+    `values`: parameters in the order of the posterior; constant errors of scale factors: unused
     """
     layout = parameter_layout(calibration)
     levels = values[[bias.static for bias in layout.bias]]

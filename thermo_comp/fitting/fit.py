@@ -65,7 +65,7 @@ def fit(
     """
     Fit a calibration to bags of a thermal test.
 
-    Raises FitError if the data do not allow a fit, as if a recording has no still interval.
+    Raises FitError if the data do not allow a fit, such as a recording without still interval.
     """
     check_serial(sources, options)
     if not sources:
@@ -348,7 +348,7 @@ def _judged(
 
 def _unusable(error: ValueError, up: Floats) -> FitError:
     if 'misalignment' in str(error):
-        # If the positions determine the misalignment, these samples are not those of a triad.
+        # An angle of 60 degrees between axes is a data error if the positions determine M.
         kind = FitError if data_checks.determines_misalignment(up) else UndeterminedError
         return kind(
             'in the fit the angle between two of the axes is some 60 degrees or less, which no '

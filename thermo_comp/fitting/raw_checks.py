@@ -42,8 +42,8 @@ def full_scale_of(bags: Sequence[ReducedBag], options: FitOptions) -> float:
     if full_scale == COUNTS_FULL_SCALE:
         return widened(full_scale, np.array([[largest]]))
     if full_scale is None:
-        # The smallest usual full scale 10 % above the largest sample, else twice this sample; a
-        # prior, whose bags may have larger forces, or for which it was stated, may have more.
+        # Take the smallest usual full scale 10 % above all samples, else twice the largest sample.
+        # The full scale of a prior may have been stated by the user.
         ranges = (STANDARD_GRAVITY * g for g in (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0))
         full_scale = next((top for top in ranges if top > 1.1 * largest), 2.0 * largest)
         full_scale = max(full_scale, options.prior.unit.full_scale if options.prior else 0.0)
@@ -176,7 +176,7 @@ def _why_dead(bags: Sequence[ReducedBag], dead: Sequence[_DeadAxis]) -> str:
     ends = {(axis.axis, axis.value > 0.0) for axis in dead}
     if not largest or not is_at_top.all() or len(ends) == 1:
         return 'the axis is dead; leave out each bag with a dead axis'
-    # The advised full scale is just below the clipped reading, which counts as saturated.
+    # Advise a full scale just below the clipped reading, so that this reading is saturated.
     limit = f'--full-scale {largest * (1.0 - 1e-4):.5g}'
     return (
         'the same largest magnitude, with both signs or on several axes, is the full scale: leave '
@@ -268,8 +268,8 @@ def judge_missing(bags: Sequence[ReducedBag], windows: ThermalWindows) -> Iterat
 
 def _missing(bag: ReducedBag, track: Track) -> tuple[float, float, float]:
     """
-    Count a bag's samples at rest: all; those before the estimate of the board temperature is
-    accurate; later samples without a temperature, but between readings of each thermometer.
+    Count three sets of a bag's samples at rest: all; those before the board temperature is
+    accurate; later ones without a temperature, between first and last reading of each thermometer.
     """
     read = [readings.stamp_ns for readings in bag.temperatures.values() if len(readings.stamp_ns)]
     begin_s = 1e-9 * (max(stamp_ns[0] for stamp_ns in read) - bag.start_ns)

@@ -83,7 +83,7 @@ def translated(path: Path, *, is_foreign: bool = False) -> Iterator[None]:
 class Span:
     """
     A part of a file: a chunk, a chunk without end ('torn'), or messages outside chunks ('loose').
-    `position` and `length` exclude the indexes after the span; `size`: decompressed [bytes].
+    `length` excludes the message indexes after the part; `size`: decompressed size [bytes].
     """
 
     position: int

@@ -184,7 +184,7 @@ class _Clock:
         later = stamp_ns[not self.n :]
         steps = np.diff(later, prepend=self.last_ns)
         self.n, self.last_ns = self.n + len(stamp_ns), int(stamp_ns[-1])
-        # After a backward step by an hour or less, samples are left out until stamps are new.
+        # After a backward step by an hour or less, samples up to the newest stamp are left out.
         restarts = np.flatnonzero(steps < -LONGEST_PAUSE_NS)
         self.n_restarts += len(restarts)
         for number, part in enumerate(np.split(later, restarts)):
@@ -200,7 +200,7 @@ class _Clock:
         self.longest_gap_s = max(self.longest_gap_s, float(np.max(gaps, initial=0)) * 1e-9)
 
     def findings(self) -> list[str]:
-        """List the kinds of stamps that do not rise, and the gaps."""
+        """List the gaps between samples, and the numbers of stamps that do not rise."""
         texts = {
             f'samples with a stamp not later than an earlier stamp: {self.n_backwards}; these '
             'samples are left out': self.n_backwards,
