@@ -13,6 +13,8 @@ from position_helpers import GRAVITY, MG, START_NS, Rest
 
 import thermo_comp as tc
 from thermo_comp.fitting import FitOptions, fit
+from thermo_comp.fitting.fit import reduce_bag
+from thermo_comp.fitting.raw_checks import full_scale_of, judge_bags
 from thermo_comp.simulation.campaign import positions
 from thermo_comp.unit.calibration import parameter_layout
 
@@ -68,6 +70,18 @@ def one_position():
     rest = Rest(np.random.default_rng(20161), level=tuple(GRAVITY * UP))
     rest.accel += (rest.temperature(rest.time)[:, None] - 20.0) * MG * SLOPE
     return fit([rest.source()], OPTIONS)
+
+
+def test_a_full_scale_that_the_bags_do_not_show_is_named(one_position):
+    # WHY: the node dropped all samples above 2 g of a sensor of 16 g, and no command had said so.
+    (text,) = [f.message for f in one_position.findings if f.name == 'full-scale']
+    assert text.startswith('samples of 19.613 m/s^2 (2 times gravity) or more')
+    reduced = [reduce_bag(Rest(np.random.default_rng(1)).source(), OPTIONS)]
+    stated = replace(OPTIONS, full_scale=156.9)
+    assert not any(f.name == 'full-scale' for f in judge_bags(reduced, stated))
+    wide = one_position.calibration
+    wide = replace(wide, unit=replace(wide.unit, full_scale=156.9))
+    assert full_scale_of(reduced, replace(OPTIONS, prior=wide)) == 156.9
 
 
 def turned(rng, ups, rest_s=20.0):

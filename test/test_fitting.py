@@ -167,6 +167,14 @@ def test_the_error_of_the_compensator_is_that_stated_by_the_fit(response):
     assert 0.5 < np.sqrt(np.mean(error**2)) < 1.6
 
 
+def test_slow_noise_for_an_unmodelled_drift_leaves_the_white_noise():
+    # WHY: the file stated white noise of 0.3 ug/sqrt(Hz) for a unit with 5 ug/sqrt(Hz), so that no
+    # window of the node's check of |f| counted as still.
+    paper = fitted(OWN_LAGS, positions(2, 1), 1, model='golovach')
+    stated = np.array(paper.calibration.noise_density_m_s2_sqrt_hz) / MICRO_G
+    np.testing.assert_allclose(stated, 5.0, rtol=0.4)
+
+
 def test_six_faces_leave_misalignment_at_its_prior():
     repeats = 1e-6 * STANDARD_GRAVITY
     result = fitted(PLAIN, FACES, 2, groups=('curve', 'set'), mounting_sd=repeats)

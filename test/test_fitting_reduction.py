@@ -161,6 +161,8 @@ def test_readings_of_a_lost_thermometer_are_counted_and_left_out(rng):
     # The first and the last reading may be spikes, too.
     at_ends = np.array([85.0, 20.0, 20.1, 20.2, 20.3, 20.4, -127.0])
     assert np.flatnonzero(is_spike(at_ends)).tolist() == [0, 6]
+    # Infinite readings, which are dropped later, give no warning.
+    assert not is_spike(np.array([np.inf, np.inf, np.inf, np.inf, 20.0, 20.0, np.inf])).all()
     # Readings of a temperature that changes by up to 18 K from reading to reading are no spikes.
     assert not is_spike(np.array([-18.0, 0.0, 12.0, 18.0, 20.0, 21.0, 21.0])).any()
 

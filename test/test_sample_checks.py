@@ -360,6 +360,20 @@ def test_a_change_by_motion_does_not_refute_the_calibration_at_once(rng):
     assert steps(rng, offset=1.0, scatter=0.05, rate_hz=5.0)[0] > 2.0
 
 
+def test_a_vibration_of_whole_periods_between_readings_is_no_rest(rng):
+    # WHY: the check uses few samples, at the stamps of the readings, 1 s apart. All of them had
+    # the same phase of a vibration of 20 Hz, and looked like a rest with a wrong |f|.
+    sway = np.sin(2.0 * np.pi * 0.2 * np.arange(5) + 1.0)
+
+    def shaken(k):
+        return at_rest(rng, K * 5.0 * sway[k % 5] if k > 1000 else 0.0)
+
+    compensator = Compensator(calibration())
+    stream(compensator, recording(3000, 100.0, shaken))
+    assert compensator.counters.n_refuted == 0
+    assert compensator.counters.n_out == 3000
+
+
 def test_the_message_states_the_deviation_of_the_latest_windows(rng):
     monitor = GravityCheck(GRAVITY, tolerance=0.1)
     watch(rng, seconds=40, bias=0.001, monitor=monitor)

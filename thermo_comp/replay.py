@@ -33,6 +33,7 @@ from .recording.reader import RecordingReader, open_recording
 from .recording.serialized import Messages
 from .recording.topics import Topics
 from .recording.writer import TABLES, BagWriter, WriteRows, table_writer
+from .thermal.thermometer import COLDEST, HOTTEST
 from .topics import FLAGS, IMU_OUT, OUTPUTS, TEMPERATURE, thermometer
 from .typing import Ints
 from .unit.calibration import Calibration
@@ -158,7 +159,8 @@ def _beyond(calibration: Calibration, block: Block) -> float:
     ranges = [regime_set.temperature_range_c for regime_set in calibration.regime_sets()]
     lower, upper = min(bounds[0] for bounds in ranges), max(bounds[1] for bounds in ranges)
     celsius = block.temperatures['board'].celsius
-    bulk = np.nanquantile(celsius, _BULK) if np.isfinite(celsius).any() else np.array([lower])
+    celsius = celsius[(celsius >= COLDEST) & (celsius <= HOTTEST)]
+    bulk = np.quantile(celsius, _BULK) if len(celsius) else np.array([lower])
     excess = float(max(bulk - np.clip(bulk, lower, upper), key=abs))
     return excess if calibration.needs_temperature and abs(excess) > _NOISE_K else 0.0
 

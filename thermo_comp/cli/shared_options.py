@@ -300,7 +300,9 @@ def fitting(
         metavar='MODEL',
     ),
     full_scale: float | None = option(
-        'Magnitude of a saturated sample, in the unit of the input.', metavar='VALUE'
+        'Magnitude of a saturated sample, in the unit of the input; default: 32767 counts, or the '
+        'smallest usual range above all samples, from 2 g.',
+        metavar='VALUE',
     ),
     reference_temperature: float = option(
         'Temperature at which bias and scale are stated, in degC.', 20.0, metavar='DEGC'

@@ -33,6 +33,7 @@ from .claim import Claim
 from .data_checks import Finding
 from .equations import as_vector
 from .evidence import ResidualRow, group_evidence, lack_of_fit
+from .initial_triad import white_noise_of
 from .layout import Layout
 from .reduction import ReducedBag
 from .regression import Regression
@@ -65,6 +66,10 @@ def build_calibration(
     lag_s = known.board_lag_s if known else ranges.usable_board_lag(windows)
     sensors = {*model.sensors[:1], *(column.sensor for column in columns)}
     window_s = windows.typical_count * float(np.median([bag.cycle_s for bag in bags]))
+    # Slow noise that stands for a drift without a column may explain most of the white noise, too:
+    # then differences of windows, in which a drift cancels, give the white noise.
+    sigma, least = prior.sigma, white_noise_of(regression.windows, regression.nominal_scale)
+    sigma = np.where(sigma < 0.7 * least, least, sigma)
     blank = Calibration(
         format_version=FORMAT_VERSION,
         unit=unit,
@@ -73,7 +78,7 @@ def build_calibration(
         axes=Axes(*(AxisReference(float(K), 0.0) for K in regression.nominal_scale)),
         static=static,
         dynamic=dynamic,
-        noise_density_m_s2_sqrt_hz=_triple(np.maximum(prior.sigma * np.sqrt(window_s), 1e-9)),
+        noise_density_m_s2_sqrt_hz=_triple(np.maximum(sigma * np.sqrt(window_s), 1e-9)),
         slow_noise_m_s2_sqrt_h=_triple(prior.sigma * prior.noise.rate * np.sqrt(3600.0)),
         sensors=tuple(name for name in model.sensors if name in sensors),
         response=blank_terms(columns),

@@ -17,7 +17,6 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from ..errors import FitError, UndeterminedError
-from ..recording.stillness import widened
 from ..text import valid_serial
 from ..typing import Floats
 from ..unit.calibration import Axes, AxisReference, Calibration, Unit
@@ -377,13 +376,6 @@ def check_serial(sources: Sequence[FitSource], options: FitOptions) -> str:
 
 def _unit(bags: Sequence[ReducedBag], options: FitOptions) -> Unit:
     serial = check_serial([bag.source for bag in bags], options)
-    full_scale = options.saturated_at
-    largest = max(bag.max_abs for bag in bags)
-    if full_scale == COUNTS_FULL_SCALE:
-        full_scale = widened(full_scale, np.array([[largest]]))
-    if full_scale is None:
-        # Take the smallest usual full scale 10 % above all samples, else twice the largest sample.
-        ranges = (STANDARD_GRAVITY * g for g in (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0))
-        full_scale = next((top for top in ranges if top > 1.1 * largest), 2.0 * largest)
+    full_scale = raw_checks.full_scale_of(bags, options)
     cycle = float(np.median([bag.cycle_s for bag in bags]))
     return Unit(serial, options.input, full_scale, cycle)

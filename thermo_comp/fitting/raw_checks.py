@@ -10,13 +10,14 @@ from typing import NamedTuple
 import numpy as np
 
 from ..recording.overview import KELVINS
+from ..recording.stillness import widened
 from ..text import counted
 from ..typing import Bools
 from ..unit.calibration import POPULATION, Calibration
 from ..unit.gravity import STANDARD_GRAVITY
 from .data_checks import Finding, advice
 from .jumps import Jump, find_jumps
-from .options import FitOptions
+from .options import COUNTS_FULL_SCALE, FitOptions
 from .reduction import ReducedBag, StillInterval
 from .windows import ThermalWindows, Track
 
@@ -33,6 +34,20 @@ def judge_prior(serial: str, prior: Calibration | None) -> Iterator[Finding]:
             f'{serial}: make a prior of the type of units with thermo_comp prior, from the '
             'calibrations of three units or more',
         )
+
+
+def full_scale_of(bags: Sequence[ReducedBag], options: FitOptions) -> float:
+    """Return the stated full scale [input units], else one above all samples of the bags."""
+    full_scale, largest = options.saturated_at, max(bag.max_abs for bag in bags)
+    if full_scale == COUNTS_FULL_SCALE:
+        return widened(full_scale, np.array([[largest]]))
+    if full_scale is None:
+        # Take the smallest usual full scale 10 % above all samples, else twice the largest sample.
+        # The full scale of a prior may have been stated by the user.
+        ranges = (STANDARD_GRAVITY * g for g in (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0))
+        full_scale = next((top for top in ranges if top > 1.1 * largest), 2.0 * largest)
+        full_scale = max(full_scale, options.prior.unit.full_scale if options.prior else 0.0)
+    return full_scale
 
 
 def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Finding]:
@@ -83,6 +98,14 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
         text = '; '.join(f'{axis.bag}: {axis.text}' for axis in dead)
         yield Finding('stuck', 'refusal', f'{text}: {_why_dead(bags, dead)}')
     size = float(np.median(np.linalg.norm(np.concatenate([rest.mean for rest in rests]), axis=1)))
+    full_scale = full_scale_of(bags, options)
+    if full_scale not in (options.full_scale, COUNTS_FULL_SCALE):
+        text = (
+            f'samples of {full_scale:.5g} {options.input} ({full_scale / size:.2g} times gravity) '
+            'or more on an axis will count as saturated, and will not be published: if the sensor '
+            'measures more, state its range with --full-scale'
+        )
+        yield advice('full-scale', text)
     yield from _judge_thermometers(bags)
     yield from _judge_units(bags, size, options)
     per_mg = 1e-3 * (STANDARD_GRAVITY if options.input == 'm/s^2' else size)

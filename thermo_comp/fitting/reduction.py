@@ -317,6 +317,7 @@ def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
     return Readings(stamp_ns, value)
 
 
+@np.errstate(invalid='ignore')
 def is_spike(value: Floats) -> Bools:
     """Return which readings are over 10 K from the median of five readings about them, (n,)."""
     # A thermometer with a loose contact reads -127 or 85 degC for a moment. The sd of its noise is

@@ -17,6 +17,7 @@ import numpy as np
 from ..recording.blocks import Block
 from ..thermal.reading_queue import DISORDER_NS, NEVER_NS, PENDING_LIMIT
 from ..typing import Bools, Floats, Ints, Stamps
+from .checks import roughness
 from .compensator import TIME_JUMP_NS, Compensator, corrected_rate
 from .segments import EVER_NS, SEGMENT_NS, Model, Segment
 from .status import DROPPED
@@ -246,6 +247,7 @@ def _judge(
 ) -> Bools:
     """Mark the samples to be published; count the reasons for which samples are dropped."""
     reasons = np.zeros(len(stamps), dtype=np.int8)
+    last = compensator.stuck.last[:3]
     reasons[compensator.stuck.find(stamps, samples)] = _REASONS['n_stuck']
     is_large = ~(np.abs(samples) < compensator.calibration.unit.full_scale).all(axis=1)
     if is_large.any():
@@ -265,7 +267,9 @@ def _judge(
         elif segment.is_new:
             held = _REFUTED if gravity.is_refuted else 0
             if not is_bad and gravity.wants(stamp_ns):
-                gravity.add(stamp_ns, row[:3], row[3:], trace)
+                before = samples[begin - 1].tolist() if begin else last
+                rough = roughness(samples[begin].tolist(), before, compensator.scales)
+                gravity.add(stamp_ns, row[:3], row[3:], trace, rough)
         if held:
             is_counted = is_bad and segment.is_new and held == _REFUTED
             reasons[begin + is_counted : begin + count] = held

@@ -49,7 +49,8 @@ LONGEST_WINDOW_NS: Final = 30_000_000_000
 # Shortest time between two samples of a window of the gravity check [ns].
 PROBE_NS: Final = 90_000_000
 SMALLEST_WINDOW: Final = 5  # smallest number of samples in a window of the gravity check
-#: Largest ratio of a still window's scatter to the noise of its samples (both as sd).
+#: Largest ratio of a still window's scatter to the noise of its samples (both as sd), also of the
+#: scatter that the changes from one sample to the next show.
 SCATTER_FACTOR: Final = 3.0
 #: Largest change of the mean between two still windows in addition to noise [m/s^2]: 0.5 mg.
 LARGEST_CHANGE: Final = 5e-3
@@ -246,6 +247,13 @@ def variance_along(force: Sequence[float], covariance: Sequence[float]) -> float
     return square / (x * x + y * y + z * z)
 
 
+def roughness(sample: Sequence[float], last: Sequence[float], scales: Sequence[float]) -> float:
+    """Return half the squared change of the force between two samples [m^2/s^4]; NaN counts 0."""
+    changes = [(a - b) / scale for a, b, scale in zip(sample, last, scales, strict=True)]
+    half = 0.5 * sum(change * change for change in changes)
+    return half if half >= 0.0 else 0.0
+
+
 class GravityCheck:
     """Compares |f| with gravity in still windows; a tolerance of 0 means no limit of |f|."""
 
@@ -272,24 +280,37 @@ class GravityCheck:
         return not 0 <= stamp_ns - self._last_ns < PROBE_NS
 
     def add(
-        self, stamp_ns: int, force: Sequence[float], covariance: Sequence[float], noise: float
+        self,
+        stamp_ns: int,
+        force: Sequence[float],
+        covariance: Sequence[float],
+        noise: float,
+        rough: float = 0.0,
     ) -> None:
-        """Add a sample: force [m/s^2], covariance (xx to zz), trace of the noise covariance."""
-        self._watch_step(stamp_ns, force, covariance, noise)
+        """
+        Add a sample: force [m/s^2], covariance (xx to zz), trace of the noise covariance, and
+        `roughness`: samples at intervals of whole periods of a vibration are equal, as at rest.
+        """
+        self._watch_step(stamp_ns, force, covariance, noise, rough)
         since_ns, step_ns = stamp_ns - self._begin_ns, stamp_ns - self._last_ns
         if not (0 <= since_ns < LONGEST_WINDOW_NS and 0 <= step_ns < 3 * WINDOW_NS):
             self._forces = []
         if not self._forces:
             self._begin_ns = stamp_ns
         self._last_ns = stamp_ns
-        self._forces.append(force)
+        self._forces.append((*force, rough))
         is_long = stamp_ns - self._begin_ns >= 0.98 * WINDOW_NS
         if is_long and len(self._forces) >= SMALLEST_WINDOW:
             self._close(covariance, noise)
             self._forces = []
 
     def _watch_step(
-        self, stamp_ns: int, force: Sequence[float], covariance: Sequence[float], noise: float
+        self,
+        stamp_ns: int,
+        force: Sequence[float],
+        covariance: Sequence[float],
+        noise: float,
+        rough: float,
     ) -> None:
         """Refute the calibration if |f| at rest, after a step, misses gravity for `STEP_NS`."""
         rests = self.result and self.result.is_still and self._last_mean
@@ -300,6 +321,7 @@ class GravityCheck:
         near = LARGEST_CHANGE + 4.0 * math.sqrt(2.0 * noise / 3.0)
         was_resting, reference = self._is_resting, (self._off or [self._last_mean or ()])[0]
         is_near = max(abs(a - b) for a, b in zip(force, reference, strict=True)) <= near
+        is_near = is_near and rough <= SCATTER_FACTOR**2 * noise
         variance = max(variance_along(force, covariance), noise / 3.0)
         residual = math.hypot(*force) - self.gravity
         is_off = abs(residual) > self._tolerance + REFUTING_SIGMAS * math.sqrt(variance)
@@ -321,10 +343,10 @@ class GravityCheck:
 
     def _close(self, covariance: Sequence[float], noise_variance: float) -> None:
         n = len(self._forces)
-        axes = list(zip(*self._forces, strict=True))
+        *axes, rough = zip(*self._forces, strict=True)
         mean = [math.fsum(values) / n for values in axes]
         squares = [(v - m) ** 2 for values, m in zip(axes, mean, strict=True) for v in values]
-        scatter = math.fsum(squares) / (n - 1)
+        scatter = max(math.fsum(squares) / (n - 1), sum(rough) / n)
         last, self._last_mean = self._last_mean or [math.inf] * 3, mean
         # Largest difference of two means at rest: `LARGEST_CHANGE` plus 4 sd of the difference.
         change = LARGEST_CHANGE + 4.0 * math.sqrt(2.0 * noise_variance / (3.0 * n))

@@ -27,7 +27,7 @@ from ..unit.correction import SCALE_VARIANCES, VARIANCES, Excess
 from ..unit.covariance import Real, covariance_at
 from ..unit.functions import TANGENT_SPANS
 from ..unit.nonlinearity import corrected_nonlinear
-from .checks import MOTION, GravityCheck, StuckCheck
+from .checks import MOTION, GravityCheck, StuckCheck, roughness
 from .segments import EVER_NS, SEGMENT_NS, Model, ThermalSide
 from .status import CompensatorConfig, Counters, GravityResidual
 
@@ -110,6 +110,7 @@ class Compensator:
         self.calibration = calibration
         self._full_scale = self._limit = calibration.unit.full_scale
         self._edge = self.thermal.correction.beyond.edge
+        self.scales = [axis.scale_factor for axis in calibration.axes]
         self.gravity = GravityCheck(*self._gravity_settings)
         self.evaluate = corrected_nonlinear if calibration.nonlinearity else corrected
         self.leap_ns = max(LEAP_NS, round(LEAP_CYCLES * 1e9 * calibration.unit.cycle_time_s))
@@ -222,6 +223,7 @@ class Compensator:
         self._segment = (start_ns, line.tolist(), correction.misalignment)
         if is_new:
             self.is_refusing = is_too_fast
+        last = self.stuck.last[:3]
         row = self.process(stamp_ns, x, y, z)
         if not is_new:
             return row
@@ -232,7 +234,8 @@ class Compensator:
                 counters.n_out -= 1
                 counters.n_refuted += 1
         if row is not None and self.gravity.wants(stamp_ns):
-            self.gravity.add(stamp_ns, row[:3], row[3:], correction.noise_trace)
+            rough = roughness((x, y, z), last, self.scales)
+            self.gravity.add(stamp_ns, row[:3], row[3:], correction.noise_trace, rough)
         return None if self.is_refusing else row
 
     def is_leap(self, stamp_ns: int) -> bool:
