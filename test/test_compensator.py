@@ -382,16 +382,3 @@ def test_a_swap_to_another_detector_loses_no_sample():
     row = compensator.process(5 * SECOND_NS + 1, 300.0, 0.0, 1.0)
     assert row is not None
     assert not compensator.status().is_settled
-
-
-def test_after_a_gap_in_a_ramp_a_flag_ends_the_dynamic_regime():
-    # WHY: the last flag stayed `dynamic` while the static set applied, until the regime was known.
-    compensator = Compensator(calibration())
-    for second in (*range(600), *range(9000, 9060)):
-        celsius = 20.0 + 0.05 * min(max(second - 400, 0), 200) + 0.004 * (-1) ** second
-        compensator.push('board', second * SECOND_NS, celsius)
-        compensator.push('case', second * SECOND_NS, celsius + 0.1)
-        compensator.process(second * SECOND_NS, 1000.0 + second % 7, 2000.0, 1500.0 + second % 5)
-    *before, last = compensator.take_flags()
-    assert before[-1] == (599 * SECOND_NS, True)
-    assert last == (9000 * SECOND_NS, False)

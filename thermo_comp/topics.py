@@ -83,7 +83,7 @@ REGIME = NodeTopic(
     'regime/dynamic',
     BOOL,
     'whether the regime is dynamic (S = 1); sent at each case reading or, without case, at each '
-    'board reading; if S becomes unknown, False is sent once instead of True, then nothing',
+    'board reading; not sent while S is unknown',
     1,
     is_latched=True,
 )

@@ -110,7 +110,6 @@ class ThermalSide:
         self.counters = counters
         self.queue = ReadingQueue()
         self.flags: list[tuple[int, bool]] = []
-        self._was_dynamic = False  # the last flag
         self._n_applied = 0
         self._use(model, config)
         self.tracker = self._new_tracker()
@@ -187,10 +186,8 @@ class ThermalSide:
             self.counters.n_case += 1
             decides = name == self.inputs[1]
         regime = tracker.detector.regime
-        # If the regime becomes unknown, the static set applies: a flag ends the dynamic regime.
-        if decides and (regime is not Regime.UNKNOWN or self._was_dynamic):
-            self._was_dynamic = regime is Regime.DYNAMIC
-            self.flags.append((stamp_ns, self._was_dynamic))
+        if decides and regime is not Regime.UNKNOWN:
+            self.flags.append((stamp_ns, regime is Regime.DYNAMIC))
 
     def _count_rejected(self, name: str, n_readings: int) -> None:
         if name == BOARD_INPUT:
