@@ -140,7 +140,7 @@ def test_white_noise_is_not_taken_for_gauss_markov_noise(rng):
 
 
 def test_no_correlation_time_longer_than_a_position_is_estimated(rng):
-    # Only correlation times up to a sixth of a position, which lasts 2000 s, are tried.
+    # Only correlation times up to a sixth of a position (at most 2000 s long) are tried.
     whitener, weight, series = drawn(rng, 12, 20, Noise(100.0, 1e5))
     assert 0.0 < whitener.estimate(series, weight).time_s <= 20.0 * 100.0 / 5.0
     alone = Whitener(np.arange(3), np.zeros(3))

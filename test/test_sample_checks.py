@@ -305,7 +305,7 @@ def watch(rng, *, bias=0.0, seconds=60, motion=0.0, rate_hz=100, monitor=None):
 
 def test_the_residual_of_a_good_calibration_is_near_0_and_its_sd_is_right(rng):
     result = watch(rng)
-    # The residual averages over 1500 samples; its limit is 5 sd of a mean of 1500 samples.
+    # The residual averages more than 1500 samples; limit: 5 sd of a mean of 1500 samples.
     assert abs(result.residual) < 5 * NOISE_SD / math.sqrt(100 * 15)
     assert result.residual_sd == pytest.approx(math.hypot(BIAS_SD, NOISE_SD / math.sqrt(99)))
     assert result.n_windows == 59  # the first of 60 windows has no predecessor to compare with

@@ -82,8 +82,8 @@ def test_if_the_case_sensor_never_reads_the_gradient_is_that_of_the_fit_at_rest(
 
 
 def test_beyond_1_g_the_covariance_includes_an_unknown_k2():
-    # Rests do not determine K2, the error proportional to the square of the force. For forces
-    # above 1.01 g K2 is assumed to have an sd of 100 ug/g^2.
+    # Rests do not determine K2, the error proportional to the square of the force. Above 1.01 g
+    # the claimed error grows by K2 (|f| - 1.01 g)^2, with an sd of K2 of 100 ug/g^2.
     compensator = Compensator(calibration(), UNCHECKED)
     warm(compensator, start_s=1000, until_s=1001)
     at_1_g, at_4_g = (
