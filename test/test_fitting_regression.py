@@ -250,8 +250,8 @@ def refit_of(whole, regression, prior, kept):
 
 
 #: The left-out score is computed by linear steps from the fit to all rows. With the groups LINEAR
-#: the model is linear in all parameters but attitudes, and the score is exact. With PRODUCTS the
-#: score neglects (change of an initial lag state) * (change of the weight of this lag).
+#: the model is linear in all parameters but attitudes, and the score is exact. With the
+#: groups PRODUCTS it neglects (change of an initial lag state) * (change of this lag's weight).
 LINEAR, PRODUCTS = ('curve',), ('curve', 'board')
 
 
