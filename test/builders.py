@@ -56,7 +56,7 @@ def calibration(**keys):
 
 
 def thermal_calibration():
-    """Make a calibration that needs a thermometer: its temperature function is negligible."""
+    """Make a calibration that needs a thermometer, although its bias slope is negligible."""
     return calibration(dynamic=regime_set(z=axis_set((0.0, 1e-12))))
 
 

@@ -110,7 +110,7 @@ def test_the_value_of_each_kind_of_column_agrees_with_hand_numbers():
     ]
     spec = memory_of(columns, ('case', 'tip'))
     layout = StateLayout(spec)
-    # Board, variance, rate, dynamic weight, unknown regime; gradients, lags + variances; a play.
+    # Board, its variance, rate, weight, unknown regime; 2 gradients and 2 lags, variances; play.
     state = np.array(
         [[23.0, 0.0, 0.01, 0.25, 0.0, 1.2, 0.0, -0.7, 0.0, 0.5, 0.0, -0.3, 0.0, 0.1]]
     ).T
@@ -158,7 +158,7 @@ def test_a_new_kind_of_column_needs_one_term_only(monkeypatch):
     rate, variance = state[place : place + 2]
     line = correction.line(state, state, np.zeros(N_ROWS), 0.0)
     assert line[8] == pytest.approx(3e6 * rate**2) == pytest.approx(300.0, rel=0.02)
-    # d(bias)/d(rate) is 2 * 3e6 * rate [counts s/K], at 300 counts per m/s^2.
+    # d(bias)/d(rate) is 2 * 3e6 * rate [counts s/K]; the scale factor is 300 counts per m/s^2.
     by_rate = (2.0 * 3e6 * rate / 300.0) ** 2 * variance
     assert line[VARIANCES[2]] - correction.noise[2] == pytest.approx(by_rate, rel=1e-6)
     with pytest.raises(ValueError, match=r'keep the largest effect of the column within'):

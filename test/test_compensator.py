@@ -111,8 +111,8 @@ def at_seconds(*events):
     ]
 
 
-# In the examples stamps fall below that of a reading that is a day ahead or already applied. Only
-# if stamps fall by over 5 s, earlier readings count as readings of another clock.
+# In the examples stamps fall below the stamp of a reading that is a day ahead, or already applied.
+# Only if stamps fall by over 5 s, earlier readings count as readings of another clock.
 @given(event_lists, st.integers(3, 30), st.sampled_from([0.0, 5.0]))
 @example(at_seconds('A', 3, 'A', 0, 'B', 2, 'B', 86_400, 'C', 0, 'A', 0), 5, 0.0)
 @example(at_seconds('B', 26, 'B', 21, 'A', 23, 'B', 16.5), 1, 0.0)
@@ -180,7 +180,7 @@ def test_a_sample_with_a_stamp_20_s_ahead_is_dropped_unless_the_next_stamp_agree
         (np.insert(usual, 2, usual[2] + leap), [0, 1, 3, 4, 5]),
         # After a gap of 20 s the first sample is dropped, and the samples after it are used.
         (np.where(np.arange(5) < 2, usual, usual + leap), [0, 1, 3, 4]),
-        # Two samples 20 s ahead are dropped if others lie between them, or if the second is older.
+        # Two stamps 20 s too late are dropped if not adjacent, or if the second is the lower one.
         (np.insert(usual, [1, 3], usual[[1, 3]] + leap), [0, 2, 3, 5, 6]),
         (np.array([1, 2 + leap, 1 + leap, 3, 4]), [0, 3, 4]),
     ):

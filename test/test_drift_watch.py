@@ -89,8 +89,8 @@ def test_the_verdict_follows_the_true_error_on_each_day(attitudes):
             (0, None) if since is None else (1, str(np.datetime64(first + since, 'D')))
         )
         assert ('outside its claim since' in str(result)) == (since is not None)
-        # With gravity along (1, 1, 1) the error of |f| is 0.6 * sqrt(3) = 1.04 times the limit, so
-        # the day from which the unit is again within its claim may be printed a day late.
+        # With gravity along (1, 1, 1), bias errors of 0.6 times the limit change |f| by 1.04 times
+        # the limit: the day on which the unit returns to its claim may be printed a day late.
         back = [str(np.datetime64(first + day, 'D')) for day in (34, 35)]
         assert (result.inside_since in back) == (n_days > 34)
         assert ('again within its claim since' in str(result)) == (result.inside_since is not None)

@@ -68,7 +68,7 @@ class Direct:
 
 @cache
 def undisturbed():
-    """Return message groups of the undisturbed bag, each with the `Direct` before it."""
+    """Return the undisturbed bag's message groups, each with the `Direct` in its state before."""
     run, result = Direct(), []
     for lot in (*lots(bag()), []):
         result.append((lot, deepcopy(run)))

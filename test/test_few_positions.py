@@ -136,7 +136,7 @@ def test_one_position_gives_bias_over_temperature_on_three_axes(one_position):
 def test_one_position_leaves_the_scale_at_its_prior(one_position):
     calibration = one_position.calibration
     for axis in calibration.static.axes():
-        # In the prior the effect of each power of t on the scale has an sd of 1e-4, at its RMS.
+        # The scale's slope has the prior mean 0 and the prior sd 67 ppm/K, a third of 200 ppm/K.
         assert np.abs(axis.scale_function.value(np.array([-4.0, 15.0])) - 1.0).max() < 5e-4
     # For a MEMS the prior sd of scale factors is 5 %, that of misalignments 0.01 rad.
     sd = np.sqrt(np.diag(calibration.posterior.covariance()))
@@ -216,8 +216,8 @@ def test_tilts_of_two_supports_are_not_taken_for_a_scale_slope_of_a_level_axis(r
     at = np.array([0.0, 10.0])
     # 15000 samples (noise 0.1 mg) determine the mean bias slope of the two rests to 1 ug/K.
     assert np.diff(z.bias_function.value(at))[0] == pytest.approx(MG, abs=0.01 * MG)
-    # At 0.03 g an error of 1 ug/K is a scale slope of 33 ppm/K, that of two rests 47 ppm/K. The
-    # scale may change by 10 times 47 ppm over 10 K.
+    # At 0.03 g a drift error of 1 ug/K is a scale slope of 33 ppm/K; the errors of two rests give
+    # sqrt(2) * 33 = 47 ppm/K. Limit of the scale's change over 10 K: 10 K * 47 ppm/K.
     assert abs(np.diff(z.scale_function.value(at))[0]) < 10.0 * 47e-6
 
 
@@ -241,7 +241,7 @@ def test_positions_without_a_thermometer_give_constants_and_wide_temperature_slo
     out = calibration.correct([1.0], [[0.1, -0.2, GRAVITY + 0.3]])
     np.testing.assert_allclose(out.specific_force, [[0.0, 0.0, GRAVITY]], atol=0.02)
     left = np.array([0.05, 0.05, np.hypot(0.05, 2e-3 * GRAVITY)])
-    # `left`: 10 K times the sd of the temperature slopes; noise of a sample: 0.02 m/s^2.
+    # `left` [m/s^2]: temperature sd, 10 K, times sd of the slopes; sample noise: 0.02 m/s^2.
     np.testing.assert_allclose(
         np.sqrt(np.diagonal(out.covariance[0])), np.hypot(left, 0.02), rtol=0.05
     )
@@ -272,7 +272,7 @@ def test_the_bias_sd_of_one_recording_contains_the_sd_of_a_turn_on(rng):
     # WHY: the claimed bias sd was 1/6 of the bias error, as if each position had its own turn-on.
     offsets = 5e-3 * rng.standard_normal((8, 3))
     ups = positions(12, 3)
-    # `least`: sd of turn-on offsets [m/s^2]: prior sd (noise 0.02 m/s^2 at 100 Hz), or stated sd.
+    # `least`: prior sd of turn-ons for samples with a noise of 0.02 m/s^2, or stated sd [m/s^2].
     stated = fit([turned(rng, ups)], replace(OPTIONS, mounting_sd=5e-3))
     for result, least in ((tumbled(12), 1e-3), (stated, 5e-3)):
         calibration = result.calibration
@@ -301,9 +301,9 @@ def test_the_claimed_variance_of_a_curve_contains_that_of_turn_ons_at_each_tempe
     unit = tc.fit(bags, gravity=GRAVITY, input='m/s^2', mounting_sd=turn_on)
     for bag in (bags[0], bags[2]):
         out = unit.correct(bag.time_s, bag.counts, board=bag.temperatures['board'])
-        # If turn-ons have a variance of V, a line through three equidistant points has 5/6 V at
-        # its ends, a parabola V; the next turn-on adds V. Nine mountings of variance V each add
-        # V/3 by the bias and V/3 by the scale.
+        # If turn-ons have a variance of V, a line fitted to three equidistant temperatures has a
+        # variance of 5/6 V at its ends, a parabola V; the next turn-on adds V. With nine mountings
+        # of variance V the errors of bias and of scale add V/3 each.
         variance = np.diagonal(out.covariance[-dwell:].mean(axis=0)) - 1e-3**2
         assert ((1.0 + 5.0 / 6.0) * turn_on**2 < variance).all()
         assert (variance < (1.0 + 1.0 + 2.0 / 3.0) * turn_on**2).all()

@@ -186,7 +186,7 @@ def test_the_sd_of_an_old_calibration_aged_to_the_last_rest_includes_the_random_
     # half and all of the variance of the random walk to the biases of x and y.
     for axis in (x, y):
         assert 0.5 < axis.present_sd / (329.0 * MICRO_G) < 1.5
-    # At the last rest the sd of z must equal the walk of its bias to 40 ug, two sd of a turn-on.
+    # The z bias' sd at the last rest must equal its simulated walk within 40 ug, two turn-on sd.
     assert z.present_sd == pytest.approx(abs(walk[-1, 2]), abs=40.0 * MICRO_G)
 
 

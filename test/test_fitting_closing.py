@@ -140,7 +140,7 @@ def test_white_noise_is_not_taken_for_gauss_markov_noise(rng):
 
 
 def test_no_correlation_time_longer_than_a_position_is_estimated(rng):
-    # Only correlation times up to a sixth of a position, which lasts 2000 s, are tried.
+    # Only correlation times up to a sixth of a position (at most 2000 s long) are tried.
     whitener, weight, series = drawn(rng, 12, 20, Noise(100.0, 1e5))
     assert 0.0 < whitener.estimate(series, weight).time_s <= 20.0 * 100.0 / 5.0
     alone = Whitener(np.arange(3), np.zeros(3))
@@ -179,11 +179,11 @@ def test_a_larger_model_must_not_explain_the_errors_of_a_coarse_thermometer():
     curve, parts, bends = (score(drift, (), by_thermometer) for drift in (120.0, 46.0, 20.0))
     assert is_better(curve, parts)
     assert not is_better(parts, bends)
-    # A curve is chosen if without it |f| errors are far above 49 ug, those by the thermometer.
+    # A curve is chosen if |f| errors without it far exceed those by the thermometer, 49 ug.
     flat, curved = (score(46.0, size * np.ones(9), by_thermometer) for size in (3000.0, 60.0))
     assert is_better(flat, curved)
     assert not is_better(curved, score(20.0, 30.0 * np.ones(9), by_thermometer))
-    # If the thermometer causes only 5 ug, a fall of the left-out drift from 46 to 20 ug counts.
+    # If errors by the thermometer are 5 ug, a left-out drift of 20 ug is better than one of 46 ug.
     assert is_better(score(46.0, (), 5.0), score(20.0, (), 5.0))
 
 

@@ -361,7 +361,7 @@ def test_the_detector_settings_follow_the_slowest_ramp(rng):
     readings = Readings(stamps(n, 1.0), celsius)
     bag = reduced([block(still(rng, 30.0, (0.0, 0.0, 3000.0)))])
     slow = learn_detector([replace(bag, temperatures={'board': readings, 'case': readings})])
-    # The setting `smallest_ramp_k_min` is 0.7 of the rate of the slowest ramp, 0.15 K/min.
+    # The setting `smallest_ramp_k_min` is 0.7 times the rate of the slowest ramp (0.15 K/min).
     assert slow.smallest_ramp_k_min == pytest.approx(0.105, rel=0.05)
     assert slow.relaxed_rate_k_min < slow.smallest_ramp_k_min / 1.5
 

@@ -183,7 +183,7 @@ def test_covariance_and_evidence_agree_with_dense_linear_algebra(solved):
         at, jacobian = dense.residual(np.zeros(dense.n)), dense.jacobian(np.zeros(dense.n))
         hessian, sd, n = jacobian.T @ jacobian, np.sqrt(mode.variance), mode.layout.n_unit
         covariance = np.linalg.inv(hessian * np.outer(sd, sd))[:n, :n]
-        # Parameters with correlations of 0.999 lose three of the eight digits of the derivatives.
+        # Of the derivatives' eight digits, correlations of 0.999 in the Hessian lose three.
         np.testing.assert_allclose(
             mode.covariance / np.outer(sd[:n], sd[:n]), covariance, atol=1e-4
         )
@@ -250,8 +250,8 @@ def refit_of(whole, regression, prior, kept):
 
 
 #: The left-out score is computed by linear steps from the fit to all rows. With the groups LINEAR
-#: the model is linear in all parameters but attitudes, and the score is exact. With PRODUCTS the
-#: score neglects (change of an initial lag state) * (change of the weight of this lag).
+#: the model is linear in all parameters but attitudes, and the score is exact. With the
+#: groups PRODUCTS it neglects (change of an initial lag state) * (change of this lag's weight).
 LINEAR, PRODUCTS = ('curve',), ('curve', 'board')
 
 
@@ -431,8 +431,8 @@ def test_scores_of_inactive_columns_agree_with_a_fit_in_which_they_are_active(no
 
 
 def test_inactive_and_active_columns_share_initial_lag_states(solved):
-    # WHY: the sparsity factor S lacked the prior of the sum of initial lag states. S of an
-    # inactive column of the scale whose lag also changes the bias was 50 times too large.
+    # WHY: the sparsity factor lacked the prior of the sum of initial lag states: for an inactive
+    # column of the scale whose lag also changes the bias it was 50 times too large.
     regression, prior, mode = solved
     of_scale = np.isin(GROUPS, ('board',)) * [[0.0], [1.0]]
     without = replace(prior, column_sd=np.where(of_scale > 0.0, 0.0, prior.column_sd))

@@ -428,8 +428,8 @@ def test_the_drift_of_scale_factors_determines_the_sd_of_turn_on_offsets():
     candidates = candidates_of(windows, ('curve', 'board'))
     candidates = replace(candidates, typical=candidates.typical * ~IDLE)
     posterior = select(regression, state, constants(truth), candidates).posterior
-    # As scale factors change, |f| determines 18 of 27 combinations of offsets; 9 act like changes
-    # of the nine constants. 18 numbers determine their sd to 1 / sqrt(2 * 18), 17 %.
+    # Of the 27 offsets (9 turn-ons, 3 axes) 18 combinations are determined; 9 act like changes of
+    # the nine constants. The sd of 18 numbers is uncertain by 1 / sqrt(2 * 18), 17 %.
     assert posterior.prior.offset_sd == pytest.approx(300.0 * MICRO, rel=0.5)
     for errors in truth.errors(regression, posterior).values():
         # The RMS of three standard normal errors exceeds 2 with a probability of 0.7 %.

@@ -123,8 +123,8 @@ def test_columns_of_sets_and_of_initial_lag_states_agree_with_formulas(bags):
     np.testing.assert_allclose(data.columns[:, 1], t * t, atol=0.3)
     np.testing.assert_allclose(data.columns[:, 3], w, atol=1e-9)
     assert data.in_scale[:6].tolist() == [True, True, True, False, True, True]
-    # An initial lag state decays with the time constant of the lag, the column of a product of
-    # this lag and t as t times the same exponential.
+    # The effect of an initial lag state decays as exp(-time / tau) in the column of the lag, and
+    # as t * exp(-time / tau) in the column of the product of lag and t.
     taus = [lag.tau_s for lag in memory_of(bank()).lags]
     for k, column in enumerate(bank(), start=6):
         lag = data.lag[k]

@@ -100,8 +100,8 @@ def spread_of(name, rows):
 
 class TestUndetermined:
     """
-    A value that a unit's data do not determine keeps the prior's value and large sd. WHY: M of
-    -3950 urad, with an sd of 9100 urad, was listed as an outlier of -32 sd.
+    A value that a unit's data do not determine keeps the prior's value and large sd. WHY: a
+    misalignment of -3950 +- 9100 urad was listed as an outlier of -32 sd of the fleet.
     """
 
     @staticmethod

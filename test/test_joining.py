@@ -156,7 +156,7 @@ def test_a_split_recording_gives_the_calibration_of_the_whole_recording():
         }
         part = replace(bag, time_s=bag.time_s[inside[0]], counts=bag.counts[inside[0]])
         parts.append(replace(part, temperatures=readings, name=f'{begin_s:g} s'))
-    # A fit of 'curve' and 'board' takes 1/5 of the time of a choice among all column groups.
+    # A fit of the column groups 'curve' and 'board' takes 1/5 of the time of a choice of groups.
     whole, split = (
         thermo_comp.fit(bags, gravity=9.80665, groups=('curve', 'board')) for bags in (bag, parts)
     )

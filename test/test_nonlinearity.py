@@ -166,5 +166,5 @@ def test_rests_in_the_field_depend_on_every_nonlinear_coefficient():
             unit, scale, values + step * (np.arange(len(values)) == k), covariance
         )
         slope = (series.residual - series_of(logged, moved).residual) / step
-        # The derivatives neglect the slope of nonlinear terms, a relative error of 2 * K2 * 1 g.
+        # The derivatives neglect d(K2 f^2)/df, which gives them a relative error of 2 * K2 * 1 g.
         assert np.allclose(slope, series.by_parameter[:, k], atol=1e-3 * abs(slope).max() + 1e-7)

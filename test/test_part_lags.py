@@ -231,7 +231,7 @@ def test_the_lags_of_parts_are_found_beside_an_effect_of_the_gradient():
 def test_a_bump_of_the_bias_over_temperature_is_fitted_by_knees():
     # The bump of the bias lasts for 2 min, and must not be taken for motion.
     _, study = study_of('bump', bump=np.array([450.0, -400.0, 500.0]), bump_c=17.0)
-    # With three stated groups of columns the fit is three times as fast as with a choice.
+    # The three stated groups of columns make the fit three times as fast as a choice of groups.
     calibration = strangers.fitted(study, groups=('curve', 'part', 'bend'))
     judgement = judged(calibration, study)
     # The bump is a bell curve (sd 0.85 K) of the bias, fitted by straight lines of 0.5 K each.
@@ -351,7 +351,7 @@ def lags_of(calibration):
 def test_lags_of_a_unit_with_a_hidden_node_are_those_of_the_bank():
     # The bias of each axis depends on its part and on a hidden node without a thermometer.
     study = next(third_node(0))
-    # With six stated groups of columns the fit is 1.5 times as fast as with a choice.
+    # The six stated groups of columns make the fit 1.5 times as fast as a choice of groups.
     groups = ('curve', 'part', 'board', 'gradient_lag', 'product', 'square')
     calibration = strangers.fitted(replace(study, bags=study.bags[:8]), groups=groups)
     assert lags_of(calibration) <= {*FINE_TAUS}

@@ -44,7 +44,7 @@ def soak(tracker, celsius=20.0, seconds=60, start_s=0):
 
 
 def test_the_first_reading_of_a_sensor_may_be_wrong():
-    """A DS18B20 reads 85 degC before its first conversion; most of ten later readings are used."""
+    """A DS18B20 reads 85 degC before its first conversion; six of ten later ones must be used."""
     tracker = tracker_of()
     tracker.read('board', 0, 85.0)
     tracker.read('board', SECOND_NS, 85.0)

@@ -147,7 +147,7 @@ def test_equal_curves_of_both_sets_stay_equal_in_a_population():
         for static, dynamic in zip(*curves, strict=True):
             contrast = np.zeros(layout.n_parameters)
             contrast[[static, dynamic]] = 1.0, -1.0
-            # The posterior has single precision, so unused coefficients have a variance of 1e-24.
+            # 1e-24: variance of unused coefficients, by rounding to single precision.
             limit = 1e-5 * covariance[static, static] + 1e-24
             assert float(contrast @ covariance @ contrast) <= limit
 
@@ -343,7 +343,7 @@ def test_the_calibration_of_another_unit_is_refused_as_a_prior():
     messages = [finding.message for finding in allowed.findings if finding.name == 'prior']
     assert any('allowed: ' in text for text in messages)
     assert any('bags contradict the prior' in text for text in messages)
-    # With a prior the model has a curve per regime; residuals of a single curve are not computed.
+    # A fit with a prior has a curve per regime; residuals of a single curve are not computed.
     assert not allowed.residuals[-1].one_set.n
 
 

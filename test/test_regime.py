@@ -4,8 +4,8 @@
 The regime detector detects ramps early and with few false alarms (benchmarks/regime.py has long
 runs).
 
-All runs are seeded. Limits of delays allow for the scatter of the median of 12 onset delays: 1.4 s
-for a sensor with 1 mK of noise, 4 s for a sensor with steps of 62.5 mK.
+All runs are seeded. Limits of delays allow for the scatter of the median of 12 onset delays: 1 s
+for a sensor with 1 mK of noise, 3 to 10 s for sensors with steps of 62.5 mK.
 """
 
 import math
@@ -78,7 +78,7 @@ def headline():
     [
         ('1 mK', 45.0, 90.0),
         ('10 mK', 150.0, 180.0),
-        # Two steps of 62.5 mK are detected: a change by 94 mK (mean) is reached after 146 +- 6 s.
+        # The second step of 62.5 mK is detected, on average at 94 mK, reached after 146 +- 6 s.
         ('1 mK, 62.5 mK steps', 158.0, 180.0),
         ('10 mK, 62.5 mK steps', 150.0, 180.0),
     ],
@@ -190,7 +190,7 @@ def test_the_rate_of_false_alarms_is_below_that_of_the_setting():
 @pytest.mark.parametrize('dt', [0.1, 1.0, 10.0])
 def test_the_threshold_follows_from_the_noise_of_the_filter(dt):
     # Expected threshold: filter gain by the Riccati equation, noise and correlation by the impulse
-    # response, alarms by Rice's formula. `_tune`'s first-order formulas err by up to 4 %.
+    # response, alarms by Rice's formula. The first-order formulas of `_tune` differ by up to 4 %.
     test = ChangeDetector(ThermometerSettings(0.01, lag_s=LAG_S), 0.2 / 60.0, 0.0, 0.02 / 3600.0)
     test._tune(dt)
     for threshold, power in zip(test._thresholds, test._powers, strict=True):

@@ -278,7 +278,7 @@ def test_a_jump_back_in_time_does_not_restore_a_refuted_calibration(rng, is_mend
     stream(compensator, events(0.0 if is_mended else 100.0))
     assert compensator.counters.n_time_jumps == 1
     if is_mended:
-        # The first 5 s window has no predecessor to compare with; two more windows restore output.
+        # Output returns after three 5 s windows: the first has none before it to compare with.
         assert compensator.counters.n_out - n_out == pytest.approx(4500, abs=200)
     else:
         assert compensator.counters.n_out == n_out
@@ -305,7 +305,7 @@ def watch(rng, *, bias=0.0, seconds=60, motion=0.0, rate_hz=100, monitor=None):
 
 def test_the_residual_of_a_good_calibration_is_near_0_and_its_sd_is_right(rng):
     result = watch(rng)
-    # Limit of the residual: 5 sd of the mean of 1500 samples; a window has 99 samples.
+    # The residual averages more than 1500 samples; limit: 5 sd of a mean of 1500 samples.
     assert abs(result.residual) < 5 * NOISE_SD / math.sqrt(100 * 15)
     assert result.residual_sd == pytest.approx(math.hypot(BIAS_SD, NOISE_SD / math.sqrt(99)))
     assert result.n_windows == 59  # the first of 60 windows has no predecessor to compare with

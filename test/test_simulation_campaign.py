@@ -57,7 +57,7 @@ def test_the_true_thermal_model_leaves_only_noise(kind):
         # determine the RMS to a factor of two.
         assert 4.0 < vector < 20.0
     else:
-        # The RMS of 1311 means is uncertain by 2 % (norm) and 1.2 % (vector); limits: 5 sd.
+        # The RMS of 1311 means is uncertain by 2 % (|f|) and 1.2 % (vector); limits: 5 sd.
         assert np.sqrt(np.mean(np.concatenate(norms) ** 2)) == pytest.approx(0.65, abs=0.065)
         assert vector == pytest.approx(1.12, abs=0.07)
 

@@ -219,7 +219,7 @@ def test_readings_that_are_not_finite_or_not_newer_do_not_change_the_state(stamp
 
 
 def test_a_reading_15_sd_from_its_prediction_is_down_weighted():
-    # Readings 6 to 30 sd off get a noise that puts them 6 sd off; beyond 30 sd they are not used.
+    # A reading 6 to 30 sd off gets a noise with which it is 6 sd off; beyond 30 sd it is not used.
     thermometer = settled()
     assert thermometer.update(600 * SECOND_NS, 20.015)
     assert abs(thermometer.temperature - 20.0) < 0.004

@@ -30,8 +30,8 @@ from thermo_comp.unit.prediction import SlowUncertainty, ramp_states, sd_of_stat
 
 
 def test_the_claimed_sd_covers_a_start_in_a_ramp():
-    # WHY: after a restart in a ramp the claimed sd was a third of the error. A part's lag at the
-    # start is unknown: 1 K in this ramp (rate times time constant), with an sd of 0.4 K in a soak.
+    # WHY: after a restart in a ramp the claimed sd was a third of the error. At the start
+    # the lag of a part is unknown: 1 K in a ramp of 1 K/min (tau = 60 s), its sd 0.4 K in a soak.
     # The claimed sd must not change if the ramp ends 40 s after the start.
     unit = calibration(response=(term('board', (30.0, 0.0, 0.0), tau_s=60.0),))
     sd = {}
@@ -82,8 +82,8 @@ def test_if_the_case_sensor_never_reads_the_gradient_is_that_of_the_fit_at_rest(
 
 
 def test_beyond_1_g_the_covariance_includes_an_unknown_k2():
-    # Rests do not determine K2, the error proportional to the square of the force. For forces
-    # above 1.01 g K2 is assumed to have an sd of 100 ug/g^2.
+    # Rests do not determine K2, the error proportional to the square of the force. Above 1.01 g
+    # the claimed error grows by K2 (|f| - 1.01 g)^2, with an sd of K2 of 100 ug/g^2.
     compensator = Compensator(calibration(), UNCHECKED)
     warm(compensator, start_s=1000, until_s=1001)
     at_1_g, at_4_g = (
@@ -186,8 +186,8 @@ def test_beyond_the_range_curve_and_lag_do_not_cancel_in_the_claimed_sd():
 
 
 def test_beyond_the_range_bias_and_scale_slopes_do_not_cancel_in_the_claimed_sd():
-    # At the upper edge the bias slope is 0.8 counts/K, which the scale slope cancels at a force of
-    # 10 m/s^2.
+    # At 35 degC, the end of the range, the bias slope is 0.8 counts/K; at a force of 10 m/s^2 the
+    # scale slope cancels the bias slope.
     bent = axis_set((0.0, 0.5, 0.01), (1.0, -0.8 / 3000.0), residual_sd_m_s2=1e-6)
     unit = calibration(static=regime_set(bent), dynamic=regime_set(bent))
     # The bias slope changes by 0.02 counts/K^2: over 30 K its sd is 0.02 * 30 / sqrt(12) counts/K.
@@ -230,7 +230,7 @@ def test_outside_its_range_a_set_follows_the_curve_of_the_other_set():
     )
     celsius = [-20.0, -7.5, -3.0, 0.0, 5.0, 30.0, 35.0, 38.0, 42.5, 60.0]
     static, dynamic = curves_at(unit, celsius)[:, 0]
-    # Beyond an end of the common range, 5 to 30 degC, both curves differ by as much as there.
+    # Outside the common range, 5 to 30 degC, both curves differ by as much as at its nearer end.
     np.testing.assert_allclose((dynamic - static)[:5], dynamic[4] - static[4], rtol=1e-12)
     np.testing.assert_allclose((dynamic - static)[5:], dynamic[5] - static[5], rtol=1e-12)
     wavy, bent = np.polynomial.Polynomial(WAVY), np.polynomial.Polynomial(BENT)
@@ -241,7 +241,7 @@ def test_outside_its_range_a_set_follows_the_curve_of_the_other_set():
 
 def test_the_sd_beyond_the_range_includes_every_parameter_of_the_tangents(rng):
     # A change of the parameters times the regressors must equal the change of bias and scale. The
-    # ranges are 5 to 35 degC (static) and 0 to 30 degC (dynamic).
+    # calibrated ranges are 5 to 35 degC (static set) and 0 to 30 degC (dynamic set).
     spline = CubicSpline((-15.0, 0.0, 15.0), (-4.0, 0.0, 6.0))
     exponential = Exponential(-1.0, (1.0,), (18.0,))
     splined = AxisSet(spline, Polynomial((1.0, 1e-4)))
@@ -308,7 +308,7 @@ def test_with_lags_the_sd_in_a_ramp_does_not_depend_on_the_calibrated_rates():
 
 def test_the_distance_of_a_squared_column_from_its_range_is_that_of_its_quantity():
     # WHY: a lag of 10 K is 100 times the range of the bags, 0.1 K; the square of the lag is 10000
-    # times its range. With the distance taken as 10000 ranges, the sd was 0.1 g.
+    # times its range. For a lag counted as 10000 times its range the claimed sd was 0.1 g.
     unit = calibration(response=(term('square', (1.0, 0.0, 0.0), tau_s=600.0, range=(0.0, 0.01)),))
     correction = Correction(unit)
     state = np.zeros(StateLayout(correction.memory).width)
