@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns bags made by other programs, and readers of their content in plain Python."""
+"""Owns writers of bags by `mcap` and `rosbags`, and the columns expected of a reader."""
 
 from dataclasses import dataclass, field
 from functools import lru_cache

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Chamber programs, plans, units and converter of the simulation agree with their description."""
+"""Simulated chamber programs, test plans, units and ADC agree with their description."""
 
 from dataclasses import replace
 from fractions import Fraction

@@ -30,7 +30,7 @@ _LOOKED_BACK = 200
 # Sd of a position's mean force due to hysteresis, mounting and drift, even in a long rest [g].
 _FLOOR_SD = 2e-5
 # A position is 'restless' if its noise is above `_RESTLESS` times the median of all positions. A
-# later still interval is a rest if its noise is below `_LOUDEST` times the noise of the rests.
+# still interval after the found rests is a rest if its noise is below `_LOUDEST` times theirs.
 _RESTLESS, _LOUDEST = 3.0, 10.0
 # Smallest backward step of the stamps that shows a restart of the driver [ns].
 _STEP_BACK_NS = 10**9

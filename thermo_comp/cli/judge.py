@@ -208,7 +208,7 @@ def report(
 
     Shows temperatures, regime, |f| before and after the correction, the
     functions of temperature with their uncertainty, and the verdict of
-    `evaluate`, with its exit code. `fit --report` writes the page of a fit.
+    `evaluate`, with its exit code. `fit --report` writes a fit's certificate.
 
     Example:
       thermo_comp report held_out.mcap -c unit42.yaml -o unit42.html

@@ -24,8 +24,8 @@ from .update import Update, update
 
 #: Largest RMS error that agrees with the claim, in claimed standard deviations.
 LIMIT = 2.0
-#: Number of days whose RMS of |f| - g decides the verdict: enough to average the scatter of node
-#: starts, and far less than the time in which a unit drifts to the limit.
+#: Number of days whose RMS of |f| - g decides the verdict: enough to average the turn-on bias
+#: offsets, and far less than the time in which a unit drifts to the limit.
 _WINDOW_DAYS = 7
 #: Smallest number of starts of the node whose attitudes the forecast uses.
 _LEAST_STARTS = 10
@@ -243,7 +243,7 @@ def passage(
     The walk begins at a random vector of mean `mean`, (k,), and covariance `covariance`, (k, k).
     In d days the walk changes by sqrt(d) `walk`, (k, m), times m independent normal variables;
     `rate_sd` is the sd of the logarithm of the variance of the walk. A walk that begins above the
-    bound has the time 0, any other walk at least 0.01 days.
+    bound exceeds it at time 0, others at 0.01 days or later.
     """
     rng = np.random.default_rng(1)
     # Principal directions with less than a thousandth of the largest error are left out.

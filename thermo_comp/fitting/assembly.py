@@ -151,7 +151,7 @@ def _valid_columns(
             # A part lags both in cooling and in heating: the range of an odd power of its lag is
             # extended to the same values of opposite sign.
             valid = ranges.union((valid, (-valid[1], -valid[0])))
-        # A column used only by curves over the temperatures of parts is of group `part`.
+        # A response column that only curves over part temperatures use is of group `part`.
         group = PART if k in weighed and not alone[k] else column.group
         valid = valid if known is None else ranges.union((valid, column.range))
         result.append(replace(column, group=group, range=valid))

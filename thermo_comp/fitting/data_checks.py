@@ -363,7 +363,7 @@ def judge_result(
     if options.prior is not None and is_above:
         contradiction = (
             f'|f| - g is {ug_text(overall.fitted.rms)} RMS with the prior, {ug_text(alone)} with '
-            'a static and a dynamic set fitted without the prior'
+            'static and dynamic curves fitted without the prior'
         )
     elif prior.informative and prior.informative.is_changed:
         contradiction = 'the parameters differ from the prior by far more than the prior sd'

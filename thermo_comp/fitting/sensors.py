@@ -21,7 +21,7 @@ from ..thermal.settings import OBVIOUS_SHARE, RAMP_K_MIN, DetectorSettings, Ther
 from ..typing import Floats
 from .reduction import Readings, ReducedBag
 
-# Interval of the grid of rates [s], and number of intervals on each side in a central difference.
+# Interval between temperature rates [s]; intervals on each side in their central difference.
 _BIN_S, _BINS_PER_SIDE = 10.0, 6
 
 

@@ -26,7 +26,7 @@ from .certificate import Curve, curves, slopes
 from .evidence import CHOSEN, LEFT_OUT, RAW, Evidence, Position, ShownBag, required
 from .style import minus, number
 
-# Time from the start of a position over which the mean reading is the zero of drift [s].
+# Drift is relative to the mean reading over this time from the start of a position [s].
 _ZERO_S = 120.0
 _SHADE = '#E9E9E9'
 # Diameter of the ring of the position with the largest residual [pt].

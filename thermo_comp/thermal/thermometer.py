@@ -57,8 +57,8 @@ class Thermometer:
 
     The estimates hold at `stamp_ns`, the stamp of the last used reading; before the first reading
     they are NaN with infinite variances. `changed_ns`: stamp of the last change of the reading;
-    `interval_s`: typical interval between readings; `n_in_row`: number of readings since the last
-    start; `n_restarts`: number of starts after a gap or a step; `is_ready`: `n_in_row` is 2 or
+    `interval_s`: typical interval between readings; `n_in_row`: number of readings since the
+    filter last started; `n_restarts`: starts after a gap or a step; `is_ready`: `n_in_row` is 2 or
     more, which gives a rate. `measured` and its variance: the last reading, or for quantized cells
     the equivalent Gaussian measurement (infinite variance: no information). `bending`: probability
     of the bending mode, in which the acceleration changes.

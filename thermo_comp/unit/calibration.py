@@ -3,7 +3,7 @@
 """
 Owns the calibration of one unit: immutable dataclasses with the keys of the calibration file.
 
-Measurement model of axis i (equations 6 to 9 of the paper, which has no phi_j): N_i is the raw
+Measurement model of axis i (equations 6 to 9 of Golovach 2016, which has no phi_j): N_i is the raw
 sample, ``t = T_board - T_ref``, w the weight of the dynamic regime (0..1), phi_j column j of the
 thermal response (`columns`), M the misalignment matrix, f the specific force::
 

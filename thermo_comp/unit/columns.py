@@ -123,7 +123,7 @@ class Column:
     ] = 'always'
     range: Annotated[
         tuple[_Value, _Value],
-        'Range to which the value is limited, without the factors for `power` and `during`.',
+        'Limits of the value of the formula of `kind`, before factors `power` and `during`.',
     ] = field(kw_only=True)
 
     def __post_init__(self) -> None:
@@ -161,7 +161,7 @@ class Column:
 
     @property
     def is_gradient(self) -> bool:
-        """Whether the column's value is linear in the gradient of `sensor`, without a lag."""
+        """Whether the column's value is the unlagged gradient T_s - T_board of `sensor`."""
         return self.term.form is LINE and isinstance(self.source, Gradient)
 
 

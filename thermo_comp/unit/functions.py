@@ -215,7 +215,7 @@ class Exponential(_Family):
         return np.asarray(result)
 
     def basis(self, t: Kelvins) -> list[Floats]:
-        """Evaluate derivatives by the amplitudes, at a constant value of the function at t = 0."""
+        """Evaluate the derivatives w.r.t. the amplitudes, with the value at t = 0 held fixed."""
         return [by_element(math.exp, t / e_fold) - 1.0 for e_fold in self.e_fold_k]
 
 

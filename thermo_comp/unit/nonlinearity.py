@@ -85,7 +85,7 @@ class Nonlinearity:
     beyond_sd_g_g2: Annotated[
         float,
         QUANTITIES['nonlinearity'],
-        'Sd of K2 of an unknown square term that begins at the largest force of the fit.',
+        'Sd of K2 in an unknown term K2 d^2, d: force beyond the largest in the fit.',
     ]
     terms: Annotated[
         tuple[NonlinearTerm, ...], 'At most one square, odd square and cube term, in this order.'

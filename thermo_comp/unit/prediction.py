@@ -8,8 +8,8 @@ After s seconds of a ramp of rate q each gradient is ``board_lag_s q``, a part o
 lags the board by ``tau q (1 - exp(-s / tau))``, and the output of a play lags its input by the
 play's half-width. In a soak (q = 0) all gradients, lags and plays are 0.
 `soak_gradient_k` is added to the gradient of the first sensor and its lags in soaks and ramps. In
-a soak the static set applies, in a ramp the dynamic set. Predicted variances include neither noise
-nor thermometer errors.
+a soak the static curves apply, in a ramp the dynamic curves. Predicted variances include neither
+noise nor thermometer errors.
 """
 
 from collections.abc import Callable

@@ -139,7 +139,7 @@ _ALL: Final = (
     ),
     # Cubic curve over the temperature of a part.
     Term('cube', '(T_board - lagged T_board)^3', _part, _CUBE, 3, 'rest_k', positive=('tau_s',)),
-    # `size`: a heat load, as of a heat pump; `gradient_even`: a heat load that saturates.
+    # Even in q_s. `size`: load of a heat pump; `gradient_even`: a load that saturates.
     Term('size', 'abs(q_s)', _gradient, _SIZE, centre_key='rest_k'),
     Term(
         *('gradient_even', 'tanh((q_s / width)^2)', _gradient, _EVEN),
