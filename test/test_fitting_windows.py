@@ -57,6 +57,19 @@ def windows_of(bags):
     )
 
 
+def test_a_rest_partly_in_the_range_of_the_model_is_used_there_only(bags):
+    # WHY: an update by three positions that reached 3 K beyond the range of the prior, in a unit
+    # whose bias and scale had changed by 100 ug and 100 ppm, increased its error from 270 to
+    # 600 ug; without the windows beyond the range the update leaves 162 ug.
+    everything = windows_of(bags)
+    lower, upper = np.quantile(everything.temperature, (0.3, 0.7))
+    for range_c, is_used in (((lower, upper), True), ((90.0, 95.0), False)):
+        model = replace(everything.model, range_c=range_c)
+        board = thermal_windows(bags, model, everything.tracks).temperature
+        assert (len(board) < len(everything.temperature)) == is_used
+        assert (board.min() >= lower and board.max() <= upper) == is_used
+
+
 def test_lag_states_on_a_grid_equal_those_updated_by_each_reading(rng):
     spec = MemorySpec(
         ('case', 'tip'),
