@@ -190,15 +190,13 @@ def _judge_ramps(windows: ThermalWindows) -> Iterator[Finding]:
             f'hardly any {missing} was recorded; heating and cooling cause errors of opposite '
             f'sign, so record more {missing}',
         )
-    calm = windows.weight <= 0.5
-    span = float(np.ptp(windows.temperature))
-    static = float(np.ptp(windows.temperature[calm])) if calm.any() else 0.0
-    if np.mean(calm) < 0.05 or static < 0.5 * span:
+    if not windows.has_soaks:
+        share, span = np.mean(~windows.is_dynamic), float(np.ptp(windows.temperature))
         yield advice(
             'soak',
-            f'only {100.0 * np.mean(calm):.0f} % of the windows are static, over {static:.1f} of '
-            f'{span:.1f} K: the soaks end before the temperatures of the unit are constant; let '
-            'some soaks last for hours',
+            f'only {100.0 * share:.0f} % of the windows are static, over '
+            f'{windows.static_span:.1f} of {span:.1f} K: the soaks end before the temperatures of '
+            'the unit are constant; let some soaks last for hours',
         )
 
 

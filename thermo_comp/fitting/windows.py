@@ -199,6 +199,18 @@ class ThermalWindows:
         return np.asarray(self.weight > 0.5)
 
     @property
+    def static_span(self) -> float:
+        """Range of the board temperatures of the static windows [K]."""
+        static = self.temperature[~self.is_dynamic]
+        return float(np.ptp(static)) if len(static) else 0.0
+
+    @property
+    def has_soaks(self) -> bool:
+        """Whether 5 % of the windows are static, and span half of the temperatures of all."""
+        is_short = self.static_span < 0.5 * float(np.ptp(self.temperature))
+        return bool(np.mean(self.is_dynamic) <= 0.95) and not is_short
+
+    @property
     def was_measured(self) -> bool:
         """Whether a temperature was recorded, which may be constant over the bags."""
         return self.has_temperature or bool(self.data.columns[:, 0].any())
