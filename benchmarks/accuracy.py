@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the accuracy figures of docs/accuracy.md: the fit against the simulator's truth.
+Prints the figures of docs/accuracy.md: errors of fits, relative to the simulator's truth.
 
 Run ``python benchmarks/accuracy.py`` for everything, or a part with fewer units:
 ``python benchmarks/accuracy.py kinds --kinds own-lags,paper --seeds 1``.
@@ -66,8 +66,8 @@ GOALS = {
     'slow-noise': Goal(1.15, 1.15, is_relative=True),
     'plain': Goal(1.05, 1.05, is_relative=True, plan='chamber-9'),
 }
-# Limits of the errors for three plans of a thermal test: without a prior, and with a prior from
-# siblings; None: no limit.
+# Limits of the errors for three plans of a thermal test, without and with a prior from siblings;
+# None: no limit.
 PLAN_GOALS = {
     'chamber-9': (None, None),
     'tumble-3': (Goal(1.5, 2.5), Goal(1.2, 2.1)),
@@ -76,7 +76,7 @@ PLAN_GOALS = {
 
 
 def block(record: SimulatedRun) -> Block:
-    """Return samples and readings of a simulated run as a block for the compensator."""
+    """Return samples and temperatures of a simulated run as a block for the compensator."""
     stamps, counts = record.accel_stamp_ns, record.counts.astype(np.float64)
     readings = {
         'board': (record.board_stamp_ns, record.board),
@@ -101,7 +101,7 @@ class Corrected:
     constants, constants_sd : ndarray, shape (2, 3)
         Bias [counts/cycle] and ln K at the reference temperature, and their claimed sd.
     fit_s : float
-        Time of the fit, s.
+        Wall time of the fit, s.
     calibration : Calibration
         The result of the fit.
 

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the measured speed of reading a bag, by thermo_comp, rosbags and mcap in one run.
+Measures the speed of reading a bag, by thermo_comp, rosbags and mcap in one run.
 
 All bags hold counts at 400 Hz and two temperatures at 10 Hz; rosbags and mcap get shorter bags
 (`--peer-samples`). `rosbags` reads and deserializes each message; `mcap` only reads each message.
 A rate is the number of counts messages read per second of wall time, in the fastest of the
-repeats. The ratios of the rates vary less between machines than the rates.
+repeats. Ratios between the rates of two readers vary less from machine to machine than the rates.
 
     python benchmarks/bag_read.py --samples 1000000
 """
@@ -38,7 +38,7 @@ COMPRESSIONS = ('none', 'lz4', 'zstd')
 
 
 def write_bag(path: Path, n: int, compression: str, chunk_bytes: int) -> None:
-    """Write a bag of n messages of counts at 400 Hz, and of temperatures at 10 Hz."""
+    """Write a bag with n messages of counts at 400 Hz, and two temperatures at 10 Hz."""
     rng = np.random.default_rng(1)
     block = 1 << 17
     with BagWriter(path, compression=compression, chunk_bytes=chunk_bytes) as bag:
@@ -60,7 +60,7 @@ def read_ours_whole(path: Path) -> int:
 
 
 def read_ours_blocks(path: Path) -> int:
-    """Read a bag block by block with thermo_comp, as for the compensator."""
+    """Read a bag block by block with thermo_comp, as `replay` does."""
     with open_recording(path) as reader:
         return sum(len(block) for block in reader.blocks())
 
@@ -91,7 +91,7 @@ def read_mcap(path: Path) -> int:
 
 
 def timed(read: Callable[[Path], int], path: Path, n: int) -> tuple[float, float]:
-    """Return wall and CPU time of reading a bag, per message [s]."""
+    """Return wall and CPU time of reading a bag, per counts message [s]."""
     wall, cpu = time.perf_counter(), time.process_time()
     content = read(path)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu

@@ -1,8 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the damages to the file of a bag: bits flipped, parts wiped or cut off, rows removed, a
-compression bomb.
+Damages the file of a bag: flips bits, wipes or cuts off parts, removes rows, makes a zip bomb.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ import zstandard
 def damaged(
     make: Callable[[Path], Path], pattern: str, damage: Callable[[Path], object]
 ) -> Callable[[Path], Path]:
-    """Return a function that makes a bag and damages its only file that matches a pattern."""
+    """Return a function that makes a bag and damages the bag's only file that fits `pattern`."""
 
     def made(folder: Path) -> Path:
         bag = make(folder)
@@ -29,7 +28,7 @@ def damaged(
 
 
 def flip(file: Path, place: float = 0.5) -> None:
-    """Flip a bit of the byte at the fraction `place` of a file."""
+    """Flip a bit of a byte; `place`: position of the byte / length of the file."""
     data = bytearray(file.read_bytes())
     data[int(len(data) * place)] ^= 4
     file.write_bytes(data)
@@ -56,7 +55,7 @@ def delete_rows(file: Path) -> None:
 
 
 def flip_message(file: Path) -> None:
-    """Change the topic number of all messages of topic 1 to 65, a number that no topic has."""
+    """Change the topic number of all messages of topic 1 to 65, which no topic has."""
     with sqlite3.connect(file) as database:
         database.execute('update messages set topic_id = topic_id + 64 where topic_id = 1')
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the table of every command on every degenerate input: exit code, seconds, peak memory.
+Runs every command on every degenerate input; prints exit code, seconds and peak memory.
 
 For any recording or table a command must end within 60 s, use at most 300 MB, and print no
 traceback. Exit code 0 is allowed only if all data of the input can be read. A run that breaks a
@@ -63,7 +63,7 @@ TABLES = {'convert'}
 
 @dataclass(frozen=True)
 class Run:
-    """Exit code, time, peak memory and last output of a command with an input."""
+    """Exit code, time, peak memory and last two lines of stderr of a command with an input."""
 
     input: str
     command: str

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the degenerate inputs: recordings and tables, each with the defect that its name states."""
+"""Makes degenerate inputs: recordings and tables, each with the defect that its name states."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def whole() -> Columns:
 
 
 def write(folder: Path, columns: Columns, name: str = 'bag.mcap', log: bool = False) -> Path:
-    """Write a bag; with `log` the log times rise steadily and do not depend on the stamps."""
+    """Write a bag; with `log` the log times have equal steps and do not depend on the stamps."""
     path = folder / name
     rising = START_NS + np.arange(len(columns.stamp_ns)) * (SECOND // RATE_HZ) if log else None
     slow = None if rising is None else rising[:: RATE_HZ // 2][: len(columns.reading_ns)]
@@ -67,7 +67,7 @@ def write(folder: Path, columns: Columns, name: str = 'bag.mcap', log: bool = Fa
 
 
 def stamps(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], Path]:
-    """Return a function that writes the recording with a defect in all stamps."""
+    """Return a function that writes a recording whose stamps `change` has altered."""
 
     def make(folder: Path) -> Path:
         columns = whole()
@@ -79,7 +79,7 @@ def stamps(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], Path]
 
 
 def spoilt(change: Callable[[Columns], object]) -> Callable[[Path], Path]:
-    """Return a function that writes the recording with a defect in its samples or readings."""
+    """Return a function that writes a recording whose columns `change` has altered."""
 
     def make(folder: Path) -> Path:
         columns = whole()
@@ -109,7 +109,7 @@ def imu(
 
 
 def _by_turns(force: np.ndarray) -> np.ndarray:
-    """Set every second sample to zero, as in a log with alternate rows for the gyroscope."""
+    """Set every second sample to zero, as in a log whose every second row is of the gyroscope."""
     return force * (np.arange(len(force)) % 2)[:, None]
 
 
@@ -131,7 +131,7 @@ def _worn(sd: float, longest_s: float) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def _leaning(force: np.ndarray) -> np.ndarray:
-    """Set y to 0.6 x + 0.9 y: a misalignment that no real triad has."""
+    """Set y to 0.6 x + 0.9 y: a misalignment larger than that of any real triad."""
     return force @ np.array([[1.0, 0.6, 0.0], [0.0, 0.9, 0.0], [0.0, 0.0, 1.0]])
 
 
@@ -147,7 +147,7 @@ def _later(size_ns: int, every: int = 0) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def rosbag2(storage: StoragePlugin, mode: CompressionMode | None) -> Callable[[Path], Path]:
-    """Return a function that writes the recording without a defect as rosbag2."""
+    """Return a function that writes a recording without a defect as rosbag2."""
 
     def make(folder: Path) -> Path:
         bare = write(folder, whole())
@@ -204,7 +204,7 @@ def other_name(folder: Path) -> Path:
 
 
 def table(change: Callable[[np.ndarray], np.ndarray], kind: str) -> Callable[[Path], Path]:
-    """Return a function that writes the recording as a table with a defect in its stamps."""
+    """Return a function that writes a table whose stamps `change` has altered."""
 
     def make(folder: Path) -> Path:
         columns = whole()

@@ -33,17 +33,17 @@ from thermo_comp.topics import IMU_OUT, REGIME
 from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
-# Sd of the sample unit's bias from turn-on to turn-on [m/s^2]. Norms in nine positions do not
-# determine the sd of turn-ons, so the fit gets it as an option.
+# Sd of the sample unit's bias from turn-on to turn-on [m/s^2]. |f| in nine positions does not
+# determine this sd, so the fit gets the sd as an option.
 MOUNTING_SD = 1e-6 * STANDARD_GRAVITY
 
-# Groups of columns of each fit, by the name in the table: a curve for both regimes; a curve per
-# regime; the groups that the fit selects. The node uses the calibration of the third fit.
+# Groups of columns by the name of the fit in the printed table: one curve for both regimes; one
+# per regime; None (the fit selects the groups) for the calibration of the node.
 MODELS = {'one set': ('curve',), 'two sets': ('curve', 'set'), 'node': None}
 
 
 def demo(folder: Path, output: Path) -> bool:
-    """Run all steps; return whether the node lost no message and its output is the replay's."""
+    """Run all steps; return whether the node lost no message and its output equals `replay`'s."""
     out = Output()
     output.mkdir(parents=True, exist_ok=True)
     held_out, recorded, unit = folder / 'held_out.mcap', output / 'out.mcap', output / 'unit.yaml'
@@ -99,7 +99,7 @@ def messages(path: Path) -> list[tuple[int, bytes]]:
 
 
 def main() -> int:
-    """Run the demonstration; return 1 if messages are lost or the output is not the replay's."""
+    """Run the demonstration; return 1 if a message is lost or node and `replay` differ."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
     parser.add_argument('--bags', default='bags', help='folder of the sample bags')
     parser.add_argument('--out', default='out', help='folder for the results')

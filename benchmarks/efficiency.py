@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the errors of bias and scale divided by the Cramer-Rao bound, for docs/accuracy.md.
+Computes errors of bias and scale divided by the Cramer-Rao bound, for docs/accuracy.md.
 
 Run ``python benchmarks/efficiency.py``, or with fewer units: ``--units 10``.
 """
@@ -28,8 +28,8 @@ def exact_unit(seed: int) -> UnitModel:
     """
     Make a unit whose bias and scale are quadratics of the board's temperature alone.
 
-    The constants hold at the reference temperature without heat flow. Without self-heating the
-    soaks in the bags have no heat flow, so the bound needs no extrapolation.
+    A calibration states its constants for zero heat flow. The unit has no self-heating, so there
+    is no heat flow in soaks, and the bound needs no extrapolation to zero heat flow.
     """
     rng = np.random.default_rng(seed)
 

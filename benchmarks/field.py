@@ -8,10 +8,10 @@ Compares updates in the field with an optimal filter, for units that age (`field
 Half of the units are in vehicles, level within 10 deg, half are carried in any attitude. Units age
 for 60 days: random walks of the bias (15 ug per root day) and scale (10 ppm per root day), bias
 offsets at turn-on (sd 20 ug) and one shock (sd 300 ug). On six days the calibration is updated
-with all earlier rests, as in `thermo_comp update`, and judged on the next rests. After the last
-day the errors of the updated calibration are compared with those of a Kalman filter that is given
-the true sd and the time of the shock. With --recordings FOLDER, the real recordings in FOLDER are
-cut into parts, and an update with all earlier parts is judged on the next part.
+with all earlier rests, as by `thermo_comp update`, and judged on the next day's rests. After the
+last day the errors of the updated calibration are compared with those of a Kalman filter that is
+given the true variances and the time of the shock. With --recordings FOLDER, the real recordings
+in FOLDER are cut into parts, and an update with all earlier parts is judged on the next part.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ LABORATORY = calibration()
 
 def probes(kind: str, state: Floats, seed: int) -> tuple[list, Floats, Floats, Floats]:
     """
-    Build noise-free rests in random attitudes of a kind of platform; return the rests, their
-    counts / `K`, board temperatures less the reference [K], and true forces [m/s^2].
+    Build noise-free rests in random attitudes of a platform `kind`; return the rests, their
+    samples / `K` [m/s^2], board temperatures less the reference [K], and true forces [m/s^2].
     """
     rng = np.random.default_rng(seed)
     force = G * np.array([attitude(kind, rng) for _ in range(N_PROBES)])
@@ -84,17 +84,17 @@ def root_mean(values: Floats) -> float:
 
 def worse(after: list, new: Calibration, kalman: Floats) -> tuple[bool, bool]:
     """
-    Return whether the updated calibration, and whether the Kalman filter, has a larger RMS of
-    |f| - g on the rests of a day than the laboratory's calibration.
+    Return whether the updated calibration has a larger RMS of |f| - g on the rests of a day than
+    the laboratory's calibration, and whether the Kalman filter has.
 
-    A difference counts if it exceeds the standard error of an RMS over n turn-ons, which is the
-    claimed sd / sqrt(2 n).
+    An RMS counts as larger if it exceeds the laboratory's by more than the standard error of an
+    RMS over n turn-ons, the claimed sd / sqrt(2 n).
     """
     old, updated = (series_of(after, given) for given in (LABORATORY, new))
     counts = np.array([rest.mean for _, rest in after]) / K
     warmth = np.array([rest.state[0] for _, rest in after]) - REFERENCE_C
     of_best = np.linalg.norm(corrected(counts, warmth, kalman), axis=1) - G
-    # Average the windows of each attitude, as `series_of` does.
+    # Average the windows of each rest in one attitude, as `series_of` does.
     group = np.repeat(np.arange(len(old)), old.n_windows)
     of_best = np.bincount(group, of_best) / old.n_windows
 
@@ -132,8 +132,8 @@ def best(history: History, process: Process, days: int) -> BestFilter:
 
 def unit(kind: str, seed: int, days: int) -> tuple[dict[str, Floats], list, float]:
     """
-    Age and update a unit; return the errors after the last day, the comparisons of `worse` by day,
-    and the time of the last update [s].
+    Simulate an ageing unit and its updates; return the errors after the last day, the result of
+    `worse` for each update, and the computing time of the last update [s].
     """
     shock_day = np.random.default_rng([seed, 7]).uniform(0.2, 0.8) * days
     process = Process(shock_day=float(shock_day))
@@ -178,7 +178,7 @@ def unit(kind: str, seed: int, days: int) -> tuple[dict[str, Floats], list, floa
 
 
 def simulated(kind: str, n_units: int, days: int) -> None:
-    """Print errors of units on a kind of platform before and after updates, and of the filter."""
+    """Print errors on a kind of platform before and after updates, and of the Kalman filter."""
     results = [unit(kind, seed, days) for seed in range(n_units)]
     joined = {name: np.array([result[0][name] for result in results]) for name in results[0][0]}
     print(f'\n{kind}: {n_units} units, {days} days, one shock each')
@@ -199,8 +199,8 @@ def simulated(kind: str, n_units: int, days: int) -> None:
     print(f'  error / claimed sd of |f| {ratio:.2f} (goal 0.7 .. 1.4)')
     days_after = np.array([pair for result in results for pair in result[1]])
     print(
-        f'  {len(days_after)} days after an update; error larger by a standard error than without '
-        f'the update on {days_after[:, 0].sum()} days (filter: {days_after[:, 1].sum()})'
+        f'  error with the update larger by a standard error than without on '
+        f'{days_after[:, 0].sum()} (filter: {days_after[:, 1].sum()}) of {len(days_after)} days'
     )
     print(f'  time of an update: {max(result[2] for result in results):.1f} s at most')
 

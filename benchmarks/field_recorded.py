@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns updates on real recordings, for the benchmark `field.py`.
+Updates calibrations with real recordings, for the benchmark `field.py`.
 
-No recording spans days, so each recording is cut into parts: a fit of the first part replaces the
-calibration of a laboratory, and each further part is taken as the recording of a separate turn-on.
-On each part, an update with all earlier parts is compared with the fit of the first part.
+No recording lasts for days, so each recording is cut into parts: a fit of the first part replaces
+the calibration of a laboratory, and each further part counts as the recording of a separate
+turn-on. On each part, an update with all earlier parts is compared with the fit of the first part.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from thermo_comp.unit.calibration import Calibration
 
 
 def part(of: Columns, begin: float, end: float) -> Columns:
-    """Cut the time from `begin` to `end` [s] out of a recording."""
+    """Return the part of a recording from `begin` to `end` [s]."""
 
     def cut(time_s: np.ndarray, *values: np.ndarray) -> tuple[np.ndarray, ...]:
         is_in = (time_s >= begin) & (time_s < end)
@@ -44,7 +44,7 @@ def part(of: Columns, begin: float, end: float) -> Columns:
 
 
 def rests_of(of: Columns, calibration: Calibration, start_ns: int) -> list[tuple[Start, Rest]]:
-    """Return the rests that a node would log if the node started with the recording."""
+    """Return the rests that a node logs if it starts at the beginning of the recording."""
     compensator = Compensator(calibration)
     correction = compensator.thermal.correction
     start = Start(
@@ -84,7 +84,7 @@ def rests_of(of: Columns, calibration: Calibration, start_ns: int) -> list[tuple
 
 def cases(folder: Path, work: Path) -> Iterator[tuple[str, Path, list[float], float]]:
     """Yield name, bag, edges of the parts [s] and length of a window [s] of each recording."""
-    # Use the time from the last jump of the readings until the sensor leaves the freezer.
+    # Use the freezer run from the last jump of the readings until the sensor leaves the freezer.
     yield 'freezer', freezer_bag(folder, work), [518.5, *np.arange(900.0, 1941.0, 104.0)], 10.0
     for unit in range(3):
         yield f'handheld {unit}', handheld_bag(folder, work, unit), [0.0, *range(80, 157, 11)], 2.0

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the units of the benchmark `field.py`, which age: physics, rests, reference filter.
+Simulates the ageing units of the benchmark `field.py`: physics, rests, reference filter.
 
 A unit leaves the laboratory with a calibration whose error is drawn from the covariance that the
 calibration states. In the field bias and scale follow random walks, each turn-on has a random bias
@@ -41,12 +41,12 @@ K = 300.0  # counts per m/s^2
 REFERENCE_C = 20.0
 CREATED = '2026-01-01T00:00:00Z'
 DAY_ZERO = 20454  # 2026-01-01 in days since 1970
-#: Slope of the bias [m/s^2 per K] and of the scale [1/K] that the calibration corrects.
+#: Slopes over temperature, of the bias [m/s^2 per K] and the scale [1/K], in the calibration.
 SLOPE, SCALE_SLOPE = 30 * UG, 1e-5
 #: Sd of the calibration's error: bias and its slope per K [m/s^2], relative scale and its slope
 #: per K, misalignment [rad].
 PRIOR = np.repeat([10 * UG, 0.3 * UG, 10e-6, 0.3e-6, 5e-6], 3)
-#: Length of a window [s], and density of its white noise [m/s^2/sqrt(Hz)].
+#: Length of a window [s], and density of the samples' white noise [m/s^2/sqrt(Hz)].
 WINDOW_S, NOISE = 10.0, 60 * UG
 KINDS = ('level', 'carried', 'fixed', 'up and down', 'faces')
 
@@ -64,17 +64,17 @@ class Process:
 
 @dataclass
 class History:
-    """Rests of a unit, and the unit's true deviations from its calibration after each day."""
+    """Rests of a unit, and the true deviations of the unit from its calibration after each day."""
 
     rests: list[tuple[Start, Rest]] = field(default_factory=list)
-    #: For each window of `rests`: number of the day, and number of the turn-on.
+    #: For each window of `rests`: number of its day, and number of its turn-on.
     day: list[int] = field(default_factory=list)
     start: list[int] = field(default_factory=list)
     states: list[Floats] = field(default_factory=list)
 
 
 def calibration() -> Calibration:
-    """Build a calibration with the sd `PRIOR`, as from a laboratory before the ageing."""
+    """Build a calibration whose parameters have the sd `PRIOR`, as from a laboratory."""
     axis = AxisSet(
         Polynomial((0.0, K * SLOPE)), Polynomial((1.0, SCALE_SLOPE)), residual_sd_m_s2=20 * UG
     )
@@ -119,13 +119,13 @@ def _parts(state: Floats, warmth: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def measured(force: Floats, warmth: Floats, state: Floats) -> Floats:
-    """Return the samples [counts / `K`] of a unit with deviations `state` under forces (n, 3)."""
+    """Return the samples / `K` [m/s^2] of a unit with deviations `state` under forces (n, 3)."""
     bias, scale, M = _parts(state, warmth)
     return np.asarray(np.linalg.solve(M, force.T).T * scale + bias)
 
 
 def corrected(counts: Floats, warmth: Floats, state: Floats) -> Floats:
-    """Correct samples [counts / `K`] for the deviations `state`; return the force [m/s^2]."""
+    """Correct samples / `K` [m/s^2] of a unit with deviations `state`; return forces [m/s^2]."""
     bias, scale, M = _parts(state, warmth)
     return np.asarray((counts - bias) / scale @ M.T)
 
@@ -143,14 +143,14 @@ def attitude(kind: str, rng: np.random.Generator) -> Floats:
 
 
 def temperature(day: float, rng: np.random.Generator) -> float:
-    """Draw the board's temperature on a day [degC]: a cycle of 60 days plus noise of 2 K."""
+    """Draw the board's temperature on a day [degC]: a sine of 60 days plus noise of 2 K (1 sd)."""
     return float(REFERENCE_C + 10.0 * np.sin(2.0 * np.pi * day / 60.0) + rng.normal(0.0, 2.0))
 
 
 def lasting(kind: str, seconds: float, rng: np.random.Generator) -> Iterator[float]:
     """
-    Split a rest into times of constant attitude [s]: the whole rest in the kinds 'level' and
-    'fixed', 20 to 90 s each in the other kinds.
+    Yield the durations [s] of constant attitude in a rest of `seconds`: the rest itself in the
+    kinds 'level' and 'fixed', 20 to 90 s each in the other kinds.
     """
     while seconds >= WINDOW_S:
         rest = seconds if kind in ('level', 'fixed') else min(seconds, rng.uniform(20.0, 90.0))
@@ -207,8 +207,8 @@ class BestFilter:
         """
         Update the filter with a rest.
 
-        now: time [days]; counts: mean of the rest [counts / `K`]; variance: of the mean's norm
-        [m^2/s^4]; warmth: board temperature less the reference temperature [K]
+        now: time [days]; counts: mean sample of the rest / `K`; variance: variance of its
+        norm [m^2/s^4]; warmth: board temperature less the reference temperature [K]
         """
         process = self.process
         if start != self._start:

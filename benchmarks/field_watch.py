@@ -6,13 +6,12 @@ Measures verdicts and forecasts of the drift watch on simulated units (`field_un
     python benchmarks/field_watch.py [--units 20] [--days 30]
 
 Units with attitudes of five kinds age by random walks of known sd and log rests. For each unit 200
-continuations of the random walk are drawn, until the RMS of |f| - g over random attitudes of the
-kind, with the scatter of the turn-ons, exceeds a tolerance of 200 ug. The figures of a forecast
-are the percentage of the drawn times in the forecast's 10 to 90 % interval, and the forecast's
-median divided by the median drawn time.
-In a second part, a verdict is taken every five days on level and on carried units, half of which
-do not age; the figures are the number of verdicts "outside", by classes of the true RMS of |f| - g
-divided by the limit.
+continuations of the random walk are drawn, until the RMS of |f| - g over random attitudes of this
+kind, with the scatter of turn-ons, exceeds a tolerance of 200 ug. The figures of a forecast are
+the percentage of the drawn times in the forecast's 10 to 90 % interval, and the forecast's median
+divided by the median drawn time. A second part of the benchmark gives a verdict every five days on
+level and on carried units, half of which do not age. The figures are the numbers of verdicts
+"outside" by class of the true RMS of |f| - g divided by the limit.
 """
 
 from __future__ import annotations
@@ -28,16 +27,16 @@ from thermo_comp.field.series import RestSeries, series_of
 from thermo_comp.field.update import update
 from thermo_comp.field.watch import LIMIT, watch
 
-#: Limits of the classes of the true RMS of |f| - g divided by the limit of the verdict.
+#: Edges of the classes of verdicts by the ratio true RMS of |f| - g / limit of the verdict.
 CLASSES = (0.0, 0.6, 0.8, 0.9, 1.0, 1.1, 1.2, 1.5, 9.0)
 LABORATORY, TOLERANCE, N_FUTURES = calibration(), 200.0 * UG, 200
 
 
 def leaves(probe: RestSeries, process: Process, bound: float, rng: np.random.Generator) -> Floats:
-    """Draw 200 times [days] after which the RMS of |f| - g exceeds a bound, in steps of 8 h."""
+    """Return the times [days] at which the RMS of |f| - g exceeds `bound` in 200 futures."""
     size = np.repeat([process.bias, process.scale * G], 3) / np.sqrt(3.0)
     error, levels = np.full(N_FUTURES, np.inf), np.zeros((N_FUTURES, 6))
-    # The norm of `root @ (1, levels)` is the RMS of |f| - g over the rests of `probe`.
+    # `levels`: random walks of bias and scale; |root @ (1, levels)| is the RMS of |f| - g.
     joined = np.column_stack((probe.residual, probe.by_level)) / np.sqrt(len(probe))
     root = np.asarray(np.linalg.qr(joined, mode='r'))
     for step in range(3 * 3650):
@@ -114,9 +113,9 @@ def main() -> None:
             factor = np.log(np.maximum(printed, 0.3) / np.maximum(true, 0.3))
             print(
                 f'{kind:12} {name}: {len(rows)} units, {100 * shares.mean():.0f} % of true days '
-                f'in 10 .. 90 %; median stated {np.median(printed):.0f} days, true '
-                f'{np.median(true):.0f}, ratio {np.exp(np.median(factor)):.2f} (scatter over the '
-                f'units: factor {np.exp(np.std(factor)):.1f})'
+                f'in the 10 .. 90 % range; median {np.median(printed):.0f} days, true '
+                f'{np.median(true):.0f} days, ratio {np.exp(np.median(factor)):.2f} (scatter over '
+                f'the units: factor {np.exp(np.std(factor)):.1f})'
             )
     for kind in KINDS[:2]:
         verdicts(kind, arguments.units, arguments.days)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the cost of a fit: CPU time and peak memory of fitting n bags, compared with those of reading
-the bags, and the exponent p in CPU time ~ (number of samples)^p.
+Measures the cost of a fit: CPU time and peak memory of fitting n bags, compared with reading the
+bags, and the exponent p of CPU time ~ (number of samples)^p.
 
 Bags of four hours are simulated once and written to disk. Reading and fitting run in separate
 processes, so that the peak memory of each is measured.
@@ -50,7 +50,7 @@ def write_bags(folder: Path, n_bags: int, rate_hz: float) -> list[Path]:
 
 
 def measure(task: str, paths: list[Path]) -> dict[str, float]:
-    """Run a task ('read' or 'fit') in a separate process; return its figures."""
+    """Run a task ('read' or 'fit') in a separate process; return its CPU time and peak memory."""
     done = subprocess.run(
         [sys.executable, __file__, '--task', task, *map(str, paths)],
         check=False,
@@ -65,7 +65,7 @@ def measure(task: str, paths: list[Path]) -> dict[str, float]:
 
 
 def run_task(task: str, paths: list[Path]) -> dict[str, float]:
-    """Read the bags, or fit them, and print time and memory."""
+    """Read the bags, or fit them; return CPU time, peak memory and number of samples."""
     from thermo_comp.fitting import FitOptions, fit
     from thermo_comp.fitting.sources import fit_sources
 

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the cost of fitting a fleet: speed-up by workers, overhead of the scheduler, network traffic,
-and results lost when workers are killed.
+Measures the cost of fitting a fleet: speed-up by workers, overhead of the scheduler, network
+traffic, and results lost when workers are killed.
 
 Units are simulated and written to bags once (``--folder`` keeps the bags), and fitted as in the
 command `fleet fit`, whose workers are processes of one thread.
@@ -42,7 +42,7 @@ from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 #: Program over 35 K with a sample per second, so that hundreds of units are simulated in minutes.
 PROGRAM, RATE_HZ, TEMPERATURE_HZ = '15 6min, 40@2 12min, 5@2 15min', 1.0, 0.2
-#: A thermal test that is short to fit: the shorter the fits, the higher the scheduler's load.
+#: A thermal test that is fitted quickly: the shorter the fits, the higher the scheduler's load.
 SMALL_PROGRAM, SMALL_BAGS = '20 2min, 45@5 8min, 5@5 10min', 6
 N_LOTS = 4
 _REST_S = 4.0
@@ -81,7 +81,7 @@ def write_fleet(folder: Path, n_units: int, n_bags: int, program: str) -> Path:
 
 
 def units_of(folder: Path, n_units: int) -> list[FoundUnit]:
-    """Return `n_units` units of a fleet; a smaller fleet is repeated."""
+    """Return `n_units` units of a fleet; the units of a smaller fleet are repeated."""
     units = find_units(Storage(str(folder)))
     return [units[i % len(units)] for i in range(n_units)]
 
@@ -89,7 +89,7 @@ def units_of(folder: Path, n_units: int) -> list[FoundUnit]:
 @dataclass(frozen=True)
 class Measured:
     """
-    Figures of a run over a fleet.
+    Durations, network traffic and processor time of a fit of a fleet.
 
     Parameters
     ----------
@@ -121,12 +121,12 @@ class Measured:
         return max(self.own_cpu_s - self.rest_cpu * self.seconds, 0.0) / len(self.tasks)
 
     def busy(self, n_workers: int) -> float:
-        """Return the time of all tasks / (number of workers times the time of the run)."""
+        """Return the summed time of the tasks / (number of workers times duration of the fit)."""
         return sum(self.tasks) / (n_workers * self.seconds)
 
 
 def measure(folder: Path, n_units: int, n_workers: int, options: FleetOptions) -> Measured:
-    """Fit units on a cluster that is already running and warmed up."""
+    """Measure a fit of units on a cluster that is running and has fitted some units before."""
     units = units_of(folder, n_units)
     with connected(None, n_workers) as client:
         count_bytes()
@@ -178,14 +178,14 @@ def count_bytes() -> None:
 
 
 def bytes_written() -> int:
-    """Return the number of bytes counted by `count_bytes`."""
+    """Return the number of bytes that this process wrote to connections since `count_bytes`."""
     from distributed.comm.tcp import TCP
 
     return int(TCP.n_written)
 
 
 def scaling(folder: Path, n_units: int, repeats: int, model: str) -> None:
-    """Compare two workers with one worker: all units (strong), half of the units (weak)."""
+    """Measure two workers against one worker on the same units, and on half of the units."""
     write_fleet(folder / 'fleet', n_units, 12, PROGRAM)
     fit = FitOptions(gravity=STANDARD_GRAVITY, model=model)
     options = FleetOptions(fit, certificates=False)
@@ -200,7 +200,7 @@ def scaling(folder: Path, n_units: int, repeats: int, model: str) -> None:
             for units, workers in ((n_units, 1), (n_units, 2), (n_units // 2, 1))
         )
         # Other programs on the cores slow two workers more than one worker. `free` is the speed-up
-        # if each worker had a free core, below 2 as workers wait and share memory.
+        # with a free core per worker; it is below 2, because workers wait and share memory.
         free = 2.0 * pair.busy(2) / solo.busy(1) * solo.cpu_s / pair.cpu_s
         collected.append((solo.seconds / pair.seconds, free, 2.0 * half.seconds / pair.seconds))
         print(
@@ -216,7 +216,7 @@ def scaling(folder: Path, n_units: int, repeats: int, model: str) -> None:
 
 
 def overhead(folder: Path, n_units: int) -> None:
-    """Measure the overhead of many small units, and extrapolate to many workers."""
+    """Measure the scheduler's overhead with small units; extrapolate to many workers."""
     write_fleet(folder / 'small', 20, SMALL_BAGS, SMALL_PROGRAM)
     fit = FitOptions(gravity=STANDARD_GRAVITY, model='golovach')
     cost = measure(folder / 'small', n_units, 2, FleetOptions(fit, certificates=False))
@@ -234,7 +234,7 @@ def overhead(folder: Path, n_units: int) -> None:
 
 
 def kill(folder: Path, n_units: int, model: str) -> int:
-    """Kill a worker twice during a run of two workers; return the number of lost results."""
+    """Kill a worker at two times in a fit with two workers; return the number of lost results."""
     write_fleet(folder / 'fleet', n_units, 12, PROGRAM)
     fleet = Path(tempfile.mkdtemp(prefix='fleet-', dir=folder))
     for unit in find_units(Storage(str(folder / 'fleet')))[:n_units]:
@@ -271,7 +271,7 @@ def kill(folder: Path, n_units: int, model: str) -> int:
 
 
 def paper(found: Measured) -> None:
-    """Estimate times of runs with 100 and 1000 workers from the scheduler's time per task."""
+    """Estimate durations of fits with 100 and 1000 workers from the scheduler's time per task."""
     kilobytes = found.n_bytes / len(found.tasks) / 1e3
     print('\n| unit takes s | units | workers | elapsed s | efficiency | scheduler busy | MB/s |')
     print('|---|---|---|---|---|---|---|')
@@ -295,7 +295,7 @@ def paper(found: Measured) -> None:
 
 
 def makespan(tasks: Sequence[float] | np.ndarray, n_workers: int, per_task: float) -> float:
-    """Return the duration of a run [s] if the scheduler needs `per_task` [s] to send a task."""
+    """Return the duration of a fit [s] if the scheduler needs `per_task` [s] to send a task."""
     free = [0.0] * n_workers
     scheduler = end = 0.0
     for task in tasks:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the position errors of an inertial navigator due to accelerometer drift, raw and compensated.
+Computes position errors of an inertial navigator by accelerometer drift, raw and compensated.
 
 The unit of the held-out bag stands still in the chamber, so any computed motion is an error. The
 navigator levels for five minutes, then navigates without aiding for half an hour; or it gets a
@@ -50,7 +50,7 @@ COLOURS = {'raw': '#b2182b', 'one set': '#e08214', 'compensated': '#2166ac'}
 
 
 def turned(angles: Floats) -> Floats:
-    """Return the matrices, shape (..., 3, 3), of small rotations, shape (..., 3) [rad]."""
+    """Return rotation matrices, shape (..., 3, 3), for small angles, shape (..., 3) [rad]."""
     x, y, z = np.moveaxis(angles, -1, 0)
     zero = np.zeros_like(x)
     cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*x.shape, 3, 3)
@@ -58,7 +58,7 @@ def turned(angles: Floats) -> Floats:
 
 
 def levelled(force: Floats) -> Floats:
-    """Return the attitude, body to east-north-up, in which a mean force (..., 3) is vertical."""
+    """Return the attitude, body to east-north-up, that makes a mean force (..., 3) vertical."""
     up = force / np.linalg.norm(force, axis=-1, keepdims=True)
     east = np.array([1.0, 0.0, 0.0]) - up[..., :1] * up
     east /= np.linalg.norm(east, axis=-1, keepdims=True)
@@ -80,7 +80,7 @@ class Navigator:
         self.velocity, self.position, self.bias = zeros, zeros.copy(), zeros.copy()
 
     def step(self, dt: float, force: Floats, rate: Floats | float = 0.0) -> None:
-        """Integrate the specific force [m/s^2] and the body's rate [rad/s] over a time [s]."""
+        """Integrate specific force [m/s^2] and angular rate [rad/s] over a step of `dt` [s]."""
         v = self.velocity
         transport = np.stack([-v[..., 1], v[..., 0], 0.0 * v[..., 0]], -1) / EARTH_RADIUS
         self.attitude = turned(-transport * dt) @ self.attitude @ turned(rate * dt + 0.0 * v)
@@ -91,7 +91,7 @@ class Navigator:
         self.position = self.position + self.velocity * dt
 
     def correct(self, gain: Floats, innovation: Floats) -> None:
-        """Correct position, velocity, attitude and bias by the estimated errors."""
+        """Correct position, velocity, attitude and bias by `gain` times the ZUPT's innovation."""
         level = innovation[..., :2, None] * gain
         up = np.zeros((*level.shape[:-2], 1))
         position, velocity, tilt, bias = (
@@ -106,7 +106,7 @@ class Navigator:
 
 @dataclass(frozen=True)
 class Model:
-    """Samples (n, 3) [m/s^2] with noise density [m/s^2/sqrt(Hz)] and sd of the bias [m/s^2]."""
+    """Samples (n, 3) [m/s^2]; for the filter: noise density [m/s^2/sqrt(Hz)], bias sd [m/s^2]."""
 
     force: Floats
     noise_density: float
@@ -115,7 +115,7 @@ class Model:
 
 @dataclass(frozen=True)
 class Flights:
-    """Errors of all flights over time, shape (steps, flights), and the filter's position sigma."""
+    """Errors of all flights, shape (steps, flights), and the position sd by the filter."""
 
     time_s: Floats
     position: Floats

@@ -41,7 +41,7 @@ STAMP = Struct('<iI')
 
 @contextmanager
 def node_in_thread(*ros_args: str) -> Iterator[CompensationNode]:
-    """Run the node in a thread of this process, in a separate context."""
+    """Run the node in a thread of this process, in a separate rclpy context."""
     context = rclpy.context.Context()
     rclpy.init(args=['--ros-args', *ros_args], context=context)
     try:
@@ -144,7 +144,7 @@ def through_the_node(
     progress: Callable[[float], None] = lambda _: None,
 ) -> tuple[PlayReport, dict[str, int]]:
     """
-    Play a bag into the node and record the output of the node, without loss.
+    Play a bag into the node and record the node's output, without loss of a message.
 
     Returns the player's report and the number of recorded messages by topic. Unlike on a robot,
     the QoS is reliable with unlimited depth, and the player waits for the node.

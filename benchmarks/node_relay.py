@@ -10,19 +10,19 @@ temperatures at 10 Hz, and a sink process receives the Imu messages. Between sou
 either the node, with all functions, or the naive relay: an rclpy node that copies Vector3Stamped
 to Imu in a callback. The CPU time is that of all threads of the relay process, from the first
 sample to the last. The latency is the time from the source's publish call to the arrival in the
-sink's middleware, before any Python code of the sink runs. Ratios of node to naive relay vary less
-between machines than CPU times and latencies. The node uses its profile for Fast DDS; source, sink
-and naive relay use the default profile. At the last rate the node is measured once more while the
-parameter `calibration_file` is set twice a second. `--core` binds each relay to a core. `--floor`
-also measures a third relay, which copies the bytes of each message to Imu in a loop over a wait
-set, with the node's profile, and computes nothing.
+sink's middleware, before any Python code of the sink runs. The ratios node / naive relay of CPU
+times vary less between machines than the CPU times. The node uses its profile for Fast DDS;
+source, sink and naive relay use the default profile. At the last rate the node is measured once
+more while the parameter `calibration_file` is set twice a second. `--core` binds each relay to a
+core. `--floor` also measures a third relay, which copies the bytes of each message to Imu in a
+loop over a wait set, with the node's profile, and computes nothing.
 
 The source keeps `--depth` samples to send lost samples again. With a reliable relay Fast DDS
 removes samples from the source's store 859 at a time; with 2000 kept samples the removal delays
 the source by 1 to 3 ms, with the node and with the naive relay.
 
 Processes that missed each other's first DDS announcements discover each other at the next
-announcements, 3 s later. A process that opens the shared memory of another process may stand still
+announcements, 3 s later. A process that opens the shared memory of another process may be blocked
 for a third of a second, because Fast DDS waits for a reader. The measurement begins when all
 processes have discovered each other.
 
@@ -139,7 +139,7 @@ def _calibration_for(rate: int, folder: Path) -> str:
 def _measure(
     relay: str, rate: int, seconds: float, options: list[str], *, reloads: bool = False
 ) -> dict[str, Any]:
-    """Run source, relay and sink once as processes; return the figures."""
+    """Run source, relay and sink once as processes; return losses, CPU time and latencies."""
     with ExitStack() as stack:
         middle, sink, source = (
             stack.enter_context(_process(role, options)) for role in (relay, 'sink', 'source')
@@ -171,7 +171,7 @@ def _measure(
 
 
 def _summary(runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Sum the losses, and take the medians of CPU time and latencies."""
+    """Return the sum over runs of lost samples, and the medians of CPU time and latencies."""
     summary = {name: sum(run[name] for run in runs) for name in ('n_sent', 'n_lost')}
     for name in ('cpu_us', 'stolen', 'p50_ms', 'p99_ms', 'p999_ms'):
         summary[name] = statistics.median(run[name] for run in runs)
@@ -180,7 +180,7 @@ def _summary(runs: list[dict[str, Any]]) -> dict[str, Any]:
 
 def _ratio(runs: list[dict[str, Any]], naive: list[dict[str, Any]]) -> float:
     """
-    Return the median of CPU time of a run / CPU time of the neighbouring run of the naive relay.
+    Return the median over runs of CPU time / CPU time of the neighbouring run of the naive relay.
 
     Neighbouring runs are compared, because the speed of a shared machine changes over minutes.
     """
@@ -246,7 +246,7 @@ def _cpu_time(pid: int) -> float:
 
 
 def _machine_time() -> tuple[int, int]:
-    """Return the time stolen by the host from all cores, and their total time [ticks]."""
+    """Return the sum over all cores of the time taken by the host, and of all time [ticks]."""
     file = Path('/proc/stat')
     if not file.is_file():
         return 0, 0

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the figures of docs/beyond_1g.md: errors of K2 and K3 that are fitted to centrifuge runs.
+Prints the figures of docs/beyond_1g.md: errors of K2 and K3 that are fitted to centrifuge runs.
 
 Run ``python benchmarks/nonlinearity.py``, or with fewer units: ``--units 4``. The runs come from
 a generator in this file, not from `thermo_comp.simulation`. A test has 12 mountings, each in three
@@ -58,7 +58,7 @@ class Unit:
 
     @classmethod
     def drawn(cls, rng: np.random.Generator, k2: float, k3: float) -> Unit:
-        """Draw a unit whose nonlinear terms have a given size and random signs."""
+        """Draw a unit with K2 and K3 of the given sizes and random signs."""
         M = np.eye(3)
         M[[1, 2, 2], [0, 0, 1]] = 1e-3 * rng.standard_normal(3)
         return cls(
@@ -162,7 +162,7 @@ def fitted(runs: list[Run], **options: float) -> Calibration:
 
 
 def residual_ug(calibration: Calibration, record: Run, level: float) -> float:
-    """Return the RMS vector error of means over 60 s at a level of |f| [ug]."""
+    """Return the RMS vector error [ug] of means over 60 s at `level`, a value of |f| [g]."""
     compensator = Compensator(calibration, UNCHECKED)
     corrected = process_block(compensator, record.block)
     error = corrected.specific_force - record.force[corrected.index]
@@ -177,7 +177,7 @@ def residual_ug(calibration: Calibration, record: Run, level: float) -> float:
 
 
 def figures(seed: int, k2: float, k3: float) -> dict[str, Floats]:
-    """Fit a unit; return errors and error / claimed sd of K2 and K3, and the residual at 5 g."""
+    """Fit a unit; return errors and error / claimed sd of K2 and K3, and the RMS error at 5 g."""
     rng = np.random.default_rng(seed)
     unit = Unit.drawn(rng, k2, k3)
     runs = [run(unit, inward, rng) for inward in mountings(rng)]
@@ -188,7 +188,7 @@ def figures(seed: int, k2: float, k3: float) -> dict[str, Floats]:
     of_terms = sd[layout.nonlinear : layout.misalignment].reshape(3, 2, -1)
     result = {'kinds': np.array([term.kind for term in nonlinearity.terms])}
     if not k2:
-        # Repeat the fit with K2 and K3 fixed at 0; record how much bias and scale differ.
+        # Repeat the fit with K2 and K3 fixed at 0; return the changes of bias and scale in sd.
         without = fitted(runs, k2_sd=1e-12, k3_sd=1e-13)
         values = [
             np.array([[a.bias / a.scale_factor, np.log(a.scale_factor)] for a in used.axes])

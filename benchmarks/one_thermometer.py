@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the table of errors of fits with and without the case thermometer, on held-out bags.
+Prints the errors of fits with and without the case thermometer, on held-out bags.
 
 python benchmarks/one_thermometer.py
 """
@@ -29,7 +29,7 @@ MICRO_G = 9.80665e-6
 
 
 def command(*arguments: object) -> dict[str, Any]:
-    """Run thermo_comp; return its JSON output. Exit code 1 (bad verdict) raises no error."""
+    """Run thermo_comp; return its JSON output. Exit codes 0 and 1 (bad verdict) are accepted."""
     line = [sys.executable, '-m', 'thermo_comp', *map(str, arguments), '--json']
     done = subprocess.run(line, capture_output=True, text=True, check=False, cwd=ROOT)
     if done.returncode not in {0, 1} or not done.stdout:

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the figures of docs/regime.md: the regime detector in simulated ramps and soaks.
+Prints the figures of docs/regime.md: the regime detector in simulated ramps and soaks.
 
 A ramp of a chamber, with control ripple and a drift by self-heating, changes the temperatures of a
 case (first-order lag of the chamber) and of a board (first-order lag of the case). Sensors of
-several noises, quanta and rates read case and board. The detector's settings are the defaults
+several noises, quanta and rates read both temperatures. The detector's settings are the defaults
 except for noise, quantum, lags and ripple, which are those of the scene. All runs are seeded, so
 the command always prints the same figures, except for CPU times.
 
@@ -30,7 +30,7 @@ from regime_scenes import SENSORS, Scene, known_signature_delays, read, temperat
 from thermo_comp.thermal.regime import Regime
 
 SOAK_H = 5.0
-# Number of ramps per scene, by the rate of the readings [Hz], to which run time is proportional.
+# Number of ramps per scene by the rate of the readings [Hz]; run time is proportional to the rate.
 RAMPS = {10.0: 1, 1.0: 6, 0.1: 10}
 
 Rows = list[list[str]]
@@ -54,7 +54,7 @@ def cost_table() -> Rows:
 
 
 def table(title: str, rows: Rows) -> None:
-    """Print a Markdown table whose first row is the head."""
+    """Print rows as a Markdown table; the first row is the head."""
     print(f'## {title}\n')
     for k, row in enumerate(rows):
         print('| ' + ' | '.join(each.replace('|', '\\|') for each in row) + ' |')
@@ -64,7 +64,7 @@ def table(title: str, rows: Rows) -> None:
 
 
 def onset_table(pool: Pool, is_quick: bool, seed: int) -> Rows:
-    """Return rows of onset delays [s]: detector, and CUSUM test that is given the true ramp."""
+    """Return rows of onset delays [s] of the detector and of a CUSUM test with the true ramp."""
     n, hours = (6, 20.0) if is_quick else (200, 400.0)
     scenes = [Scene(0.5, 900.0, noise, quantum, 1.0) for noise, quantum in SENSORS]
     jobs = [(scene, n, seed, rippled) for scene in scenes for rippled in (False, True)]
@@ -106,7 +106,7 @@ def onset_table(pool: Pool, is_quick: bool, seed: int) -> Rows:
 
 
 def soak_table(pool: Pool, hours: float, seed: int) -> Rows:
-    """Return the rows of false switches per hour of soak by sensor."""
+    """Return a row per sensor with the number of false switches per hour of soak."""
     runs = max(1, round(hours / len(SENSORS) / SOAK_H))
     scenes = [Scene(0.5, 900.0, noise, quantum, 1.0) for noise, quantum in SENSORS]
     jobs = [(scene, SOAK_H, seed + k) for scene in scenes for k in range(runs)]
@@ -162,7 +162,7 @@ def rate_table(matrix: Matrix) -> Rows:
 
 
 def scene_table(matrix: Matrix, lag: float) -> Rows:
-    """Return median delay and dynamic fraction of ramps, for scenes with a given case lag."""
+    """Return median delay and flagged share of ramps, for scenes with a given case lag [s]."""
     rows = [['sensor', 'Hz', 'K/min', 'median, s', 'share flagged']]
     for scene, result in matrix:
         if scene.lag_s == lag:
@@ -186,7 +186,7 @@ Tables = Iterator[tuple[str, Rows]]
 
 
 def part_onset(pool: Pool, arguments: argparse.Namespace) -> Tables:
-    """Measure the onset delays for ramps of 0.5 K/min behind a lag of 15 min."""
+    """Measure onset delays for ramps of 0.5 K/min and a case that lags by 15 min."""
     rows = onset_table(pool, arguments.quick, arguments.seed)
     yield 'Onset of a ramp of 0.5 K/min behind a lag of 15 min, 1 Hz', rows
 
@@ -198,7 +198,7 @@ def part_soak(pool: Pool, arguments: argparse.Namespace) -> Tables:
 
 
 def part_matrix(pool: Pool, arguments: argparse.Namespace) -> Tables:
-    """Yield tables of the detector's results over all simulated scenes."""
+    """Yield tables of missed ramps, onset delays and flagged shares over all simulated scenes."""
     rates = arguments.rates or ((1.0, 0.1) if arguments.quick else tuple(RAMPS))
     matrix = run_matrix(pool, arguments.quick, arguments.seed, rates, arguments.ramps)
     yield 'Ramps by rate of the readings', rate_table(matrix)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the figures of docs/regime.md, drawn from the results of benchmarks/regime.py."""
+"""Draws the pictures of docs/regime.md from the results of benchmarks/regime.py."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the runs of benchmarks/regime.py: the detector over ramps and soaks, and its cost.
+Runs the detector over ramps and soaks, and measures its CPU time, for benchmarks/regime.py.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
 from thermo_comp.thermal.thermometer import Thermometer
 from thermo_comp.typing import Bools, Floats
 
-#: Arguments of `run_ramps`: scene, number of ramps, seed, whether with ripple and self-heating.
+#: Arguments of `run_ramps`: scene, number of ramps, seed, whether ripple and self-heating exist.
 Job = tuple[Scene, int, int, bool]
 
 
 @dataclass
 class Outcome:
-    """Delays [s] and counts of the detector's results for the ramps of a scene."""
+    """Onset delays [s] in the ramps of a scene, and numbers of ramps with a wrong flag."""
 
     delays: list[float]
     missed: int
@@ -36,7 +36,7 @@ class Outcome:
 
 
 def settings(scene: Scene) -> DetectorSettings:
-    """Return the default settings with the scene's noise, quantum, lags and chamber ripple."""
+    """Return detector settings with the scene's noise, quantum, lags and chamber ripple."""
     case = ThermometerSettings(scene.noise_sd, scene.quantum, lag_s=scene.lag_s)
     board = ThermometerSettings(scene.noise_sd, scene.quantum, lag_s=scene.lag_s + BOARD_LAG_S)
     return DetectorSettings(ripple_c=RIPPLE_C, case=case, board=board)
@@ -65,7 +65,7 @@ def ours(scene: Scene, case: Floats, board: Floats) -> npt.NDArray[np.int8]:
 
 
 def judge(flags: Iterable[tuple[Floats, Bools]], duration: float) -> Outcome:
-    """Return onset delays, counts and dynamic fraction of the time in ramps of `duration` s."""
+    """Return delays, wrong flags and the fraction flagged dynamic in ramps of `duration` s."""
     outcome = Outcome([], 0, 0, 0, 0.0, 0)
     for t, flag in flags:
         outcome.n += 1
@@ -89,7 +89,7 @@ def run_ramps(job: Job) -> tuple[Scene, Outcome]:
     """Run the detector over ramps of a scene."""
     scene, n, seed, is_rippled = job
     rng = rng_of(seed, 5, scene)
-    # A ramp lasts the time of a change by four quanta plus two lags, at least 40 min, at most 2 h.
+    # A ramp lasts two lags plus the time of a change by four quanta, limited to 40 min .. 2 h.
     edges_s = 60.0 * 4.0 * scene.quantum / scene.ramp_k_min + 2.0 * scene.lag_s
     duration = min(max(edges_s, 2400.0), 7200.0)
     t = np.arange(-2700.0, duration, 1.0 / scene.rate_hz)
@@ -102,7 +102,7 @@ def run_ramps(job: Job) -> tuple[Scene, Outcome]:
 
 
 def run_soak(job: tuple[Scene, float, int]) -> tuple[str, int, int, float]:
-    """Return for a soak: sensor, switches to dynamic, all switches, fraction of known flags."""
+    """Return sensor, number of switches to dynamic, of all switches, and share of known flags."""
     scene, hours, seed = job
     rng = rng_of(seed, 7, scene)
     t = np.arange(0.0, 3600.0 * hours, 1.0 / scene.rate_hz)

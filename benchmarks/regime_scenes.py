@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns simulated ramps and sensors of benchmarks/regime.py, and delays of a CUSUM test."""
+"""Simulates ramps and sensors for benchmarks/regime.py, and delays of a CUSUM test."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ class Scene:
 
 
 def first_order(t: Floats, lag: float) -> Floats:
-    """Return the response of a first-order lag to a ramp of slope 1 that starts at time 0."""
+    """Return the output of a first-order lag for a ramp of slope 1 that starts at time 0."""
     x = np.maximum(t, 0.0)
     return x - lag * (1.0 - np.exp(-x / lag))
 
 
 def second_order(t: Floats, lag: float, other: float) -> Floats:
-    """Return the response of two lags in series to a ramp of slope 1 that starts at time 0."""
+    """Return the output of two lags in series for a ramp of slope 1 that starts at time 0."""
     x = np.maximum(t, 0.0)
     decay = lag**2 * np.exp(-x / lag) - other**2 * np.exp(-x / other)
     return x - lag - other + decay / (lag - other)
@@ -70,7 +70,7 @@ def temperatures(
 
 
 def read(truth: Floats, scene: Scene, rng: np.random.Generator) -> Floats:
-    """Return the readings of a sensor [degC], with its noise and rounding."""
+    """Return readings [degC] with the noise and rounding of the scene's sensor."""
     reading = truth + rng.normal(0.0, scene.noise_sd, truth.shape)
     return np.round(reading / scene.quantum) * scene.quantum if scene.quantum else reading
 
@@ -82,9 +82,9 @@ def known_signature_delays(
     Return median and 95 % quantile of the delays [s] of a CUSUM test that is given the true ramp,
     baseline and noise.
 
-    The test is Page's: the largest log likelihood ratio over the onset times, with the true ramp
-    as signature. The threshold for `per_hour` false alarms is extrapolated by a line in the
-    logarithm of the number of exceedances over the threshold, counted in noise without a ramp.
+    The test statistic (Page's) is the largest log likelihood ratio over the onset times, with the
+    true ramp as signature. The threshold for `per_hour` false alarms is extrapolated from noise
+    without a ramp, where the logarithm of the number of exceedances is a line over the threshold.
     """
     rng = np.random.default_rng([seed, 9])
     dt = 1.0 / scene.rate_hz

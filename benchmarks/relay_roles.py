@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the processes that `node_relay.py` runs side by side: source, relays, sink, reloader.
+Contains the processes that `node_relay.py` runs side by side: source, relays, sink, reloader.
 
 The processes communicate with their parent by lines on standard input and output, and with each
 other by DDS.
@@ -25,16 +25,16 @@ from typing import Any
 
 RELIABILITIES = ('best_effort', 'reliable')
 DEPTH = 2000
-#: Time without a message after which the sink ends [s].
+#: Time without a new message after which the sink ends [s].
 SILENCE_S = 2.0
-#: Longest wait for the first sample [s].
+#: Longest wait of the sink for the first message [s].
 PATIENCE_S = 30.0
-#: Interval of the checks for arrived samples [s].
+#: Interval at which the sink checks for arrived messages [s].
 SINK_REST_S = 2e-3
 
 COUNTS = struct.Struct('<4siII7s5x3d')
 ENCAPSULATION = b'\0\1\0\0'
-#: frame_id of uncounted and of counted samples; each relay copies the frame_id to the Imu.
+#: frame_id of warm-up samples and of samples that the sink counts; relays copy it to the Imu.
 WARM_UP, SAMPLE = b'warmup\0', b'sensor\0'
 
 
@@ -89,7 +89,7 @@ def _source(arguments: argparse.Namespace) -> None:
             if wait > 0:
                 time.sleep(wait * 1e-9)
 
-    # Publish uncounted samples at the same rate until the sink has received an Imu message.
+    # Publish warm-up samples, which the sink does not count, until it has received a message.
     run(sys.maxsize, WARM_UP, lambda: bool(select.select([sys.stdin], [], [], 0)[0]))
     time.sleep(0.5)
     print('start', flush=True)
@@ -184,7 +184,7 @@ def _floor(arguments: argparse.Namespace) -> None:
         Vector3Stamped, 'accel/counts', print, _qos(arguments.reliability), raw=True
     )
     take, publish = subscription.handle.take_message, publisher.handle.publish_raw
-    # Both frame_ids have 7 bytes, so the three values are at the same offset in every message.
+    # Both frame_ids have 7 bytes, so x, y and z of a sample have the same offset in all messages.
     head, frame = COUNTS.size - 24, bytearray(COUNTS.size - 24 + 37 * 8)
     with subscription.handle, node.context.handle:
         wait_set = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)

@@ -1,8 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the measurement of `replay`: reading, compensating and writing bags, by thermo_comp and
-rosbags.
+Measures `replay`: reading, compensating and writing bags, by thermo_comp and rosbags.
 
 thermo_comp is measured by the function that the command `thermo_comp replay` calls. rosbags is
 measured by a script that deserializes each message, corrects it with the compensator of
@@ -50,7 +49,7 @@ def calibration() -> Calibration:
 
 
 def write_bag(path: Path, n: int, compression: str = 'zstd') -> None:
-    """Write a bag of n messages of counts at 400 Hz, and of two temperatures at 1 Hz."""
+    """Write a bag with n messages of counts at 400 Hz, and two temperatures at 1 Hz."""
     rng = np.random.default_rng(1)
     noise = np.round(rng.normal(0.0, 8.0, (BLOCK, 3)))
     with BagWriter(path, compression=compression) as bag:
@@ -68,20 +67,20 @@ def write_bag(path: Path, n: int, compression: str = 'zstd') -> None:
 
 
 def read(path: Path) -> int:
-    """Read a bag to columns, block by block; return the number of samples."""
+    """Read a bag into columns, block by block; return the number of samples."""
     with open_recording(path) as reader:
         return sum(len(block) for block in reader.blocks())
 
 
 def read_and_compensate(path: Path) -> int:
-    """Read a bag to columns and correct them; return the number of samples."""
+    """Read a bag into columns and correct the samples; return the number of samples."""
     compensator = Compensator(calibration())
     with open_recording(path) as reader:
         return sum(len(process_block(compensator, block).index) for block in reader.blocks())
 
 
 def compensate(path: Path) -> tuple[int, float]:
-    """Correct a bag; return the number of samples, and the CPU time without reading [s]."""
+    """Correct a bag; return the number of samples, and the CPU time of correcting alone [s]."""
     compensator = Compensator(calibration())
     spent = 0.0
     n = 0
@@ -175,7 +174,7 @@ def pipelines(folder: Path, n: int, repeats: int) -> None:
 
 
 def day(folder: Path, hours: float, compression: str, repeats: int) -> None:
-    """Print the time of reading bags of three lengths, without and with compensation."""
+    """Print the times of reading alone, and of reading and compensating, for three bag lengths."""
     print(
         f'{compression}: wall (CPU) seconds; alone = compensation only, million samples per CPU s'
     )

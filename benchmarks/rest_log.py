@@ -9,8 +9,8 @@ log.
 The node runs in this process, source and sink of samples in two other processes; the rest log is
 on in even seconds of the clock and off in odd seconds. Neighbouring seconds are compared, because
 the speed of a shared machine changes. The latency is the time from the source's publish call to
-the arrival in the sink's middleware. The rest log sums samples in blocks; the sum over a block,
-whose time is printed, delays the next sample.
+the arrival in the sink's middleware. For the rest log the node sums samples in blocks; summing a
+block delays the next sample. The time of summing a block is printed.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from thermo_comp.typing import Floats
 def cost(
     node: CompensationNode, relay: Relay, keeper: RestKeeper, seconds: int
 ) -> tuple[list[float], list[float]]:
-    """Return the CPU time per sample [us] in each second with the rest log, and without."""
+    """Return the CPU times per sample [us] in seconds with the rest log, and in those without."""
     found: tuple[list[float], list[float]] = ([], [])
     time.sleep(2.0 - time.time() % 2.0)
     for _ in range(seconds):
@@ -112,7 +112,7 @@ def measure(rate: int, seconds: int, folder: Path) -> None:
 
 
 def _compared(with_log: Floats, without: Floats, unit: str) -> str:
-    """Format the median without the log, the relative change with the log, its standard error."""
+    """Format the median of CPU time or latency without the log, and its change by the log."""
     n = min(len(with_log), len(without))
     more, usual = with_log[:n] - without[:n], float(np.median(without))
     # Medians, because the host may stop the machine and so make some seconds outliers.

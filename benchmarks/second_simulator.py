@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns a second simulator, without code of the simulator of thermo_comp, of units whose physics the
-fit does not model exactly.
+Simulates units whose physics the fit does not model exactly, without code of the simulator of
+thermo_comp.
 
 Run ``python benchmarks/second_simulator.py`` for the table of docs/accuracy.md, or a part of it:
 ``python benchmarks/second_simulator.py --kinds own,even --plans wide --seeds 1``.
@@ -33,7 +33,7 @@ STEP_S, SAMPLE_S, READING_S = 2.0, 1.0, 2.0
 NOISE_UG, READING_SD, READING_STEP = 5.0, 0.005, 0.001
 REFERENCE_C, AIR_S, FULL_SCALE = 20.0, 90.0, 8388607.0
 Program = tuple[float, float, list[tuple[float, float, float]]]
-#: For each plan: seed text and program of the test, duration [s], seed text and held-out programs.
+#: For each plan: seed, program and duration [s] of the test; seed and programs of held-out runs.
 #: A program: start [degC], soak [min], then target [degC], rate [K/min] and soak [min] per ramp.
 PLANS: dict[str, tuple[str, Program, float, str, list[Program]]] = {
     'wide': (
@@ -80,7 +80,7 @@ def seed_of(text: str) -> int:
 
 
 def unit_of(kind: str, seed: int) -> SimpleNamespace:
-    """Draw the parameters of a unit: coefficients [ug/K^n] and [ppm/K^n], time constants [s]."""
+    """Draw a unit: coefficients of bias [ug/K^n] and scale [ppm/K^n], time constants [s]."""
     draw = np.random.default_rng(seed_of(f'{kind}-{seed}'))
 
     def normal(sd: float) -> Floats:
@@ -132,7 +132,7 @@ def unit_of(kind: str, seed: int) -> SimpleNamespace:
 
 
 def directions(n: int, seed: int) -> Floats:
-    """Return attitudes spread over the sphere, in a frame that depends on the seed."""
+    """Return n attitudes spread over the sphere, in a frame that depends on the seed."""
     k = np.arange(n) + 0.5
     polar, around = np.arccos(1.0 - 2.0 * k / n), np.pi * (1.0 + 5.0**0.5) * k
     spiral = np.c_[np.cos(around) * np.sin(polar), np.sin(around) * np.sin(polar), np.cos(polar)]
@@ -155,8 +155,8 @@ def program_of(program: Program) -> tuple[Floats, Floats]:
 
 def states_of(unit: SimpleNamespace, air_c: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """
-    Integrate the temperatures of case and board, shape (n, bags), and of the pendulums, and sum
-    the outputs of the play operators, shape (n, bags, 3).
+    Return the temperatures of case and board, shape (n, bags), those of the pendulums, and the
+    bias by the play operators (hysteresis), both of shape (n, bags, 3).
     """
     n, n_bags = air_c.shape
     air, heat = air_c[0].copy(), unit.own_heat_k
@@ -198,13 +198,13 @@ def runs_of(
     soaked_s: float = 5400.0,
     soaked_c: float | None = None,
 ) -> list[Any]:
-    """Record a program in n attitudes, shape (n, 3), each as a run like `SimulatedRun`."""
+    """Return a run like `SimulatedRun` for each attitude of `up`, shape (n, 3)."""
     draw, n_bags = np.random.default_rng(seed), len(up)
     seconds, celsius = program_of(program)
     lasts_s = lasts_s or float(seconds[-1])
     t = np.arange(round((soaked_s + lasts_s) / STEP_S) + 1) * STEP_S - soaked_s
     first = celsius[0]
-    # Before the recording the air goes from `before` to the first temperature at 2 K/min.
+    # Before the recording the air changes from `before` to the first temperature at 2 K/min.
     before = first + draw.uniform(-5, 5, n_bags) if soaked_c is None else np.full(n_bags, soaked_c)
     coming = np.minimum(np.abs(first - before), (t + soaked_s)[:, None] / 30.0)
     coming = before + np.sign(first - before) * coming
@@ -243,7 +243,7 @@ def runs_of(
             for celsius in (board, case)
             for sd in [READING_SD * draw.standard_normal(len(read))]
         ]
-        # A sample has the stamp of the end of its cycle.
+        # The stamp of a sample is the end of its sample interval.
         stamps, read_ns = (np.rint(1e9 * (time + 0.5 * SAMPLE_S)).astype(np.int64)
                            for time in (middle, read))  # fmt: skip
         result.append(

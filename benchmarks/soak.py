@@ -54,7 +54,7 @@ class Temperatures:
         self.case = self.board = 20.0
 
     def step(self, seconds: float) -> tuple[float, float]:
-        """Advance by one reading; return the temperatures of board and case [degC]."""
+        """Advance by one reading interval; return the temperatures of board and case [degC]."""
         phase = seconds % (2.0 * (RAMP_S + REST_S))
         up = min(phase, RAMP_S) - min(max(phase - RAMP_S - REST_S, 0.0), RAMP_S)
         dt = 1.0 / READINGS_HZ
@@ -146,7 +146,7 @@ class Soak:
             self._news.notify_all()
 
     def send(self, n: int) -> None:
-        """Publish samples, and the temperatures that precede them."""
+        """Publish n samples, each temperature reading before the sample of the same stamp."""
         head, frame_length, frame = HEAD
         for index in range(self.n_sent, self.n_sent + n):
             sec, nanosec = divmod(self.start_ns + index * SECOND_NS // self.rate, SECOND_NS)
@@ -171,8 +171,8 @@ class Soak:
         while not self.n_heard and time.monotonic() < deadline:
             self.send(self.rate // READINGS_HZ)
             time.sleep(1.0 / READINGS_HZ)
-        # Samples before discovery are lost. Wait until two diagnostics reports, at least a report
-        # period apart, state the same number of samples: then no sample is under way.
+        # Samples sent before discovery are lost. Wait until two diagnostics reports, at least a
+        # report period apart, state the same number of samples: then no sample is under way.
         self.wait_for(lambda: int(self.account.get('samples in', 0)) > 0, 'a report')
         n_in = -1
         while n_in != int(self.account['samples in']):
@@ -180,7 +180,7 @@ class Soak:
             time.sleep(2.0 * REPORT_S)
         self.n_sent_before, self.n_in_before = self.n_sent, n_in
         self.n_out_before, self.n_heard_before = int(self.account['samples out']), self.n_heard
-        # Drop the latencies of the samples before discovery.
+        # Delete the latencies of samples sent before discovery.
         self.latencies.clear()
 
     def reload(self, path: str) -> None:
@@ -196,7 +196,7 @@ class Soak:
         self.client.call_async(request).add_done_callback(count)
 
     def run(self, seconds: float, paths: list[str]) -> dict[str, Any]:
-        """Publish samples for the given time; return the counts of messages."""
+        """Publish samples for `seconds`; return message counts, memory and latencies."""
         memory: list[tuple[float, float]] = []
         latency: list[tuple[float, float, float]] = []
         n_reloads = n_sent = 0
@@ -254,8 +254,8 @@ def _resident_kib(pid: int) -> float:
 
 def slope(rows: list[tuple[float, float]], window_s: float) -> tuple[float, float] | None:
     """
-    Return the slope per hour and the slope's standard error, from means over windows; None for
-    fewer than four windows.
+    Fit a line to means over windows; return its slope per hour and the slope's standard error, or
+    None for fewer than four windows.
     """
     table = np.array(rows)
     table = table[table[:, 0] >= 0.1 * table[-1, 0]]

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the errors of fits to bags of units whose physics the package does not model, compared with
-the errors of curves that scipy fits.
+Compares errors of fits to bags of units whose physics the package does not model with the errors
+of curves that scipy fits.
 
 Run ``python benchmarks/strangers.py`` for every case (many hours), or some cases with fewer units:
 ``python benchmarks/strangers.py --cases kink,soaks --units 2 --json strangers.json``. A colon
@@ -12,10 +12,10 @@ Units and recordings come from `strangers_units.py` and `strangers_cases.py`, wh
 with the package; the package is used only through `thermo_comp.fit` and `Calibration.correct`.
 Errors are those on held-out recordings, unless the row states otherwise. An error is the RMS of
 means over 60 s in ug: of the norm, ``|f| - g``, and of the vector against the true force. A ratio
-is the RMS of error / claimed sd. Figures are RMS over the units. MISS marks a limit of
-`strangers_limits.py` that a row violates; the exit code is then 1. The baselines fitted by the
-package take most of the time; ``--baselines strangers.json`` reads the scores of the baselines
-from an earlier run.
+is the RMS of error / claimed sd. The table has the RMS of each figure over the units. MISS marks a
+limit of `strangers_limits.py` that a row violates; the exit code is then 1. The baselines fitted
+by the package take most of the time; ``--baselines strangers.json`` reads the scores of the
+baselines from an earlier run.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ PACKAGE: dict[str, dict[str, Any]] = {
     'sets': {'groups': ('curve', 'set')},
 }
 BASELINES = ('constants', 'cubic', 'golovach', 'sets')
-#: Smallest share of minutes with all samples corrected for a fit to pass; below 1, because samples
-#: before the first reading of a thermometer are not corrected.
+#: Least share of the minutes that a fit must correct completely; below 1, because samples before
+#: the first reading of a thermometer are not corrected.
 LEAST_PUBLISHED = 0.98
 #: Cases of recorded bags, each with a single unit.
 RECORDED = ('sample-bags', 'no-case', 'board-twice', 'cats')
@@ -60,7 +60,7 @@ RECORDED = ('sample-bags', 'no-case', 'board-twice', 'cats')
 @dataclass(frozen=True)
 class Corrected:
     """
-    Corrected means over 60 s of a bag.
+    Means over 60 s of a bag's corrected samples.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def fitted(
 
 
 def chosen_by(calibration: thermo_comp.Calibration) -> str:
-    """List the groups of a calibration; groups of the response with their number of columns."""
+    """List a calibration's groups of columns; response groups with their number of columns."""
     columns = Counter(term.group for term in calibration.response)
     others = {entry.group for entry in calibration.evidence} - set(columns)
     return ' '.join([*sorted(others), *(f'{group}:{n}' for group, n in columns.items())])
@@ -110,8 +110,8 @@ def corrected(
     out = calibration.correct(bag.time_s, bag.samples, config=config, **given)
     first, size = slots(bag)
     force, claim = means(out.specific_force, first, size), means(out.covariance, first, size)
-    # The published covariance is that of a sample. A mean over a minute reduces white noise and
-    # the rounding of the converter; the other errors are equal in all samples of a minute.
+    # The published covariance is that of one sample. A mean over a minute reduces white noise and
+    # rounding errors of the converter; the other errors are equal in all samples of a minute.
     density = np.square(calibration.noise_density_m_s2_sqrt_hz)
     scale = np.array([axis.scale_factor for axis in calibration.axes])
     rounding = 1.0 / 6.0 if calibration.unit.input == 'counts' else 0.0
@@ -140,8 +140,8 @@ def score(outs: Sequence[Corrected], bags: Sequence[Minutes], *, is_drift: bool)
     forces = [out.force for out in outs]
     plain = error_of(forces, bags, is_drift=is_drift)
     if is_drift:
-        # The offset of a new mounting cancels in the drift of a pose: subtract the smallest
-        # variance, which is that at the reference temperature.
+        # A mounting's bias offset cancels in the drift: subtract the smallest claimed variance,
+        # that at the reference temperature, from all claimed variances of a bag.
         variances = [np.diagonal(out.claim, axis1=1, axis2=2) for out in outs]
         sd = np.sqrt(np.concatenate(
             [v - v.min(axis=0) + out.white for v, out in zip(variances, outs, strict=True)]
@@ -177,7 +177,7 @@ def _drift(forces: Sequence[Floats], bags: Sequence[Minutes]) -> Floats:
 
 
 def scipy_baselines(study: Study) -> dict[str, Callable[[Minutes], Floats]]:
-    """Return the two corrections that scipy fits: constants, and a cubic per axis."""
+    """Return the two corrections that scipy fits: constants alone, and with a cubic per axis."""
     bags = [minutes(bag) for bag in study.baseline_bags or study.bags]
     orders = {'constants': 0, 'cubic': 3}
     if study.is_drift:
@@ -205,8 +205,8 @@ def bias_score(calibration: thermo_comp.Calibration, study: Study) -> Score:
     bag = Bag('zero', time_s, zero, temperatures)
     out = corrected(calibration, bag, config)
     error = out.force[len(out.force) // 2 :].mean(axis=0)
-    # The Cramer-Rao bound does not include thermometer noise and turn-ons: subtract their claimed
-    # variance, which is that of the calibration without a posterior.
+    # The Cramer-Rao bound does not include thermometer noise and turn-ons: subtract the variance
+    # that a calibration without a posterior claims, which contains only these two.
     exact = corrected(replace(calibration, posterior=None), bag, config)
     sd = np.sqrt(np.maximum(np.diag(out.claim[-1] - exact.claim[-1]), 0.0))
     return Score(
@@ -221,9 +221,9 @@ def without_constants(calibration: thermo_comp.Calibration) -> thermo_comp.Calib
     """
     Return a calibration in whose posterior bias, scale and misalignment have no variance.
 
-    A single pose determines these constants to 50 mg only. The drift in a pose does not depend on
-    the constants, but the difference of two claimed variances does: an acceleration `a`, which has
-    noise, contributes ``a^2`` times the variance of the scale factor.
+    A single pose determines bias and scale to 50 mg only. The drift in a pose does not depend on
+    bias and scale, but the claimed variance contains ``a^2`` times the variance of the scale
+    factor, and so changes with the noise of the acceleration `a`.
     """
     if calibration.posterior is None:
         return calibration
@@ -239,7 +239,7 @@ def without_constants(calibration: thermo_comp.Calibration) -> thermo_comp.Calib
 def scored(
     study: Study, model: thermo_comp.Calibration, tests: dict[str, list[Minutes]]
 ) -> dict[str, Score]:
-    """Return the score of a calibration for each set of held-out bags."""
+    """Return the scores (errors and ratios) of a calibration by set of held-out bags."""
     if study.bound is not None:
         return {'': bias_score(model, study)}
     if study.is_drift:
@@ -259,7 +259,7 @@ def run(
     earlier: Mapping[tuple[str, int], Mapping[str, Score]],
 ) -> list[Result]:
     """
-    Fit all models to a study and score them.
+    Fit all models to a study's bags, and compute their errors on held-out bags.
 
     Parameters
     ----------
@@ -334,7 +334,7 @@ def run_case(
         seen = Counter[str]()
         for study in studies:
             if not label or study.label == label or study.label in needed:
-                # Studies with equal labels hold out different bags; each is counted as a unit.
+                # Studies with equal labels hold out different bags; each study counts as a unit.
                 number = unit + seen[study.label]
                 seen[study.label] += 1
                 print(f'{case} {study.label}, unit {number}', file=sys.stderr, flush=True)
@@ -362,7 +362,7 @@ HEAD = (
 
 
 def pair(score: Score | None) -> str:
-    """Format the errors of the norm and of the vector [ug] of a model."""
+    """Format a model's error of the norm and of the vector [ug]."""
     if score is None:
         return '-'
     return ' / '.join('-' if np.isnan(x) else f'{x:.3g}' for x in (score.norm, score.vector))

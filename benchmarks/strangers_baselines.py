@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the baselines that scipy fits to means over a minute, for the benchmark `strangers.py`.
+Fits the baselines of the benchmark `strangers.py` by scipy, to means over a minute.
 
 The baseline 'constants' has nine numbers: bias, scale and misalignment. The baseline 'cubic' adds
 for each axis a cubic of the bias and a line of the scale over board temperature. Both baselines
@@ -21,8 +21,8 @@ from strangers_units import GRAVITY, REFERENCE_C, Bag, Floats
 Ints = npt.NDArray[np.int64]
 
 WINDOW_S = 60.0  # length of the means whose errors are evaluated [s]
-#: Largest bias [g], relative error of the scale and misalignment [rad]. A fit without bounds to
-#: few attitudes finds scale factors that make the forces of all attitudes equal.
+#: Largest fitted bias [g], relative error of the scale and misalignment [rad]. A fit without
+#: bounds to few attitudes finds scale factors that make the forces of all attitudes equal.
 LARGEST = 0.2
 SPAN_K = (
     15.0  # temperatures are divided by this unit [K], so that their powers have equal magnitudes
@@ -39,7 +39,7 @@ class Minutes:
 
 
 def slots(bag: Bag) -> tuple[Ints, Ints]:
-    """Return the first row of each whole window, and the number of rows of each window."""
+    """Return first row and number of rows of windows of 60 s with at least 95 % of their rows."""
     number = np.floor((bag.time_s - bag.time_s[0]) / WINDOW_S)
     first = np.flatnonzero(np.diff(number, prepend=-1.0))
     size = np.diff(first, append=len(number))
@@ -66,7 +66,7 @@ def minutes(bag: Bag) -> Minutes:
 
 
 def _curved(p: Floats, order: int, samples: Floats, board: Floats) -> Floats:
-    """Correct samples in g; p: bias, scale, misalignment, then curves of bias and of scale."""
+    """Correct samples in g; p: bias, scale, misalignment, then coefficients of both curves."""
     t = ((board - REFERENCE_C) / SPAN_K)[:, None]
     bias, scale = p[:3], 1.0 + p[3:6]
     if order:

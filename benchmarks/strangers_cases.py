@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the simulated cases of the benchmark `strangers.py`: units, bags of the fit, held-out bags.
+Simulates the cases of the benchmark `strangers.py`: units, bags of the fit, held-out bags.
 
 Each case draws a random unit, seeded by its number, and yields studies: bags for a fit, and
 held-out bags.
@@ -52,7 +52,7 @@ HELD = (
 )
 FROST = program(5, 10, (12, 0.5, 60), (28, 0.8, 30))
 ROOM = program(21, 20)
-#: SHORT is from 7 to 33 degC, the programs USE of the held-out bags are from 5 to 35 degC.
+#: Program SHORT spans 7 to 33 degC, the programs USE of the held-out bags span 5 to 35 degC.
 SHORT = program(20, 20, (33, 1, 50), (7, 1, 60), (20, 1, 12))
 USE = (program(20, 20, (35, 0.7, 45), (15, 1.5, 40)), program(20, 20, (5, 1.2, 50), (24, 0.6, 40)))
 #: Programs for MEMS units: of the fit, and of the held-out bags.
@@ -116,7 +116,7 @@ FULL_SCALE = {'full_scale': 8388607.0}
 
 
 def one_test(bags: tuple[Bag, ...]) -> dict[str, tuple[Bag, ...]]:
-    """Return bags as the only set of held-out bags of a study."""
+    """Return bags as the only set of held-out bags, without a name."""
     return {'': bags}
 
 
@@ -208,7 +208,7 @@ def mems(number: int) -> Iterator[Study]:
 def sessions(number: int) -> Iterator[Study]:
     """
     Turn a MEMS unit by hand every 8 min in two recordings, each with a random bias offset of
-    0.3 mg. Fit the first recording, both, and the second with the first fit as prior.
+    0.3 mg. Fit the first recording, both recordings, and the second with the first fit as prior.
     """
     rng, hold_s, rate_hz = rng_of('sessions', number), 480.0, 10.0
     unit, up = consumer_grade(rng), spread(12, rng)
@@ -247,7 +247,7 @@ def kink(number: int) -> Iterator[Study]:
 
 
 def gradient(number: int) -> Iterator[Study]:
-    """Add a bias proportional to case less board temperature; bags of 40 min, fast ramps."""
+    """Add a bias proportional to case less board temperature; record fast ramps of 40 min."""
     rng = rng_of('gradient', number)
     unit = navigation(
         rng,
@@ -340,7 +340,7 @@ def coarse_thermometer(number: int) -> Iterator[Study]:
 
 
 def slow_drift(number: int) -> Iterator[Study]:
-    """Add a random walk of the bias, slow tilts, or a bias of 1 mg (1 sd) that decays."""
+    """Add a random walk of the bias, slow tilts of the support, or a decaying bias (sd 1 mg)."""
     for kind, grade, full_scale, rate_hz, ways in (
         ('bias', navigation, 8388607.0, 0.5, (HALF, HELD)),
         ('support', navigation, 8388607.0, 0.5, (HALF, HELD)),
@@ -448,7 +448,7 @@ def bias_bound(unit: Unit, up: Floats, bags: Sequence[Bag], window_s: float = 60
     ))  # fmt: skip
 
     def modelled(p: Any) -> Any:
-        """Return the samples in g for complex `p`, whose imaginary step gives derivatives."""
+        """Return samples [g] for complex parameters `p`, for derivatives by imaginary steps."""
         a, b, c = p[6:9]
         u = up + np.einsum('pk,pki->pi', p[21:].reshape(n, 2), tangents)
         u = u / np.sqrt((u**2).sum(axis=1, keepdims=True))

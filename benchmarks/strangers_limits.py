@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the limits of the benchmark `strangers.py`: rows of figures over several units, and the
+Contains the limits of the benchmark `strangers.py`: rows of figures over several units, and the
 limits that each row violates.
 """
 
@@ -43,7 +43,7 @@ class Score:
 @dataclass(frozen=True)
 class Result:
     """
-    The scores of a unit, a study and a set of held-out bags.
+    Scores of all models for a unit, a study and a set of held-out bags.
 
     Parameters
     ----------
@@ -73,13 +73,13 @@ class Result:
 @dataclass(frozen=True)
 class Limit:
     """
-    The limits of a row. By default the error may be 1.05 times that of the best baseline, and
-    error / claimed sd 1.5.
+    The limits of a row. By default the error may be up to 1.05 times that of the best baseline,
+    and the RMS of error / claimed sd up to 1.5.
 
     Parameters
     ----------
     norm, vector : float
-        Largest errors [ug].
+        Largest errors of ``|f|`` and of the vector [ug].
     best : float
         Largest error / smallest error of the baselines, for the norm and for the vector.
     low, high : float
@@ -121,8 +121,8 @@ LIMITS = {
     'plain': Limit(norm=1.3, vector=2.0, low=0.7, high=1.4),
     'one-pose: own bag': Limit(vector=2.0, low=0.7, high=1.4),
     'one-pose: other program': Limit(vector=5.0, low=0.7, high=1.4),
-    # For 'returned', `score` subtracts the smallest claimed variance over temperature, which
-    # contains a slope's variance: error / claimed sd has no meaning and no limit.
+    # `score` subtracts the smallest claimed variance of a bag, in 'returned' also the variance of
+    # a slope over temperature, so that error / claimed sd has no meaning and no limit.
     'returned': Limit(high=np.inf),
     'soaks': Limit(low=0.5, high=1.5, claim=3.0),
     'turn-on': _TURN_ON,
@@ -139,7 +139,7 @@ LIMITS = {
     'bump': Limit(norm=60.0),
     'carry': Limit(),
     'support': Limit(vector=60.0),
-    # The baselines use the same wrong gravity, so only error / claimed sd is limited.
+    # Fit and baselines are given the same wrong gravity: only error / claimed sd is limited.
     'gravity': Limit(best=np.inf),
     'cold-start': Limit(),
     # The claimed sd includes flicker noise over times longer than the recordings, so the error
@@ -149,7 +149,7 @@ LIMITS = {
     'coarse-thermometer': Limit(),
     'slow-drift': Limit(),
     'third-node alone': Limit(),
-    # The still-air bag may increase the chamber bags' error by 2 % at most, the noise of a fit.
+    # Adding a bag in still air to the fit may increase the error by 2 %, the noise of a fit.
     'third-node joint: chamber': Limit(than='alone: chamber', times=1.02),
     'third-node joint: still air': Limit(than='alone: still air', times=1.02),
     'third-node joint: its attitude': Limit(than='alone: its attitude', times=0.5),
@@ -202,7 +202,7 @@ def judged_ratio(score: Score) -> float:
 
 
 def rows_of(results: Sequence[Result]) -> list[Row]:
-    """Return a row per title with the RMS of the scores over the units, in order of results."""
+    """Return a row per title with the RMS of the scores over the units, in the results' order."""
     titles = list(dict.fromkeys(result.title for result in results))
     return [_row([result for result in results if result.title == title]) for title in titles]
 
@@ -228,7 +228,7 @@ def _row(results: Sequence[Result]) -> Row:
 
 
 def limit_of(title: str) -> Limit:
-    """Find the limit of a row by the longest beginning of its title."""
+    """Return the limits of a row: those of the longest key with which its title begins."""
     return LIMITS[max((key for key in LIMITS if title.startswith(key)), key=len)]
 
 
@@ -239,7 +239,7 @@ def best_baseline(row: Row, name: str) -> float:
 
 
 def misses(row: Row, others: Sequence[Row]) -> list[str]:
-    """Describe the limits that a row violates; `others` are all rows of the case."""
+    """Return a text for each limit that a row violates; `others` are all rows of the case."""
     exceeded = ['refused'] if row.refused else []
     if 'fit' not in row.scores:
         return exceeded
@@ -260,7 +260,7 @@ def misses(row: Row, others: Sequence[Row]) -> list[str]:
             if limit.than and other.title.endswith(limit.than) and 'fit' in other.scores:
                 share = getattr(fit, name) / getattr(other.scores['fit'], name)
                 checks.append((f'{name} / {limit.than}', share, limit.times))
-    # An undefined figure, such as the vector without a true force, is NaN and violates no limit.
+    # An undefined figure, as the vector error without a true force, is NaN and violates no limit.
     exceeded += [f'{name} {value:.3g} > {most:g}' for name, value, most in checks if value > most]
     if ratio < limit.low:
         exceeded.append(f'ratio {ratio:.2g} < {limit.low:g}')

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the cases with recordings of the benchmark `strangers.py`: the sample bags, with and without
-the case thermometer, and a recording of a real unit, published with another package.
+Contains the cases with recordings of the benchmark `strangers.py`: the sample bags, with and
+without the case thermometer, and a recording of a real unit, published with another package.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ import thermo_comp
 from thermo_comp.recording.reader import read_recording
 
 ROOT = Path(__file__).resolve().parent.parent
-#: Length of the blocks into which the recording of the real unit is cut, and of the means by which
-#: rests are found [s].
+#: Length of the blocks into which the recording of the real unit is cut, and of the means whose
+#: steps separate rests [s].
 BLOCK_S, MINUTE_S = 10800.0, 60
 #: Largest change of the mean from one minute to the next at rest [m/s^2]. When the real unit was
 #: carried from one room to another its bias changed by 0.1 m/s^2 in a minute.
@@ -40,7 +40,7 @@ def sample_bag(path: Path) -> Bag:
 
 
 def samples(which: str) -> Iterator[Study]:
-    """Yield the sample bags with both thermometers, without the case's, or the board's as both."""
+    """Yield the sample bags with both thermometers, the board's alone, or the board's twice."""
     bags = [sample_bag(path) for path in sorted((ROOT / 'bags/fit').glob('*.mcap'))]
     bags.append(sample_bag(ROOT / 'bags/held_out.mcap'))
     if which != 'sample-bags':
@@ -97,7 +97,7 @@ def blocks_of(bag: Bag, name: str) -> dict[int, Bag]:
 
 
 def cats(path: Path) -> Iterator[Study]:
-    """Hold out the real unit's rests in odd blocks, then those in even blocks, then each one."""
+    """Hold out the real unit's rests in odd blocks, then those in even blocks, then one by one."""
     whole = real_unit(path)
     rests = [part(whole, rows, f'rest{k}') for k, rows in enumerate(rests_of(whole))]
     still: tuple[list[Bag], list[Bag]] = ([], [])

@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the units and recordings of the benchmark `strangers.py`, simulated by numpy and scipy.
+Simulates the units and recordings of the benchmark `strangers.py` by numpy and scipy.
 
 Case, board, the sensing part of each axis and a hidden node are the nodes of a linear thermal
-network. The input of the network is the air temperature of the chamber, which is linear in time
-between two steps, so the integration is exact. Bias and scale of an axis are functions of
-the temperature of the axis's sensing part. This module shares no code with the package, so that an
-error of the package is not an error of the simulated truth.
+network. The input of the network is the chamber's air temperature, which is linear in time within
+each step, so the integration is exact. Bias and scale of an axis are functions of the temperature
+of the axis's sensing part. This module shares no code with the package, so that an error of the
+package is not an error of the simulated truth.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def _zeros() -> Floats:
 @dataclass(frozen=True)
 class Unit:
     """
-    A unit: constants, curves, thermal network, converter, thermometers.
+    A simulated unit: constants, curves, thermal network, converter, thermometers.
 
     Parameters
     ----------
@@ -232,7 +232,7 @@ def consumer_grade(rng: np.random.Generator) -> Unit:
 def network(unit: Unit, environment: Environment = CHAMBER) -> tuple[Floats, Floats, Floats]:
     """Return A, b, h of ``x' = A x + b air + h``; x: case, board, parts, hidden node [degC]."""
     A, b, h = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
-    # Conductances of the case per its heat capacity: 0.1 to the board, `film` to the air.
+    # Relative conductances of the case: 0.1 to the board, `film` to the air (1 in a chamber).
     A[CASE, CASE] = -environment.film - 0.1
     A[CASE, BOARD] = 0.1
     b[CASE] = environment.film
@@ -249,9 +249,9 @@ def network(unit: Unit, environment: Environment = CHAMBER) -> tuple[Floats, Flo
 
 
 def integrate(A: Floats, b: Floats, h: Floats, air: Floats, step_s: float, x: Floats) -> Floats:
-    """Integrate the network from the state `x`, exactly for air that is linear between steps."""
+    """Integrate the network from state `x`, exactly for an air temperature linear in a step."""
     n = len(b)
-    # Extended state: the nodes, the air, the slope of the air, and 1 for the self-heating.
+    # Extended state: temperatures of nodes and air, slope of the air temperature, 1 (for `h`).
     whole = np.zeros((n + 3, n + 3))
     whole[:n, :n], whole[:n, n], whole[:n, n + 2] = A, b, h
     whole[n, n + 1] = 1.0
@@ -330,8 +330,8 @@ def record(
     lasts_s = float(corners[-1, 0])
     grid = np.arange(-SOAK_S, lasts_s + STEP_S, STEP_S)
     A, b, h = network(unit, environment)
-    # The chamber has a constant error and a ripple, and 5400 s before the recording a temperature
-    # that differs by up to 5 K from the program's first temperature.
+    # The air temperature has a constant error and a ripple, and differs 5400 s before the
+    # recording by up to 5 K from the program's first temperature.
     first_c = corners[0, 1]
     air = np.interp(grid, *corners.T) + 0.2 * rng.standard_normal()
     air += 0.03 * np.sin(2.0 * np.pi * grid / rng.uniform(200, 300) + rng.uniform(0, 2 * np.pi))
@@ -345,7 +345,7 @@ def record(
     states = integrate(A, b, h, air, STEP_S, x)
     n = int(lasts_s * rate_hz)
     stamps = (np.arange(n) + 1.0) / rate_hz
-    # A sample is the mean over a cycle and has the time of the cycle's end as its stamp.
+    # A sample is the mean over a sample interval; its stamp is the end of this interval.
     middle = stamps - 0.5 / rate_hz
     nodes = np.array([np.interp(middle, grid, node) for node in states.T]).T
     parts = np.where(unit.part_s > 0.0, nodes[:, PARTS], nodes[:, [BOARD]])
@@ -438,14 +438,14 @@ def lagged(node: Floats, tau_s: float) -> Floats:
     if not tau_s:
         return node
     decay = np.exp(-STEP_S / tau_s)
-    # `behind`: node less lagged temperature; it tends to `tau_s` times the rate of a ramp.
+    # `behind`: node temperature less lagged temperature, in a long ramp `tau_s` times the rate.
     gain = tau_s / STEP_S * (1.0 - decay)
     behind = lfilter([gain], [1.0, -decay], np.diff(node, prepend=node[0]))
     return np.asarray(node - behind)
 
 
 def quantised(words: Floats, carries: bool) -> Floats:
-    """Round to whole counts; with `carries` the remainder is added to the next sample."""
+    """Round to whole counts; with `carries` the rounding remainder is added to the next sample."""
     if not carries:
         return np.asarray(np.rint(words))
     return np.diff(np.rint(np.cumsum(words, axis=0)), axis=0, prepend=0.0)

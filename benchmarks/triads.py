@@ -80,9 +80,9 @@ def _only(axis: int, value: float) -> Triple:
 
 def triad(kind: str, seed: int = 0) -> UnitModel:
     """
-    Return a triad of sensor heads that lag the board. Bias and scale are constant in the kind
-    'plain', else they depend on the heads' temperatures (kind 'paper': on the board's) and on the
-    effects of the kind.
+    Return a triad whose sensor heads lag the board's temperature. Bias and scale are constant in
+    the kind 'plain', else they depend on the temperatures of the heads (kind 'paper': of the
+    board) and, in the kinds of `_EXTRA`, on further effects.
     """
     draw = Specimen(kind, seed, FIRST_KIND + TRIAD_NAMES.index(kind))
     heads = ['head-x', 'head-y', 'head-z'] if kind in _OWN_HEADS else ['head']
@@ -139,7 +139,7 @@ def _slips(draw: Specimen) -> list[Effect]:
     return effects
 
 
-# Kinds of triads with a thermal node for each axis, and kinds with heads also linked to the case.
+# Kinds of triads with a head for each axis, and kinds whose heads are also linked to the case.
 _OWN_HEADS = ('own-lags', 'between', 'switched-load')
 _BETWEEN = ('between', 'switched-load')
 _EXTRA: dict[str, Callable[[Specimen], list[Effect]]] = {
@@ -151,13 +151,13 @@ _EXTRA: dict[str, Callable[[Specimen], list[Effect]]] = {
         )
     ],
     'hysteresis': _slips,
-    # Powers of |T_case - T_board|: load (1) and losses (2) of a heat pump, convection (1.25).
+    # Exponents of |T_case - T_board|: load (1) and losses (2) of a heat pump, convection (1.25).
     'even': lambda draw: [
         FlowEffect('case', 'board', 1.0, bias=draw.signed(3.0, 12.0), scale=draw.normal(10.0)),
         FlowEffect('case', 'board', 2.0, bias=draw.signed(0.2, 1.0)),
         FlowEffect('case', 'board', 1.25, bias=draw.normal(2.0), bias_curvature=draw.normal(0.05)),
     ],
-    # Leakage doubles every 7 to 10 K, from 1 to 5 ug at the reference temperature.
+    # A leakage of 1 to 5 ug at the reference temperature, which doubles every 7 to 10 K.
     'convection': lambda draw: [
         LeakageEffect('board', draw.between(10.0, 14.5), bias=draw.signed(1.0, 5.0))
     ],

@@ -4,7 +4,7 @@
 Owns the files made from the code: JSON schema, and pages on calibration file and ROS interface.
 
 Run ``python docs/make_reference.py`` after a change of a key of the calibration file or of a
-parameter of the node. A test compares the files with the code.
+parameter of the node. A test compares the generated files with the code.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ Schema; this page is generated from the schema.
 A file is refused if it has unknown or missing keys, text in place of a number, NaN or infinity,
 ranges that do not rise, functions that are not normalised at the reference temperature, a relative scale that could leave
 the range 0.1 to 10, a posterior of the wrong size, another `format_version` than 2, YAML aliases or tags, or a size above 8
-MiB. The error names the file, the key, the value and the expected value. Numbers are written with all digits and the
-posterior in single precision, so that no number changes if a file is read and written. The last line of a written file is
-`...`: if such a file is cut, for example by a copy that has not ended, it is refused.
+MiB. The error message names the file, the key, the value and the expected value. Numbers are written with all digits and
+the posterior in single precision, so that no number changes if a file is read and written. The last line of a written file
+is `...`: if such a file is cut, for example by a copy that has not ended, it is refused.
 
 The main keys:
 
@@ -83,8 +83,8 @@ response:                            # columns added to both sets
 The parameters of the posterior are, for each axis x, y, z: first the bias in input units (level of
 the static set, free coefficients of its Fs, level of the dynamic set, free coefficients of its Fs,
 weights of the response in the order of the file); then the parameters of the relative scale in the
-same order. A `nonlinearity` adds, for each axis, the coefficients of its terms, then their changes
-per kelvin. The last three parameters of a posterior are `M[1][0]`, `M[2][0]` and `M[2][1]`. The
+same order. A `nonlinearity` adds parameters for each axis: the coefficients of its terms, then their
+changes per kelvin. The last three parameters of a posterior are `M[1][0]`, `M[2][0]` and `M[2][1]`. The
 covariance of all parameters is `factor @ factor.T + diag(diagonal)`. The posterior of a `gyroscope`
 has only the parameters of the bias, in rad/s and in the order of the accelerometer's bias. The
 `gyroscope` uses the ranges, the reference temperature and the thermometers of the accelerometer.
@@ -94,10 +94,10 @@ BOUNDS = """\
 ## Bounds
 
 Each number in a calibration is one of the quantities in the table. The bounds are wider than any instrument needs; a
-calibration within them gives finite results and a positive definite covariance. Further bounds depend on the full scale of
-the unit. The bias at the reference temperature, and its change over temperature, must each be within twice the full scale.
-No column of the thermal response may change the bias, nor a parameter's sd the bias or scale, by more than a million times
-the limit of bias or scale. The relative scale with the largest contributions of all columns must be between 0.1 and 10.
+calibration within them gives finite results and a positive definite covariance. The bias at the reference temperature, and
+its change over temperature, must each be within twice the full scale of the unit. The relative scale, plus or minus the sum
+of the largest effects of its columns, must stay between 0.1 and 10. A column of the response must change the bias, and one
+sd of a parameter must change bias or relative scale, by at most a million times these limits.
 """
 
 INTERFACE = """\
@@ -117,10 +117,10 @@ Each QoS policy can be overridden at start with the usual `qos_overrides./topic.
 parameters.
 
 With Fast DDS the node uses a profile with `nackSupressionDuration` = 20 ms for its publishers, as no ROS QoS setting has
-this parameter. With the default, 0 s, each sample for a reliable subscriber wakes a thread of the middleware about four
-times, which takes a quarter of the node's CPU time. With NACKs suppressed for 20 ms, a lost sample is resent up to 20 ms
-later. A user's profile (`FASTRTPS_DEFAULT_PROFILES_FILE`, or `DEFAULT_FASTRTPS_PROFILES.xml` in the working directory)
-replaces that of the node: repeat `nackSupressionDuration` there.
+this parameter. With the default of `nackSupressionDuration`, 0 s, a thread of the middleware wakes about four times for each
+sample to a reliable subscriber, and takes a quarter of the node's CPU time. With NACKs suppressed for 20 ms, a lost sample
+is resent up to 20 ms later than without. A user's profile (`FASTRTPS_DEFAULT_PROFILES_FILE`, or
+`DEFAULT_FASTRTPS_PROFILES.xml` in the working directory) replaces that of the node: repeat `nackSupressionDuration` there.
 
 `linear_acceleration_covariance` is a full 3x3 matrix: noise of the sample plus uncertainty of the calibration at the
 present thermal state. Without an angular rate or an orientation in the input, the first element of the covariance of the
@@ -175,7 +175,7 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | case readings that repeat those of the board (one topic for both), ten changed readings in a row | the readings are used; the gradient expected of the case adds to the covariance, WARN |
 | a sample whose stamp goes back by a second or more, after the force at rest has refuted the calibration | nothing is published until the force at rest agrees with gravity in two windows, ERROR |
 | a board temperature that leads the case temperature in ramps (swapped topics) | the covariance is increased, ERROR |
-| counts constant for `stuck_timeout`, on all axes or on one axis while the others change or show their noise; three zeros | dropped, counted, ERROR |
+| counts constant for `stuck_timeout`, on all axes or on one axis while the others change or show their noise; samples of three zeros | dropped, counted, ERROR |
 | counts that come faster than their conversion cycle | dropped, counted, ERROR |
 | a magnitude of the specific force at rest that differs from gravity by more than `gravity_tolerance` | nothing is published, ERROR |
 | a second publisher of a topic | the topic is not used, ERROR, until one publisher is left or for one second all messages are from one publisher (WARN while the middleware still lists a killed publisher, for 20 s) |

@@ -19,7 +19,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
         return markdown
     command = typer.main.get_command(app)
     text = get_docs_for_click(obj=command, ctx=typer.Context(command), name='thermo_comp')
-    # Drop the text before the first command, which the page has already.
+    # Drop the text before the first command: the page of the command line has it already.
     commands = text[text.index('\n## ') :]
     return markdown + re.sub(
         r'^Examples?:\n((?: +.*\n)+)', r'Example:\n\n```sh\n\1```\n', commands, flags=re.MULTILINE

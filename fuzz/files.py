@@ -21,7 +21,7 @@ from thermo_comp.errors import RecordingError
 from thermo_comp.recording.reader import open_recording
 from thermo_comp.unit.schema import build
 
-#: One folder for all inputs of a process.
+#: Folder of all input files of a process.
 FOLDER = tempfile.TemporaryDirectory(prefix='fuzz-')
 METADATA = """\
 rosbag2_bagfile_information:
@@ -49,14 +49,14 @@ def _one_line(check: Callable[[], None]) -> None:
 
 
 def check_database(data: bytes) -> None:
-    """Read any bytes as a database: messages, or an error of one line."""
+    """Read any bytes as a database: the result is messages, or an error of one line."""
     path = Path(FOLDER.name, 'bag.db3')
     path.write_bytes(data)
     _one_line(lambda: _read(path, len(data)))
 
 
 def check_compressed(data: bytes) -> None:
-    """Read any bytes as a compressed file of a bag: messages, or an error of one line."""
+    """Read any bytes as a compressed bag: the result is messages, or an error of one line."""
     folder = Path(FOLDER.name, 'bag')
     folder.mkdir(exist_ok=True)
     (folder / 'metadata.yaml').write_text(METADATA, encoding='ascii')

@@ -62,7 +62,7 @@ def small_calibration() -> Calibration:
 UNIT = small_calibration()
 #: Largest number of messages in an input: more would only slow the fuzzer down.
 MOST_MESSAGES = 6
-#: One compensator for all inputs, as making it takes longer than most inputs.
+#: One compensator serves all inputs: making a compensator takes longer than checking an input.
 COMPENSATOR = Compensator(UNIT)
 
 
@@ -79,7 +79,7 @@ def check_calibration(data: bytes) -> None:
         return
     assert parse_calibration(dump_calibration(value).encode()) == value
     row = Compensator(value).process(START_NS, 1.0, 2.0, 3.0)
-    # Without a reading only a calibration that needs no temperature corrects a sample.
+    # Before the first temperature, only a calibration of constants corrects a sample.
     assert row is None or not value.needs_temperature
 
 
@@ -110,7 +110,7 @@ def check_mcap(data: bytes) -> None:
             BAG.write_bytes(data)
             with open_recording(BAG, require=()) as reader:
                 n = sum(block.n_messages for block in reader.blocks())
-                # A message has at least 22 bytes, and zstd expands a byte to at most 30 kB.
+                # A message record has at least 31 bytes, and zstd expands a byte to at most 30 kB.
                 assert n <= 1000 * len(data), n
         except RecordingError as error:
             assert '\n' not in str(error), error

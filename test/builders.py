@@ -56,7 +56,7 @@ def calibration(**keys):
 
 
 def thermal_calibration():
-    """Make a calibration that needs a thermometer: its temperature function is negligible."""
+    """Make a calibration that needs a thermometer, although its bias slope is negligible."""
     return calibration(dynamic=regime_set(z=axis_set((0.0, 1e-12))))
 
 
@@ -194,8 +194,8 @@ def batch(compensator, events):
 
 def assert_equal_bits(unit, config, events, chunk):
     """
-    Check that one block of all events, and blocks of `chunk` events, give the same bits as single
-    samples; return the rows of the single samples, the whole block and the three compensators.
+    Check that a block of all events, blocks of `chunk` events and single events give equal bits.
+    Return the output rows of single events, the block of all events, and the three compensators.
     """
     streamed, whole, cut = (Compensator(unit, config) for _ in range(3))
     rows, index = stream(streamed, events)
@@ -218,7 +218,7 @@ def assert_equal_bits(unit, config, events, chunk):
 
 
 def warm(compensator, celsius=20.0, case=None, *, until_s=1, start_s=0, flicker=0.0):
-    """Push constant readings; with a `flicker` [K] the thermometer does not count as stuck."""
+    """Push a reading per second; readings that alternate by `flicker` [K] are not stuck."""
     for second in range(start_s, until_s):
         noise = flicker * (-1) ** second
         compensator.push('board', second * SECOND_NS, celsius + noise)

@@ -29,7 +29,7 @@ ROOT = Path(__file__).resolve().parent.parent
 # variable OPENBLAS_NUM_THREADS when numpy is imported.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
-# Each worker of each test run uses a separate DDS domain, limited to this machine. The domain
+# Each worker of each test run uses a separate DDS domain, limited to this machine. The DDS domain
 # follows from the id of the run and the number of the worker. Domain 0 is for users, domains from
 # 81 are for the benchmarks.
 _RUN = os.environ.get('PYTEST_XDIST_TESTRUNUID', str(os.getpid()))
@@ -46,7 +46,7 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 # Examples of hypothesis have no time limit, because their duration depends on the machine.
 settings.register_profile('usual', max_examples=50, deadline=None)
 settings.load_profile('usual')
-# For `make nightly`; a test with a fixed number of examples keeps this number.
+# Examples in `make nightly`; a test with a fixed number of examples keeps this number.
 settings.register_profile('nightly', max_examples=10_000, deadline=None)
 
 
@@ -216,7 +216,7 @@ def small_disk(tmp_path, request):
 @pytest.fixture
 def peer():
     """Return a ROS node with publishers, subscribers and clients for the node under test."""
-    pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+    pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
     from ros_helpers import Peer
 
     peer = Peer()
@@ -326,7 +326,7 @@ def equal_tracks_once():
         place = key.digest()
         if place not in known:
             known[place] = track(bag, model, spec)
-            # All fits share these arrays, so no fit may change them.
+            # Tests share the arrays of thermal states, so no fit may change them.
             known[place].states.flags.writeable = known[place].is_known.flags.writeable = False
             if len(known) > 60:
                 del known[next(iter(known))]

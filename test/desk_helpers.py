@@ -88,7 +88,7 @@ class Desk:
 
             write_unit(path, 42, 2)
         elif name == 'fleet':
-            pytest.importorskip('distributed', reason='distributed is not installed: `fleet`')
+            pytest.importorskip('distributed', reason='distributed is not installed (`fleet`)')
             from fleet_helpers import write_unit
 
             write_unit(path / 'unit42', 42, 1)
@@ -126,7 +126,7 @@ class Desk:
                 'board: {column: temp, unit: degC}\n'
             )
         elif name == 'flight.ulg':
-            pytest.importorskip('pyulog', reason='pyulog is not installed: the extra `px4`')
+            pytest.importorskip('pyulog', reason='pyulog of the extra `px4` is not installed')
             from test_convert_ulog import write_two_imus
 
             write_two_imus(path, np.random.default_rng(4))
@@ -159,7 +159,7 @@ class Desk:
             paths = here.glob(word) if '*' in word else []
             arguments += sorted(str(path.relative_to(here)) for path in paths) or [word]
         if arguments[0] == 'play':
-            pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+            pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
             # In these tests there is no subscriber, so wait only 0.5 s for subscribers.
             arguments[1:1] = ['--wait', '0.5']
         if arguments[:2] == ['record', '--positions']:

@@ -32,8 +32,8 @@ from thermo_comp.ros.waitloop import WaitLoop
 
 #: Time limit for any event [s]: after this time the test fails.
 TIMEOUT_S = 60.0
-#: Longest time span [s] and largest number of messages of a lot. The shared memory of Fast DDS has
-#: room for 512 messages; further messages arrive seconds later, out of order.
+#: Longest span [s] and largest number of messages sent without a pause: the shared memory of Fast
+#: DDS has room for 512 messages; further messages arrive seconds later, out of order.
 LOT_S, LOT_SIZE = 10.0, 400
 QOS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
 FRAME = b'sensor\0'
@@ -175,12 +175,12 @@ class Bench:
         return n
 
     def meet(self):
-        """Send samples, with stamps later than any bag, until the node publishes; reset counts."""
+        """Send samples, stamped after all bags, until the node publishes; read its counters."""
         pause = threading.Event()
         standing = _STANDING.copy()
         for k in range(1000):
             stamp_ns = START_NS + (100_000 + k) * 1_000_000_000
-            # The node accepts samples of a unit at rest at constant temperature.
+            # Samples at rest and at constant temperature pass all checks of the node.
             standing[2] += 1.0
             self.send([('board', stamp_ns, _REST[0]), ('counts', stamp_ns, tuple(standing))])
             pause.wait(0.02)

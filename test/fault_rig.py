@@ -94,7 +94,7 @@ def force_at(seconds):
 
 @dataclass(frozen=True)
 class Truth:
-    """Temperatures of case and board [degC] and `memory` [K] on a fine grid of times [s]."""
+    """Temperatures of case and board [degC], `memory`: board - lagged board [K], times [s]."""
 
     time: np.ndarray
     case: np.ndarray
@@ -108,7 +108,7 @@ class Truth:
 
 
 def truth(ramp_s=RAMP_S, duration_s=DURATION_S):
-    """Compute temperatures: case lags air, board lags case; memory: board - lagged board [K]."""
+    """Return temperatures of case (lags air) and board (lags case), and board - lagged board."""
     step = 0.01
     time = np.arange(0.0, duration_s + 1.0, step)
     air = 15.0 + RAMP_K_S * (np.clip(time, *ramp_s) - ramp_s[0])

@@ -47,7 +47,7 @@ class Row:
     silent: tuple[tuple[float, float], ...] = ()
     #: Span [s] in which the fault is not yet detected and the output may be wrong.
     blind: tuple[float, float] = (0.0, 0.0)
-    #: Time from which the output is within 1 ug of the fault-free output [s]; inf: never.
+    #: Time [s] from which the output is within 1 ug of the output without the fault; inf: never.
     recovered: float = 0.0
     #: Time from which stamps are ahead of the true times, and the difference [s].
     shift: tuple[float, float] = (math.inf, 0.0)

@@ -40,10 +40,10 @@ class Truth:
     misalignment: Floats = field(default_factory=lambda: np.array([1e-3, -2e-3, 5e-4]))
     start_sd: float = 0.0
     sigma: Floats = field(default_factory=lambda: np.full(3, 2.0 * MICRO))
-    #: Slow noise of the bias (white noise: `sigma`).
+    #: Correlated noise of the bias, in addition to white noise with an sd of `sigma`.
     noise: Noise = field(default_factory=Noise)
     offset_sd: float = 0.0
-    #: Sd of support tilts [rad] by a column of temperature with an RMS of 1.
+    #: Sd of the support tilt [rad] caused by a temperature column with an RMS of 1.
     tilt_sd: float = 0.0
 
     @property
@@ -159,7 +159,7 @@ def prior_of(truth, names=('curve', 'board'), **changes):
 
 
 def candidates_of(windows, forced=()):
-    """Make all columns candidates, with prior slopes of 5 ug/K (bias) and 5 ppm/K (scale)."""
+    """Let a fit keep any column; typical prior sd of slopes: 5 ug/K (bias), 5 ppm/K (scale)."""
     none = np.zeros((2, len(windows.groups)), dtype=bool)
     typical, largest = (
         np.outer(slope, windows.kelvins) * windows.parts

@@ -12,7 +12,7 @@ from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 #: Program of about half an hour with ramps of 5 K/min; the board temperature covers 36 K.
 PROGRAM = parse_cyclogram('20 2min, 45@5 8min, 5@5 10min')
-#: Tests that do not depend on the model use the paper's model, whose fit is the fastest.
+#: Tests that do not depend on the model use Golovach's model, whose fit is the fastest.
 OPTIONS = FleetOptions(FitOptions(gravity=STANDARD_GRAVITY, model='golovach'), certificates=False)
 
 

@@ -11,8 +11,8 @@ from pathlib import Path
 
 _STOPPING_S = 10.0  # time for the node to end [s]
 
-#: Environment for processes that a test kills: they use Fast DDS without shared memory, because
-#: segments that a killed process leaves may be the cause of rare crashes of other nodes.
+#: Environment of processes that a test kills: Fast DDS without shared memory, as segments left by
+#: a killed process may crash other nodes.
 OVER_UDP = {'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4'}
 
 

@@ -30,7 +30,7 @@ class Imu:
 
 @dataclass
 class Rest:
-    """A sensor at rest: noise about `level` [m/s^2]; the board cools by `fall` K, from `warm`."""
+    """A sensor at rest at `level` [m/s^2]; the board cools from `warm` [degC] by `fall` [K]."""
 
     rng: np.random.Generator
     duration_s: float = 600.0

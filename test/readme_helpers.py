@@ -42,7 +42,7 @@ def shown_of_demo():
 
 
 def is_alike(got, expected):
-    """Whether outputs have equal words, and numbers that differ by at most a third, or 5."""
+    """Whether outputs have equal words, and numbers that differ by at most 5, or by a third."""
     if _NUMBER.sub('#', got).split() != _NUMBER.sub('#', expected).split():
         return False
     numbers = zip(_NUMBER.findall(got), _NUMBER.findall(expected), strict=True)

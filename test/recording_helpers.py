@@ -22,7 +22,7 @@ STRING, BOOL = 'std_msgs/msg/String', 'std_msgs/msg/Bool'
 ACCEL, IMU_IN, BOARD, CASE, OTHER = (
     '/accel/counts', '/imu/uncompensated', '/temperature/board', '/temperature/case', '/chatter',
 )  # fmt: skip
-#: Types of the topics above, and of a driver with other names.
+#: Message type of each topic, also of topics with the names of a driver.
 TYPES = {
     ACCEL: VECTOR, IMU_IN: IMU, BOARD: TEMPERATURE, CASE: TEMPERATURE, OTHER: STRING,
     '/mpu/data': IMU, '/mpu/die': TEMPERATURE, '/baro/air': TEMPERATURE,

@@ -56,7 +56,7 @@ def swapped(source, rest):
         ('units', as_it_is, COUNTS, 1),
         ('jump', jumped, FORCE, 1),
         ('jump', jumped, FORCE, 7),
-        # For this name the test replaces the readings by those of the function `swapped`.
+        # The case 'swapped' replaces the readings by the function `swapped`.
         ('swapped', as_it_is, FORCE, 7),
         ('compensated', compensated, FORCE, 12),
     ],
@@ -160,7 +160,7 @@ def test_one_bag_in_kelvins_among_others_is_refused_by_name(rng):
 
 
 def test_the_advice_for_rests_without_noise_names_the_parameter_of_the_node(rng):
-    # WHY: the node rejects equal samples as a stuck converter's, and dropped 60 % of the samples.
+    # WHY: the node takes equal samples for those of a stuck converter: 60 % of all were dropped.
     rests = [Rest(rng, level=tuple(GRAVITY * up), sd=0.3 * MG) for up in positions(7, 3)]
     for rest in rests[:2]:
         # The samples have no noise; a drift of 40 mg changes them by steps of 4 mg.

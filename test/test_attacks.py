@@ -129,7 +129,7 @@ def test_twenty_clients_that_set_parameters_at_once_are_all_answered(peer, tmp_p
 
 def test_a_link_that_replaces_a_folder_gives_no_calibration_from_another_folder(tmp_path):
     # A folder may be replaced by a link after the node has checked a path in it.
-    pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+    pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
     from thermo_comp.ros.reader import read
 
     folder, outside = tmp_path / 'units', tmp_path / 'outside'
@@ -263,7 +263,7 @@ def allowed():
 
 
 def test_the_policy_permits_exactly_the_topics_and_services_of_the_node(tmp_path):
-    pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+    pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
     from ros_helpers import node_in_thread
 
     opened = {'publish': set(), 'subscribe': set(), 'reply': set()}

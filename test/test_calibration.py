@@ -206,7 +206,7 @@ def test_the_message_on_a_wrong_entry_names_key_value_and_rule(old, new, key, me
 def test_files_without_a_calibration_are_refused(content, message):
     with pytest.raises(CalibrationError, match=message) as caught:
         parse_calibration(content)
-    # `rule` is the message for peers on the network, which must not quote the file.
+    # `rule`: message that a node sends to peers on the network; it must not quote the file.
     rule, whole = caught.value.rule or str(caught.value), str(caught.value)
     quotes = whole.startswith('not valid YAML: ')
     assert re.fullmatch(r'not valid YAML( \(line \d+\))?', rule) if quotes else rule == whole

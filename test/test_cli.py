@@ -111,7 +111,7 @@ def on_a_terminal(*arguments, no_color=False):
 class TestPlay:
     @pytest.fixture(autouse=True)
     def needs_ros(self):
-        pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+        pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 
     def test_play_sends_every_message_under_the_requested_names(self, bag, cli):
         arguments = ('play', bag, '--rate', '0', '--wait', '0', '--json')

@@ -16,7 +16,7 @@ pytestmark = pytest.mark.usefixtures('equal_fits_once')
 
 @pytest.fixture(autouse=True)
 def needs_ros():
-    pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+    pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 
 
 @pytest.mark.slow
@@ -51,8 +51,8 @@ def test_the_demonstration_prints_the_output_shown_on_the_pages(tmp_path, monkey
         rows = re.findall(rf'^{section} +([a-z ]+?) +\d+ +([\d.]+) ', printed, re.MULTILINE)
         assert len(rows) == 4, printed
         raw, node, two_sets, one_set = (float(rms) for _, rms in rows)
-        # One set cannot describe the difference of the regimes, two sets cannot describe lags: the
-        # node must be better than both. Noise is below 10 ug.
+        # The node's error must be below those of two fits without lags: a common curve of both
+        # regimes, and a curve per regime. Noise is below 10 ug.
         assert raw > 150.0
         assert node < 10.0
         assert node < 0.5 * min(one_set, two_sets)

@@ -29,7 +29,7 @@ EXAMPLES = [
     for name, command in COMMANDS.items()
     for line in re.findall(r'^ +(thermo_comp .*)$', command.help or '', re.MULTILINE)
 ]
-# The example that is run in a separate process; the others run in the process of the tests.
+# The example that runs in a separate process; other examples run in the process of the tests.
 OF_ITS_OWN = 'thermo_comp evaluate held_out.mcap -c unit42.yaml --tolerance 100ug'
 # An example of each command that prints figures, except for those that other files test.
 WITH_JSON = {

@@ -51,7 +51,7 @@ def test_the_bank_of_columns_has_the_expected_number_per_group():
         'gradient_even': 42, 'play': 20,
     }  # fmt: skip
     assert len(set(bank(('case', 'tip')))) == len(bank(('case', 'tip')))
-    # Knees are within the temperature span of the bags, also those for parts lagging the board.
+    # Knees over any lagged temperature are within the temperature span of the bags.
     assert 'bend' not in by_group(bank(span_k=(-0.4, 0.4)))
     bends = [column for column in bank(span_k=(-10.0, 2.0)) if column.group == 'bend']
     assert len(bends) == 12 * len({column.tau_s for column in bends}) == 96
@@ -65,7 +65,7 @@ def test_gradient_even_about_rest_is_an_even_function_of_gradient_less_rest():
     assert {(column.sensor, column.rest_k) for column in change} == {('case', -0.5)}
     table = ColumnTable(change, MemorySpec(('case', 'tip')), 20.0)
     states = np.zeros((StateLayout(MemorySpec(('case', 'tip'))).width, 3))
-    # Gradients of three states: -0.5 K, as in a soak, and 1.5 K above and below -0.5 K.
+    # Gradients of the three states: -0.5 K, that of a soak, and 1.5 K above and below -0.5 K.
     states[GRADIENT] = -0.5, 1.0, -2.0
     values = table.raw(states)
     assert np.all(values[:, 0] == 0.0)
@@ -110,7 +110,7 @@ def test_the_value_of_each_kind_of_column_agrees_with_hand_numbers():
     ]
     spec = memory_of(columns, ('case', 'tip'))
     layout = StateLayout(spec)
-    # State: board, variance, rate, weight, unknown regime; case and tip gradients; 2 lags; a play.
+    # Board, its variance, rate, weight, unknown regime; 2 gradients and 2 lags, variances; play.
     state = np.array(
         [[23.0, 0.0, 0.01, 0.25, 0.0, 1.2, 0.0, -0.7, 0.0, 0.5, 0.0, -0.3, 0.0, 0.1]]
     ).T
@@ -134,7 +134,7 @@ def test_a_bend_has_slopes_over_board_temperature_and_lag():
     state = np.zeros((StateLayout(spec).width, 1))
     lag = StateLayout(spec).places[Lag('board', 60.0)]
     state[BOARD], state[lag] = 24.0, 0.5
-    # Slopes over the quantity of each column (t, lag), then over the board temperature.
+    # Slopes of column 0 over t, of column 1 over its lag, then of both over the board temperature.
     assert np.ravel(table.slopes(state)).tolist() == [1.0, -1.0, 1.0, 1.0]
     state[BOARD] = 21.0
     assert not np.any(table.slopes(state))
@@ -158,7 +158,7 @@ def test_a_new_kind_of_column_needs_one_term_only(monkeypatch):
     rate, variance = state[place : place + 2]
     line = correction.line(state, state, np.zeros(N_ROWS), 0.0)
     assert line[8] == pytest.approx(3e6 * rate**2) == pytest.approx(300.0, rel=0.02)
-    # d(bias)/d(rate) is 2 * 3e6 * rate [counts s/K], at 300 counts per m/s^2.
+    # d(bias)/d(rate) is 2 * 3e6 * rate [counts s/K]; the scale factor is 300 counts per m/s^2.
     by_rate = (2.0 * 3e6 * rate / 300.0) ** 2 * variance
     assert line[VARIANCES[2]] - correction.noise[2] == pytest.approx(by_rate, rel=1e-6)
     with pytest.raises(ValueError, match=r'keep the largest effect of the column within'):

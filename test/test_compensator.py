@@ -37,8 +37,8 @@ NOISE = 1e-4**2 / 0.01 + (1.0 / 6.0) / 300.0**2
 
 
 def test_the_offset_is_half_the_sum_of_signed_counts():
-    # From counts at +g and -g: offset = sum / 2, scale = difference / 2. The paper prints Eq. (3)
-    # and (4) with sum and difference exchanged.
+    # From counts at +g and -g: offset = sum / 2, scale = difference / 2. Golovach's paper has sum
+    # and difference exchanged in its Eq. (3) and (4).
     plus, minus = 300.0 * GRAVITY + 12.0, -300.0 * GRAVITY + 12.0
     axis = AxisReference((plus - minus) / 2.0 / GRAVITY, (plus + minus) / 2.0)
     compensator = Compensator(calibration(axes=Axes(*[axis] * 3)))
@@ -48,7 +48,7 @@ def test_the_offset_is_half_the_sum_of_signed_counts():
 
 
 def test_a_corrected_sample_agrees_with_the_formula_of_the_static_set():
-    # The expected values are the formula of the static set at t = 10 K without a gradient or rate.
+    # Expected: the formula of the static set at t = 10 K, for a gradient and a rate of 0.
     axis = axis_set((0.0, 0.5, 0.01), (1.0, 1e-4), delta=2.0)
     unit = calibration(
         axes=equal_axes(300.0, 7.0),
@@ -98,7 +98,7 @@ def event_list(seed):
     return events
 
 
-#: Hypothesis draws the seed of a list, because drawing each message would double the time.
+#: Hypothesis draws one seed per list, as drawing each message would double the tests' time.
 event_lists = st.integers(0, 2**64 - 1).map(event_list)
 
 
@@ -111,8 +111,8 @@ def at_seconds(*events):
     ]
 
 
-# In the explicit examples a reading that was applied before, or a reading one day later, shows
-# that stored readings have stamps of another clock.
+# In the examples stamps fall below the stamp of a reading that is a day ahead, or already applied.
+# Only if stamps fall by over 5 s, earlier readings count as readings of another clock.
 @given(event_lists, st.integers(3, 30), st.sampled_from([0.0, 5.0]))
 @example(at_seconds('A', 3, 'A', 0, 'B', 2, 'B', 86_400, 'C', 0, 'A', 0), 5, 0.0)
 @example(at_seconds('B', 26, 'B', 21, 'A', 23, 'B', 16.5), 1, 0.0)
@@ -147,7 +147,7 @@ def test_the_covariance_in_an_unknown_regime_contains_the_difference_of_the_sets
     early = compensator.process(SECOND_NS // 2, 0.0, 0.0, 1.0)
     warm(compensator, until_s=1500, start_s=1)
     late = compensator.process(1500 * SECOND_NS, 0.0, 0.0, 1.0)
-    # The static and the dynamic set differ by 3 counts (0.01 m/s^2) on x, and are equal on y.
+    # The dynamic bias exceeds the static bias by 3 counts (0.01 m/s^2) on x, and equals it on y.
     assert early[3] == pytest.approx(NOISE + 0.01**2, rel=1e-6)
     assert early[6] == pytest.approx(NOISE, rel=1e-6)
     assert late[3] == pytest.approx(NOISE, rel=1e-6)
@@ -180,7 +180,7 @@ def test_a_sample_with_a_stamp_20_s_ahead_is_dropped_unless_the_next_stamp_agree
         (np.insert(usual, 2, usual[2] + leap), [0, 1, 3, 4, 5]),
         # After a gap of 20 s the first sample is dropped, and the samples after it are used.
         (np.where(np.arange(5) < 2, usual, usual + leap), [0, 1, 3, 4]),
-        # Samples with wrong stamps are dropped: two apart, or two in falling order.
+        # Two stamps 20 s too late are dropped if not adjacent, or if the second is the lower one.
         (np.insert(usual, [1, 3], usual[[1, 3]] + leap), [0, 2, 3, 5, 6]),
         (np.array([1, 2 + leap, 1 + leap, 3, 4]), [0, 3, 4]),
     ):
@@ -265,7 +265,7 @@ def test_another_transition_time_during_a_transition_causes_no_step_of_the_outpu
 
 def test_a_new_transition_time_does_not_restart_the_check_of_gravity(rng):
     # WHY: after a change of any parameter the check of |f| began again, and samples with a wrong
-    # |f| were published for 13 s at rest, and without a limit in motion.
+    # |f| were published for 13 s at rest, and in motion for as long as it lasted.
     compensator = Compensator(calibration(), CompensatorConfig())
 
     def published(seconds, size):
@@ -285,7 +285,7 @@ def test_a_new_transition_time_does_not_restart_the_check_of_gravity(rng):
     other = replace(compensator.config, transition_time_s=50.0)
     compensator.take_over(compensator.thermal.model, other)
     assert published(range(65, 70), 1.3 * count_per_g) == 0
-    # A change of the tolerance restarts the check.
+    # A change of the tolerance of |f| restarts the check of |f|.
     other = replace(other, gravity_tolerance_m_s2=5.0)
     compensator.take_over(compensator.thermal.model, other)
     assert published(range(70, 75), 1.1 * count_per_g) > 0
@@ -356,7 +356,7 @@ def test_a_switch_of_sets_causes_no_step():
 
 @pytest.mark.parametrize(
     ('delta', 'given_s', 'expected_s'),
-    # The blend is limited to 1 ug/s: 102 s for sets that differ by 0.3 counts = 102 ug.
+    # At 1 ug/s a change by the difference of the sets, 0.3 counts = 102 ug, takes 102 s.
     [(0.01, 30.0, 30.0), (0.3, 30.0, 1e-3 / 9.80665e-6), (0.3, 5.0, 50.0), (0.3, 0.0, 0.0)],
 )
 def test_a_transition_time_above_0_limits_the_change_to_1_ug_per_s(delta, given_s, expected_s):

@@ -67,7 +67,7 @@ def test_a_bag_converted_from_a_table_has_the_values_of_the_table(tmp_path):
         np.column_stack([columns[k] for k in ['wx', 'wy', 'wz']]),
         rtol=1e-14,  # rounding of the conversions to rad/s and back to deg/s
     )
-    # sensor_msgs/Imu: -1 for a missing orientation, 0 for an unknown covariance of the rate.
+    # sensor_msgs/Imu: -1: no orientation, 0: unknown covariance of the angular rate.
     assert block.imu.orientation_covariance[:, 0].tolist() == [-1.0] * 400
     assert not block.imu.angular_velocity_covariance.any()
     # A temperature becomes a message if it changes: 4 times for the case, 10 times for the board.

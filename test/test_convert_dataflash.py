@@ -12,7 +12,7 @@ from thermo_comp.convert.log import write_log
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording.reader import read_recording
 
-pytest.importorskip('pymavlink', reason='pymavlink is not installed: the extra `ardupilot`')
+pytest.importorskip('pymavlink', reason='pymavlink of the extra `ardupilot` is not installed')
 
 SIZES = {'Q': 8, 'B': 1, 'f': 4, 'I': 4, 'H': 2, 'h': 2, 'c': 2, 'N': 16}
 NEW_IMU = ('QBffffffIIfBBHH', 'TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ,EG,EA,T,GH,AH,GHz,AHz')
@@ -157,7 +157,7 @@ def test_samples_corrected_by_ardupilot_are_left_out(tmp_path, rng, course, kept
     np.testing.assert_array_equal(read.accel, force[0][kept])
     assert f'INS_TCAL1_ENABLE was 1 for {share} % of the samples' in read.chosen
     assert len(read_autopilot(path, allow_compensated=True).stamp_ns) == N
-    # The fit needs the thermal history, so temperatures stay where samples are left out.
+    # The fit needs the thermal history: temperatures are kept also where samples are left out.
     assert len(read.temperatures['board'].celsius) > 1
 
 

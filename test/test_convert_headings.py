@@ -192,7 +192,7 @@ def slow_table(path, heading, times, first=20.0, last=45.0):
           for since in (0, 1_774_747_800) for step in (1, 5)),
         # WHY: a table in which every seventh row occurs twice was refused: times did not rise.
         ('s', [k / 10 for k in range(900) for _ in range(2 if k % 7 == 0 else 1)], 45.0),
-        # Without motion and temperature change the size of the stamps shows their unit.
+        # At rest at constant temperature the size and the step of the stamps show their unit.
         *((unit, [START_NS // size + step * k for k in range(900)], 20.0)
           for unit, size, step in (('s', 10**9, 2), ('ms', 10**6, 5000), ('us', 10**9, 10_000))),
     ],
@@ -340,7 +340,7 @@ def test_words_of_24_and_32_bits_are_not_saturated(rng, one_g, bits):
 
 
 def write(path, rng, unit, **columns):
-    """Write a table of rests; samples have `unit` per g; times and angular rates are optional."""
+    """Write a table of rests; `unit`: reading at 1 g; times and angular rates are optional."""
     accel = unit * (UP + 0.002 * rng.standard_normal(UP.shape))
     parts = [columns['time'][:, None]] if 'time' in columns else []
     parts += [accel, columns['rate']] if 'rate' in columns else [accel]

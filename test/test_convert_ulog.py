@@ -12,7 +12,7 @@ from thermo_comp.convert.log import write_log
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording.reader import read_recording
 
-pytest.importorskip('pyulog', reason='pyulog is not installed: the extra `px4`')
+pytest.importorskip('pyulog', reason='pyulog of the extra `px4` is not installed')
 
 ACCEL = 'sensor_accel:uint64_t timestamp;uint64_t timestamp_sample;uint32_t device_id;'
 ACCEL += 'float x;float y;float z;float temperature;uint32_t error_count;uint8_t[3] clip_counter;'
@@ -90,7 +90,7 @@ def test_each_imu_of_a_log_can_become_a_bag(flight, tmp_path, imu):
     expected_ns = (5_000_000 + np.arange(N) * STEP_US + imu) * 1000
     np.testing.assert_array_equal(bag.accel_stamp_ns, expected_ns)
     np.testing.assert_array_equal(bag.accel, truth['force'][imu])
-    # The board temperature is the accelerometer's at each sample, the case's the barometer's.
+    # Each accelerometer sample has a board temperature; the barometer's is that of the case.
     np.testing.assert_array_equal(bag.temperatures['board'].celsius, truth['celsius'][imu])
     np.testing.assert_array_equal(bag.temperatures['case'].celsius, 20 + 0.5 * np.arange(12))
     assert recording.info.metadata['serial'] == f'px4-accel-{77 + imu}'
@@ -122,7 +122,7 @@ def test_a_log_without_sample_times_is_read(tmp_path, rng):
     read = read_autopilot(path)
     np.testing.assert_array_equal(read.accel, force)
     assert 'case' not in read.temperatures
-    # A constant temperature is written every 10 s, so in this log of 6 s once.
+    # A constant temperature is written every 10 s, so once in this log of 6 s.
     np.testing.assert_array_equal(read.temperatures['board'].celsius, [31.5])
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The correction with all kinds of columns: equal bits in blocks, and the claimed sd."""
+"""With all kinds of columns, blocks and samples give equal bits, and the claimed sd is right."""
 
 import math
 from dataclasses import replace
@@ -171,7 +171,7 @@ def test_corrections_drawn_from_the_posterior_scatter_by_the_claimed_sd(rng):
             # The covariance of n draws is uncertain by at most 8 % of the product of both sd.
             sds = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
             assert (np.abs(claimed - expected) < 0.33 * sds).all()
-            # Claimed and drawn variances agree in all directions, so correlations agree, too.
+            # Claimed variances equal those of the draws in all directions, so correlations agree.
             root = np.linalg.inv(np.linalg.cholesky(expected))
             assert np.abs(root @ claimed @ root.T - np.eye(3)).max() < 0.5
 
@@ -225,7 +225,7 @@ def test_the_variance_of_initial_lag_states_is_updated_every_ten_seconds():
         last.setdefault(stamp // 10_000_000_000, []).append((stamp, variance))
     assert len(last) >= 9
     for span in last.values():
-        # Within 10 s only the variance of the thermometer (30 counts/K, 5 mK) changes.
+        # Within 10 s only the variance that the thermometer causes (5 mK at 30 counts/K) changes.
         part = (30.0 / 300.0 * 0.005) ** 2
         stamp, variance = span[0]
         age = (stamp - collected[0][0]) * 1e-9 + 1.0

@@ -60,7 +60,7 @@ def test_without_positions_the_covariance_is_that_of_the_prior():
 
 def test_two_opposite_faces_determine_bias_and_scale_of_their_axis():
     sd = np.sqrt(np.diag(constants_covariance(FACES[:2], np.full(2, SD))))
-    # Bias and scale errors are half the difference and half the sum of the two errors of |f|.
+    # Bias and scale errors: half the difference and half the sum of errors of |f| on +x and -x.
     assert sd[[0, 3]] == pytest.approx(SD / np.sqrt(2.0), rel=1e-6)
     np.testing.assert_allclose(sd[[1, 2, 4, 5, 6, 7, 8]], PRIOR_SD[[1, 2, 4, 5, 6, 7, 8]])
 
@@ -88,7 +88,7 @@ def test_the_next_direction_reduces_the_mean_variance(n, rng):
     before = mean_variance(up, at)
     gain = before - mean_variance(np.vstack([up, proposed]), at)
     others = [before - mean_variance(np.vstack([up, unit]), at) for unit in units(rng, 300)]
-    # A face, which is easy to hold, is preferred if its gain is at least half of the largest gain.
+    # A face is proposed if it reduces the variance at least half as much as the best direction.
     assert gain > 0.45 * max(others)
     assert np.max(up @ proposed, initial=-1.0) < np.cos(np.radians(20.0))
 

@@ -96,7 +96,7 @@ def test_rows_of_tables_have_as_many_cells_as_the_header():
 @pytest.mark.slow
 def test_the_site_builds_without_a_warning(tmp_path):
     for module in ('material', 'mkdocstrings', 'mkdocs_jupyter'):
-        pytest.importorskip(module, reason=f'{module} is not installed: the extra `docs`')
+        pytest.importorskip(module, reason=f'{module} of the extra `docs` is not installed')
     words = ('-m', 'mkdocs', 'build', '--strict', '--site-dir', tmp_path / 'site')
     finished = ran(sys.executable, *words)
     assert finished.returncode == 0, finished.stderr

@@ -28,9 +28,9 @@ def walked(rate, bound, axes=1, mean=0.0):
 
 def test_the_probability_of_a_first_passage_agrees_with_closed_forms():
     # A random walk of rate r stays within (-c, c) up to t with the probability: sum over k of
-    # (-1)^k [N((2 k + 1) c / s) - N((2 k - 1) c / s)], s^2 = r t. In three dimensions a walk of
-    # rate r on each axis stays in a ball of radius c up to t with the probability: 2 sum over
-    # k > 0 of (-1)^(k + 1) exp(-(k pi)^2 r t / 2 c^2).
+    # (-1)^k [N((2 k + 1) c / s) - N((2 k - 1) c / s)], s^2 = r t, N: normal distribution. In three
+    # dimensions a walk of rate r on each axis stays in a ball of radius c up to t with the
+    # probability: 2 sum over k > 0 of (-1)^(k + 1) exp(-(k pi)^2 r t / 2 c^2).
     rate, bound = 4.0, 50.0
     k, n = np.arange(-40, 41), np.arange(1, 200)
     for probability, days, of_ball in zip(
@@ -42,7 +42,7 @@ def test_the_probability_of_a_first_passage_agrees_with_closed_forms():
         assert float((-1.0) ** k @ inside) == pytest.approx(1.0 - probability, abs=0.025)
         stays = 2.0 * (-1.0) ** (n + 1) @ np.exp(-((n * np.pi) ** 2) * rate * of_ball / 5000.0)
         assert stays == pytest.approx(1.0 - probability, abs=0.025)
-    # A random walk passes a nearer bound earlier, and a unit that does not age never passes it.
+    # A random walk passes a nearer bound earlier; a unit that does not age never passes a bound.
     assert walked(rate, bound, mean=30.0)[1] < walked(rate, bound)[1]
     assert walked(1e-12, bound) == (np.inf,) * 3
     assert walked(rate, bound, mean=51.0) == (0.0,) * 3
@@ -57,8 +57,8 @@ def test_forecasts_agree_with_the_simulated_future_of_units():
         for rows in field_watch.forecasts(kind, 3, 20).values():
             shares += rows[:, 0].tolist()
             ratios.append(float(np.median(rows[:, 3] / rows[:, 1])))
-    # The printed interval must contain 80 % of the simulated days; the mean of this share over 24
-    # rows has an error of 6 %.
+    # The printed interval must contain 80 % of the simulated days on which a unit leaves the
+    # tolerance; the mean of 24 such shares has an error of 6 %.
     assert np.mean(shares) == pytest.approx(0.8, abs=0.12)
     # A unit's median time until it leaves the tolerance is uncertain by a factor of 1.5, the mean
     # of eight such times by 1.3.
@@ -89,12 +89,12 @@ def test_the_verdict_follows_the_true_error_on_each_day(attitudes):
             (0, None) if since is None else (1, str(np.datetime64(first + since, 'D')))
         )
         assert ('outside its claim since' in str(result)) == (since is not None)
-        # With gravity along (1, 1, 1) the error is 0.6 * sqrt(3) = 1.04 times the limit, so the
-        # day since which the unit is within its claim may be a day late.
+        # With gravity along (1, 1, 1), bias errors of 0.6 times the limit change |f| by 1.04 times
+        # the limit: the day on which the unit returns to its claim may be printed a day late.
         back = [str(np.datetime64(first + day, 'D')) for day in (34, 35)]
         assert (result.inside_since in back) == (n_days > 34)
         assert ('again within its claim since' in str(result)) == (result.inside_since is not None)
-        # For a unit within its claim the printed day is later than the last day of the log.
+        # A unit within its claim must be forecast to leave it after the last day of the log.
         assert since is not None or f'about {result.last}' not in str(result)
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""With each file of config/drivers the commands read a bag with that driver's topics and types."""
+"""Commands that get a driver's file of config/drivers read bags with this driver's topics."""
 
 import csv
 import re
@@ -195,7 +195,7 @@ def warming_unit():
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: path.stem)
 def test_the_node_uses_the_topics_of_the_driver_s_file(path, tmp_path):
-    pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+    pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
     from ros_helpers import Peer, node_arguments, node_in_thread, stamped
     from sensor_msgs.msg import Imu, Temperature
     from std_msgs.msg import Float64

@@ -137,7 +137,7 @@ def test_the_bias_of_a_gyroscope_is_exported_and_imported(cubic):
     px4 = export_calibration(unit, 'px4')
     value = numbers(px4.text, '\t')
     assert value['TC_G_ENABLE'] == 1.0
-    # PX4 subtracts X0 + X1 d + X2 d^2 + X3 d^3 from the rate [rad/s]; d: temperature - TREF [K].
+    # PX4 subtracts X0 + X1 d + X2 d^2 + X3 d^3 from angular rates [rad/s]; d: temperature - TREF.
     d = celsius[2] - value['TC_G0_TREF']
     for axis in range(3):
         bias = sum(value[f'TC_G0_X{power}_{axis}'] * d**power for power in range(4))
@@ -233,8 +233,8 @@ def test_losses_of_an_export_are_noted(cubic):
         'cubics replace',
         '1000 urad',
         r'response is lost (gradient): ',
-        'dynamic set is lost',
-        'nonlinear terms over specific force are lost',
+        'dynamic coefficients are lost',
+        'the terms nonlinear in specific force are lost',
     ):
         assert any(expected in note for note in text.notes), expected
         assert expected in text.text
@@ -392,7 +392,7 @@ def test_kalibr_files_without_bias_and_with_several_imus_are_read():
 
 
 def test_px4_rate_polynomials_of_different_degree_are_imported(cubic):
-    # WHY: an axis without a third power had too few coefficients, and the import failed.
+    # WHY: the import failed for an axis whose rate polynomial has no third power.
     rows = [(1e-3, 0.0, 0.0, 0.0), (2e-3, 1e-4, 0.0, 0.0), (0.0, 1e-4, -2e-6, 3e-8)]
     lines = [f'TC_G0_X{p}_{axis}={row[p]!r}' for axis, row in enumerate(rows) for p in range(4)]
     lines += ['TC_G_ENABLE=1', 'TC_G0_TREF=31', 'TC_G0_TMIN=0', 'TC_G0_TMAX=50']

@@ -3,8 +3,8 @@
 """
 The published covariance covers faults at any time of a ramp (tested without DDS).
 
-WHY: the covariance was large enough for a fault in the middle of a ramp, but not for an equal
-fault at the start of a ramp, nor if a sensor had another temperature after the fault than before.
+WHY: the covariance covered faults in the middle of a ramp, but not faults at its start, and no
+faults during which the temperature of the sensor changed.
 Every published sample must have an error below five claimed standard deviations.
 """
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 
 import soak
 from fault_bench import bench
@@ -87,7 +87,7 @@ def truncated(path):
 
 
 def cut_between_keys(path):
-    # WHY: all keys from `misalignment_sd` on have defaults, so a file cut there was accepted.
+    # WHY: a file cut before `misalignment_sd` was accepted, as all later keys have defaults.
     content = path.read_bytes()
     path.write_bytes(content[: content.index(b'\nmisalignment_sd:') + 1])
 
@@ -161,7 +161,7 @@ def test_many_reloads_at_1_khz_lose_no_sample(tmp_path):
     path = tmp_path / 'fast.yaml'
     fast = unit(unit=Unit('F-1', 'counts', 8388607.0, 1e-3))
     save_calibration(fast, path)
-    # The loop ends with the last answer, before all 60 s of samples have been sent.
+    # Sending ends at the answer to the last reload, before all 60 s of samples have been sent.
     events = bag(rate_hz=1000.0, duration_s=60.0)
     n_reloads = 100
     with bench(path) as node:
@@ -218,7 +218,7 @@ def test_the_slope_of_the_soak_benchmark_has_the_claimed_standard_error(rng):
     # `slope` leaves out the first 10 % of the run, here 360 s.
     values[:300] += 50.0
     slope, sd = soak.slope(list(zip(time.tolist(), values.tolist(), strict=True)), 60.0)
-    # Sd of the slope: sd of a mean over 60 s / root of the sum of squares of the 54 centred times.
+    # Sd of the slope: sd of a mean over 60 s / sqrt(sum of (t - mean t)^2 of the 54 means).
     assert sd == pytest.approx(1.0 / 60**0.5 / (54 * 0.9**2 / 12) ** 0.5, rel=0.3)
     assert abs(slope - 7.0) < 4.0 * sd
     assert soak.slope([(0.0, 1.0), (1.0, 1.0)], 60.0) is None

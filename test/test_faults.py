@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 For each row of the fault table the output of compensator and diagnostics is compared with the
-truth. Rows about the order of arrival are also sent over DDS to a node process, whose output must
-equal that without DDS.
+truth. Rows that depend on the order of arrival of messages are also sent over DDS to a node
+process, whose output must equal the output without DDS.
 """
 
 from copy import deepcopy
@@ -13,7 +13,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 
 from fault_bench import Heard, bench, lots
 from fault_rig import CONFIG, bag, corrected, force_at, unit
@@ -68,7 +68,7 @@ class Direct:
 
 @cache
 def undisturbed():
-    """Return groups of messages of the undisturbed bag, each with the state before the group."""
+    """Return the undisturbed bag's message groups, each with the `Direct` in its state before."""
     run, result = Direct(), []
     for lot in (*lots(bag()), []):
         result.append((lot, deepcopy(run)))
@@ -78,7 +78,7 @@ def undisturbed():
 
 
 def direct(events):
-    """Run events; up to the first group with a fault, use the results of the undisturbed run."""
+    """Return the output for events; reuse the undisturbed run up to the first difference."""
     given, known = list(lots(events)), undisturbed()
     n = next((k for k, lot in enumerate(given) if lot != known[k][0]), len(given))
     run = deepcopy(known[n][1])

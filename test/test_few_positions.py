@@ -13,6 +13,8 @@ from position_helpers import GRAVITY, MG, START_NS, Rest
 
 import thermo_comp as tc
 from thermo_comp.fitting import FitOptions, fit
+from thermo_comp.fitting.fit import reduce_bag
+from thermo_comp.fitting.raw_checks import full_scale_of, judge_bags
 from thermo_comp.simulation.campaign import positions
 from thermo_comp.unit.calibration import parameter_layout
 
@@ -47,8 +49,8 @@ def left_by(pair, **options):
 @pytest.mark.slow
 def test_two_positions_determine_the_thermal_response():
     # Noise of 9 ug/sqrt(Hz) is 1.2 ug in means over 60 s; 128 means determine the sd to 6 %, and
-    # superfluous columns may increase the sd by 10 %. Over all 36 pairs of bags the median sd is
-    # 1.3 ug (docs/accuracy.md).
+    # superfluous columns may increase the sd by 10 %. Over all 36 pairs of the nine sample bags
+    # the sd of 60 s means in a third position has a median of 1.3 ug.
     assert left_by((1, 2)) == pytest.approx([1.2] * 3, rel=0.3)
 
 
@@ -68,6 +70,18 @@ def one_position():
     rest = Rest(np.random.default_rng(20161), level=tuple(GRAVITY * UP))
     rest.accel += (rest.temperature(rest.time)[:, None] - 20.0) * MG * SLOPE
     return fit([rest.source()], OPTIONS)
+
+
+def test_a_full_scale_that_the_bags_do_not_show_is_named(one_position):
+    # WHY: the node dropped all samples above 2 g of a sensor of 16 g, and no command had said so.
+    (text,) = [f.message for f in one_position.findings if f.name == 'full-scale']
+    assert text.startswith('samples of 19.613 m/s^2 (2 times gravity) or more')
+    reduced = [reduce_bag(Rest(np.random.default_rng(1)).source(), OPTIONS)]
+    stated = replace(OPTIONS, full_scale=156.9)
+    assert not any(f.name == 'full-scale' for f in judge_bags(reduced, stated))
+    wide = one_position.calibration
+    wide = replace(wide, unit=replace(wide.unit, full_scale=156.9))
+    assert full_scale_of(reduced, replace(OPTIONS, prior=wide)) == 156.9
 
 
 def turned(rng, ups, rest_s=20.0):
@@ -122,9 +136,9 @@ def test_one_position_gives_bias_over_temperature_on_three_axes(one_position):
 def test_one_position_leaves_the_scale_at_its_prior(one_position):
     calibration = one_position.calibration
     for axis in calibration.static.axes():
-        # Each power of the scale curve has a prior sd of 1e-4 at the RMS of its column.
+        # The scale's slope has the prior mean 0 and the prior sd 67 ppm/K, a third of 200 ppm/K.
         assert np.abs(axis.scale_function.value(np.array([-4.0, 15.0])) - 1.0).max() < 5e-4
-    # The prior sd of a MEMS are 5 % for the scale and 0.01 for the misalignment.
+    # For a MEMS the prior sd of scale factors is 5 %, that of misalignments 0.01 rad.
     sd = np.sqrt(np.diag(calibration.posterior.covariance()))
     for block in parameter_layout(calibration).scale:
         assert sd[block.static] == pytest.approx(0.05, rel=0.3)
@@ -135,8 +149,8 @@ def test_one_position_leaves_the_scale_at_its_prior(one_position):
 
 
 def test_after_soaks_in_one_position_the_drift_error_is_within_three_claimed_sd(rng):
-    # WHY: norms in one attitude do not separate bias and scale. The fit attributed the drift to
-    # the scale, and claimed an sd of 0 for the drift of the bias, which was wrong on two axes.
+    # WHY: |f| in one attitude does not separate bias and scale. The fit attributed the drift to
+    # the scale; the bias drift was wrong on two axes, with a claimed sd of 0.
     slope = 0.1 * SLOPE
     bags = []
     for celsius in (5.0, 20.0, 35.0):
@@ -150,7 +164,7 @@ def test_after_soaks_in_one_position_the_drift_error_is_within_three_claimed_sd(
 @pytest.mark.slow
 def test_rests_at_three_temperatures_give_the_bias_slope_despite_a_warm_up_of_the_board(rng):
     # WHY: the sensor does not follow the warm-up of the board. The fit found a bias slope of 0,
-    # and took differences between the norms of rests for mounting offsets.
+    # and attributed differences of |f| between rests to mounting offsets.
     bags = []
     for celsius in (5.0, 20.0, 35.0):
         for up in positions(8, 3):
@@ -161,12 +175,12 @@ def test_rests_at_three_temperatures_give_the_bias_slope_despite_a_warm_up_of_th
     calibration, at = result.calibration, np.array([6.0, 36.0])
     curves = [axis.bias_function for axis in calibration.static.axes()]
     slopes = np.array([np.diff(curve.value(at))[0] / 30.0 for curve in curves])
-    # The norm of a rest has a noise of 1 ug, and due to the warm-up by 1 K the sensor's
-    # temperature in a rest is uncertain by 0.1 K.
+    # The mean |f| of a rest has a noise of 1 ug. As the board warms up by 1 K, the temperature of
+    # the sensor in a rest is uncertain by 0.1 K.
     np.testing.assert_allclose(slopes, 0.1 * MG * SLOPE, atol=0.002 * MG)
     assert 'misfit' not in names_of(result)
-    # Soaks do not determine the weight of a lag column, which is at most the bias slope: the
-    # claimed sd of this weight is between half of the bias slope and the bias slope.
+    # Soaks do not determine the weights of lags, which can be as large as the bias slope: their
+    # claimed sd is between half of the bias slope and the bias slope.
     variance, layout = np.diag(calibration.posterior.covariance()), parameter_layout(calibration)
     of_lags = [variance[block.response : block.end].sum() for block in layout.bias]
     assert 0.5 < np.sqrt(np.mean(of_lags) / np.mean(slopes**2)) < 1.0
@@ -175,7 +189,7 @@ def test_rests_at_three_temperatures_give_the_bias_slope_despite_a_warm_up_of_th
 @pytest.mark.slow
 def test_the_drift_error_of_a_sensor_that_follows_half_of_a_warm_up_is_within_three_claimed_sd():
     # WHY: a curve fitted to the drifts within rests was wrong by 7 claimed sd over the range of
-    # temperatures. Seed 2 gives an error above the sd of the curve fitted to drifts.
+    # temperatures. With seed 2 the error of the drift exceeds its claimed sd.
     rng, slopes, bags = np.random.default_rng(2), 0.1 * MG * SLOPE, []
     for celsius in (5.0, 20.0, 35.0):
         for up in positions(6, 3):
@@ -202,8 +216,8 @@ def test_tilts_of_two_supports_are_not_taken_for_a_scale_slope_of_a_level_axis(r
     at = np.array([0.0, 10.0])
     # 15000 samples (noise 0.1 mg) determine the mean bias slope of the two rests to 1 ug/K.
     assert np.diff(z.bias_function.value(at))[0] == pytest.approx(MG, abs=0.01 * MG)
-    # With a force of 0.03 g, an error of 1 ug/K is 33 ppm/K of the scale factor, and the
-    # difference of two rests with such errors is 47 ppm/K; the limit is ten times this.
+    # At 0.03 g a drift error of 1 ug/K is a scale slope of 33 ppm/K; the errors of two rests give
+    # sqrt(2) * 33 = 47 ppm/K. Limit of the scale's change over 10 K: 10 K * 47 ppm/K.
     assert abs(np.diff(z.scale_function.value(at))[0]) < 10.0 * 47e-6
 
 
@@ -227,14 +241,14 @@ def test_positions_without_a_thermometer_give_constants_and_wide_temperature_slo
     out = calibration.correct([1.0], [[0.1, -0.2, GRAVITY + 0.3]])
     np.testing.assert_allclose(out.specific_force, [[0.0, 0.0, GRAVITY]], atol=0.02)
     left = np.array([0.05, 0.05, np.hypot(0.05, 2e-3 * GRAVITY)])
-    # The sd of an output: 0.02 m/s^2 noise of a sample, and 10 K times the slopes' sd (`left`).
+    # `left` [m/s^2]: temperature sd, 10 K, times sd of the slopes; sample noise: 0.02 m/s^2.
     np.testing.assert_allclose(
         np.sqrt(np.diagonal(out.covariance[0])), np.hypot(left, 0.02), rtol=0.05
     )
 
 
 def test_a_fit_that_cannot_determine_the_repeatability_of_mountings_reports_its_assumption(rng):
-    # The nine constants of a triad fit nine norms exactly, so nine norms show no mounting offset.
+    # The nine constants of a triad fit nine |f| exactly, so |f| shows no mounting offset.
     assert 'mountings' in names_of(tumbled(9))
     stated = fit([turned(rng, positions(9, 3))], replace(OPTIONS, mounting_sd=1e-3))
     assert 'mountings' not in names_of(stated)
@@ -255,10 +269,10 @@ def test_counts_of_32_bits_are_fitted(rng):
 
 
 def test_the_bias_sd_of_one_recording_contains_the_sd_of_a_turn_on(rng):
-    # WHY: the claimed bias sd was 1/6 of the error, as if each position had a separate turn-on.
+    # WHY: the claimed bias sd was 1/6 of the bias error, as if each position had its own turn-on.
     offsets = 5e-3 * rng.standard_normal((8, 3))
     ups = positions(12, 3)
-    # `least`: prior sd of turn-ons for a noise of 0.02 m/s^2 at 100 Hz, and the stated sd [m/s^2].
+    # `least`: prior sd of turn-ons for samples with a noise of 0.02 m/s^2, or stated sd [m/s^2].
     stated = fit([turned(rng, ups)], replace(OPTIONS, mounting_sd=5e-3))
     for result, least in ((tumbled(12), 1e-3), (stated, 5e-3)):
         calibration = result.calibration
@@ -273,8 +287,8 @@ def test_the_bias_sd_of_one_recording_contains_the_sd_of_a_turn_on(rng):
 
 @pytest.mark.slow
 def test_the_claimed_variance_of_a_curve_contains_that_of_turn_ons_at_each_temperature(rng):
-    # WHY: the claimed variance was 1.6 to 1.9 times that of a turn-on, as turn-ons at three
-    # temperatures were taken for an error of the mean offset, not of the curve.
+    # WHY: turn-on offsets at three temperatures were taken for errors of the mean bias, not of the
+    # curve: the claimed variance was only 1.6 to 1.9 times the variance of a turn-on.
     turn_on, ups, dwell = 5e-3, positions(9, 3), 600
     bags = []
     for celsius in (-15.0, 20.0, 55.0):
@@ -287,22 +301,22 @@ def test_the_claimed_variance_of_a_curve_contains_that_of_turn_ons_at_each_tempe
     unit = tc.fit(bags, gravity=GRAVITY, input='m/s^2', mounting_sd=turn_on)
     for bag in (bags[0], bags[2]):
         out = unit.correct(bag.time_s, bag.counts, board=bag.temperatures['board'])
-        # At the ends of the range a curve through three equidistant points has 5/6 (line) to 1
-        # (parabola) times the variance of a turn-on, which the next turn-on adds once more. If
-        # `mounting_sd` is the sd of nine independent mountings, bias and scale add 1/3 each.
+        # If turn-ons have a variance of V, a line fitted to three equidistant temperatures has a
+        # variance of 5/6 V at its ends, a parabola V; the next turn-on adds V. With nine mountings
+        # of variance V the errors of bias and of scale add V/3 each.
         variance = np.diagonal(out.covariance[-dwell:].mean(axis=0)) - 1e-3**2
         assert ((1.0 + 5.0 / 6.0) * turn_on**2 < variance).all()
         assert (variance < (1.0 + 1.0 + 2.0 / 3.0) * turn_on**2).all()
 
 
 def test_rests_of_one_mounting_do_not_show_how_well_mountings_repeat(rng):
-    # WHY: if each position had several rests, the fitted mounting sd was 1/20 of the true sd.
+    # WHY: with several rests per mounting the fitted mounting sd was 1/20 of the true sd.
     whole, cut = tumbled(9), fit([turned(rng, np.repeat(positions(9, 3), 5, axis=0))], OPTIONS)
     sd, sd_cut = (done.calibration.static.x.residual_sd_m_s2 for done in (whole, cut))
-    # Nine norms do not determine the mounting sd, which stays at its prior in both fits.
+    # Nine values of |f| do not determine the mounting sd, which stays at its prior in both fits.
     assert sd_cut == pytest.approx(sd, rel=0.1)
     assert 'mountings' in names_of(cut)
-    # All rests of a mounting are left out together, so nine mountings have nine left-out norms.
+    # All rests of a mounting are left out together: nine mountings give nine left-out |f|.
     assert len(cut.fit.selected.score.norms.square) == 9
 
 
@@ -316,7 +330,7 @@ def test_two_bags_without_a_pause_between_them_count_as_one_turn_on(rng):
         ]
         return [source_of(*part, name=name) for part, name in zip(arrays, 'ab', strict=True)]
 
-    # The second bag begins in the fifth position, so a cut that is not recognised adds a mounting.
+    # The second bag begins in the fifth position; bags that are not joined have a mounting more.
     source = turned(rng, positions(9, 3))
     whole = tumbled(9)
     parts, others = (fit(cut(source, 9400, pause_s), OPTIONS) for pause_s in (0.0, 60.0))
@@ -355,7 +369,7 @@ def test_the_sd_of_turn_ons_in_a_prior_is_used_for_six_positions(rng):
 
 
 def test_an_update_by_three_positions_has_errors_near_the_claimed_sd(rng):
-    # WHY: a change of the scale was attributed to the bias, and errors were 2.4 claimed sd RMS.
+    # WHY: a scale change was attributed to the bias, and force errors were 2.4 claimed sd RMS.
     known = fit([turned(rng, positions(18, 3))], replace(OPTIONS, mounting_sd=1e-5)).calibration
     scale, bias = 1.0 + 2e-3 * rng.standard_normal(3), 1e-2 * rng.standard_normal(3)
     corners = positions(60, 5)
@@ -370,16 +384,16 @@ def test_an_update_by_three_positions_has_errors_near_the_claimed_sd(rng):
         out = aged.correct(np.arange(1.0, len(reading) + 1.0), reading)
         variance = np.diagonal(out.covariance, axis1=1, axis2=2) - 0.02**2
         ratios.append((out.specific_force - GRAVITY * corners) ** 2 / variance)
-    # Both fits are of a unit with six random changes, of scales and biases: the mean square of six
-    # normal numbers is uncertain by 60 %.
+    # The scales and biases of the unit have six random changes: the mean square of six normal
+    # numbers is uncertain by 60 %.
     assert np.mean(ratios) < 3.0
 
 
 @pytest.mark.parametrize('size', [1, 6])
 def test_turn_ons_between_six_faces_are_not_taken_for_a_misalignment(rng, size):
-    # WHY: with a turn-on (sd 1 mg) in each of six faces, the fit found misalignments of 20 mrad;
-    # with three turn-ons of six faces each, the fit assumed 18 independent offsets, and claimed an
-    # sd of the misalignments of 5 to 12 mrad.
+    # WHY: with a turn-on (sd 1 mg) in each of six faces the fit found misalignments of 20 mrad.
+    # With three turn-ons of six faces each the fit assumed 18 independent offsets, so the claimed
+    # sd of the misalignments was 5 to 12 mrad.
     M = np.array([[1.0, 0.0, 0.0], [2e-3, 1.0, 0.0], [-2e-3, 1e-3, 1.0]])
     sensed = np.linalg.inv(M)
     faces = np.vstack((np.eye(3), -np.eye(3)))
@@ -397,12 +411,12 @@ def test_turn_ons_between_six_faces_are_not_taken_for_a_misalignment(rng, size):
         assert sd.min() > 5e-3
     else:
         assert np.median(sd) < 4e-3
-        # Three turn-ons determine the sd of turn-ons, 1 mg, to a factor of two.
+        # Three turn-ons determine the sd of turn-on offsets, 1 mg, to a factor of two.
         assert 0.4 < calibration.static.x.residual_sd_m_s2 / (1e-3 * GRAVITY) < 2.0
 
 
 def test_the_claimed_sd_from_six_faces_contains_the_cross_axis_sensitivity_of_a_mems(rng):
-    # The norms of six faces do not show the cross-axis sensitivities of 0.8, -0.6 and 0.5 %.
+    # |f| on six faces does not show the cross-axis sensitivities of 0.8, -0.6 and 0.5 %.
     M = np.array([[1.0, 0.0, 0.0], [8e-3, 1.0, 0.0], [-6e-3, 5e-3, 1.0]])
     sensed = np.linalg.inv(M)
     faces = np.vstack((np.eye(3), -np.eye(3)))
@@ -418,7 +432,7 @@ def test_the_claimed_sd_from_six_faces_contains_the_cross_axis_sensitivity_of_a_
 
 
 def test_six_attitudes_that_hardly_determine_the_scale_factors_give_scale_factors_near_1(rng):
-    # The squared components of these attitudes are almost linearly dependent.
+    # The squared x, y and z components of the attitudes are almost linearly dependent.
     up = [
         [-7, 88, 48],
         [14, -89, -44],

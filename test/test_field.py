@@ -30,7 +30,7 @@ from thermo_comp.unit.provenance import Provenance
 
 
 def test_derivatives_of_a_rest_by_all_parameters_agree_with_finite_differences():
-    # In a ramp no column is zero, and both coefficient sets have a weight.
+    # The rests are in a ramp, so that every column and both coefficient sets have an effect.
     unit = rich_calibration()
     logged = rests(unit, in_any_attitude, no_error, days=1, rate=0.5 / 60.0)
     series = series_of(logged, unit)
@@ -39,8 +39,8 @@ def test_derivatives_of_a_rest_by_all_parameters_agree_with_finite_differences()
     layout = parameter_layout(unit)
     levels = {block.static: axis for axis, block in enumerate(layout.scale)}
     levels |= {block.dynamic: axis for axis, block in enumerate(layout.scale)}
-    # Test every second parameter. The block of parameters of a bias or scale has an odd length, so
-    # each kind of parameter is tested either in the bias or in the scale.
+    # Test every second calibration parameter. The block of parameters of a bias or scale has an
+    # odd length, so each kind of parameter is tested either in the bias or in the scale.
     for k in range(0, layout.n_parameters, 2):
         step = 1e-7
         moved = values.copy()
@@ -61,7 +61,7 @@ def test_derivatives_of_a_rest_by_all_parameters_agree_with_finite_differences()
         by_level = series.by_level[:, axis + 3] * unit.gravity_m_s2
         assert np.allclose(slope, by_level, atol=1e-4)
         both = series.by_parameter[:, [block.static, block.dynamic]].sum(axis=1)
-        # A relative change of K has the effect of an equal change of the scale level in both sets.
+        # A relative change of K changes |f| like an equal change of the scale level in both sets.
         assert np.allclose(slope, both, atol=0.02 * abs(slope).max())
 
 
@@ -72,7 +72,7 @@ def test_an_update_with_the_true_variances_equals_a_kalman_filter():
     series = series_of(history.rests, unit)
     best = field_units.BestFilter(process)
     for k in range(len(series)):
-        # The Kalman filter takes the rests that `series_of` averages to row k, as one measurement.
+        # The mean of the rests of row k of `series` is one measurement of the Kalman filter.
         first = int(series.n_windows[:k].sum())
         windows = [r for _, r in history.rests[first : first + int(series.n_windows[k])]]
         mean = np.mean([window.mean for window in windows], axis=0) / field_units.K
@@ -94,7 +94,7 @@ def test_an_update_with_the_true_variances_equals_a_kalman_filter():
         bias, scale = layout.bias[axis].static, layout.scale[axis].static
         sd = np.sqrt(solved.posterior[bias, bias]) / field_units.K
         expected = best.state[axis] + best.state[15 + axis]
-        # The update averages the rests of a turn-on to a few rows: an error below 0.2 sd.
+        # The update averages rests of a turn-on to a few rows: an error of less than 0.2 sd.
         assert abs(solved.shift[bias] / field_units.K - expected) < 0.2 * sd
         P = best.P[np.ix_([axis, 15 + axis], [axis, 15 + axis])].sum()
         assert sd == pytest.approx(np.sqrt(P), rel=0.1)
@@ -178,15 +178,15 @@ def test_the_sd_of_an_old_calibration_aged_to_the_last_rest_includes_the_random_
     walk = np.cumsum(60.0 / np.sqrt(3.0) * MICRO_G * rng.standard_normal((90, 3)), axis=0)
     logged = rests(unit, upright, lambda day: walk[round(3 * day)], 30)
     x, y, z = update(series_of(logged, unit), unit).axis_changes
-    # The bias of x has an sd of 10 ug. At rest z reads bias plus scale error, 10 ug each.
+    # The bias of x has an sd of 10 ug; at 1 g bias and scale of z have an sd of 10 ug each.
     residual = unit.static.x.residual_sd_m_s2
     assert x.claimed_sd == pytest.approx(np.hypot(10.0 * MICRO_G, residual), rel=0.01)
     assert z.claimed_sd == pytest.approx(np.hypot(np.sqrt(200.0) * MICRO_G, residual), rel=0.01)
-    # Rests in one attitude do not separate bias and scale: the ageing model gives the bias of x
-    # and y between half and all of the variance of the random walk.
+    # Rests in one attitude do not separate bias and scale: the ageing model attributes between
+    # half and all of the variance of the random walk to the biases of x and y.
     for axis in (x, y):
         assert 0.5 < axis.present_sd / (329.0 * MICRO_G) < 1.5
-    # The present sd of z must be the size of the change of z to 40 ug, two sd of a turn-on offset.
+    # The z bias' sd at the last rest must equal its simulated walk within 40 ug, two turn-on sd.
     assert z.present_sd == pytest.approx(abs(walk[-1, 2]), abs=40.0 * MICRO_G)
 
 
@@ -207,7 +207,7 @@ def test_a_change_of_gravity_is_not_taken_for_a_change_of_three_scales(day):
     result = update(series_of(stepped(history, size, day), unit), unit)
     ((change, found, sd),) = result.solution.gravity
     assert change.time - field_units.DAY_ZERO == pytest.approx(day + 0.4, abs=0.5)
-    # The random walks of the scales (10 ppm per root day) limit the sd of the step of gravity.
+    # Random walks of the scales (10 ppm per root day) limit how well the gravity step is known.
     assert abs(found - size) < 4.0 * sd < 60.0 * MICRO_G
     for before, after in zip(aged.axis_changes, result.axis_changes, strict=True):
         assert after.scale == pytest.approx(before.scale, abs=30e-6)
@@ -215,7 +215,7 @@ def test_a_change_of_gravity_is_not_taken_for_a_change_of_three_scales(day):
     (text,) = (line for line in change_texts(result) if 'as if gravity' in line)
     assert text.startswith('from 2026-')
     assert 'as if gravity were not the stated 9.80665 m/s^2: no scale was changed' in text
-    # If the user states gravity as certain, the update attributes the step to the three scales.
+    # If gravity is stated as certain, the update takes the step of |f| for three scale changes.
     certain = update(series_of(stepped(history, size, day), unit), unit, is_gravity_certain=True)
     assert certain.solution.gravity == ()
     assert all(axis.scale > 150e-6 for axis in certain.axis_changes)
@@ -415,7 +415,7 @@ def with_shares(logged, share):
 
 
 def test_derivatives_of_a_rest_by_initial_lag_states_agree_with_finite_differences():
-    # At a turn-on the states of lags are unknown; expected derivatives are differences of |f|.
+    # At a turn-on the states of lags are unknown; expected derivatives: finite differences of |f|.
     unit, share, step = rich_calibration(), 0.6, 1e-4
     logged = with_shares(rests(unit, in_any_attitude, no_error, days=4, rate=0.5 / 60.0), share)
     series, layout = series_of(logged, unit), StateLayout(Correction(unit).memory)
@@ -435,8 +435,8 @@ def test_derivatives_of_a_rest_by_initial_lag_states_agree_with_finite_differenc
 
 
 def test_an_unknown_regime_after_a_turn_on_does_not_increase_the_noise_of_a_rest():
-    # The residual sd of a calibration is the scatter of turn-ons. The ageing model estimates this
-    # scatter of turn-ons, so the noise of a rest must not contain the residual sd.
+    # The ageing model estimates the scatter of turn-ons, which is the residual sd of a
+    # calibration, so the noise of a rest must not contain the residual sd.
     unit = field_units.calibration()
     logged = field_units.live('level', 1, 3, field_units.Process()).rests
     unknown = [(s, replace(r, state=(*r.state[:4], 1.0, *r.state[5:]))) for s, r in logged]
@@ -447,9 +447,9 @@ def test_an_unknown_regime_after_a_turn_on_does_not_increase_the_noise_of_a_rest
 
 @pytest.mark.parametrize('lags', [0.0, 1.0])
 def test_unknown_initial_lag_states_are_not_taken_for_scatter_of_rests(rng, lags):
-    # A turn-on has three rests, in which 100, 70 and 40 % of the initial lag states remain. Sd of
-    # walks per root day: bias 15, scale 10 ug; turn-ons 20 ug, rests 3 ug; initial lag states:
-    # `lags` times the assumed sd (40 to 100 ug).
+    # A turn-on has three rests, in which 100, 70 and 40 % of the initial lag states remain. Random
+    # walks grow by 15 ug (bias) and 10 ug (scale, at 1 g) per root day; sd of turn-ons: 20 ug, of
+    # rests: 3 ug, of initial lag states: `lags` times the assumed sd (40 to 100 ug).
     unit = rich_calibration()
     each = series_of(with_shares(rests(unit, in_any_attitude, no_error, days=60), 1.0), unit)
     n, names = len(each), [k for k, v in vars(each).items() if isinstance(v, np.ndarray)]
@@ -465,7 +465,7 @@ def test_unknown_initial_lag_states_are_not_taken_for_scatter_of_rests(rng, lags
     residual += np.sqrt(series.noise + (3.0 * MICRO_G) ** 2) * rng.standard_normal(3 * n)
     ageing, _, used = learn(replace(series, residual=residual), unit, float(series.time[0]))
     assert len(used) == 3 * n
-    # In six simulations the estimates scattered by 20 % (walk of the bias), 30 % (walk of the
+    # In six simulations the estimated sd scattered by 20 % (walk of the bias), 30 % (walk of the
     # scale) and 15 % (turn-on).
     assert ageing.bias == pytest.approx(15.0 * MICRO_G, rel=0.5)
     assert ageing.scale == pytest.approx(10.0 * MICRO_G, rel=0.7)

@@ -11,7 +11,7 @@ G = 9.80665
 MICRO_G = 1e-6 * G
 KNEE_C, SLOPE = 21.3, 20.0  # [degC], [ug/K]
 BIAS = 1e-3 * G
-#: Sd of the samples [m/s^2]: 0.4 ug in the mean of a minute at 0.5 Hz.
+#: Noise of a sample [m/s^2], which gives 0.4 ug in means over 60 s at 0.5 Hz.
 NOISE = 2.0 * MICRO_G
 UPS = np.array(
     [[1, 0, 0], [-1, 0.1, 0], [0, 1, 0.1], [0.1, -1, 0], [0, 0.1, 1], [0, 0, -1],
@@ -20,7 +20,7 @@ UPS = np.array(
 
 
 def recording(up, rng, slope=None):
-    """Simulate times [s], samples [m/s^2] and board [degC] for two hours: 10, 32, 12 degC."""
+    """Simulate times [s], samples [m/s^2] and board [degC]: in two hours from 10 to 32 to 12."""
     time_s = np.arange(0.0, 7200.0, 2.0)
     board = np.interp(time_s, (0.0, 600.0, 3600.0, 7200.0), (10.0, 10.0, 32.0, 12.0))
     bias = (SLOPE if slope is None else slope) * MICRO_G * np.maximum(board - KNEE_C, 0.0)
@@ -35,7 +35,7 @@ def columns(recorded, name, thermometers=('board',)):
 
 
 def left_by(groups):
-    """Fit some groups, correct another recording; return the RMS error of means over 60 s [ug]."""
+    """Fit groups of columns; return unit and RMS error of 60 s means in a held-out bag [ug]."""
     rng = np.random.default_rng(8)
     bags = [columns(recording(up, rng), f'rest{k}') for k, up in enumerate(UPS)]
     unit = tc.fit(bags, gravity=G, input='m/s^2', groups=groups, mounting_sd=1e-7)
@@ -132,9 +132,9 @@ def test_a_bag_of_another_environment_is_excluded_and_increases_the_claimed_sd()
     for unit in (joint, later):
         (note,) = [note for note in unit.provenance.notes if note.startswith('environment: r4')]
         assert 'did not use these data' in note
-        # The increase covers the true error in bag r4, a bias up to 1.1 mg above the knee.
+        # The variance added because of bag r4 covers the bias error in r4, up to 1.1 mg.
         more = sd_of_a_correction(unit) ** 2 - sd_of_a_correction(alone) ** 2
         assert 0.5 < true_error / np.sqrt(more.mean()) < 1.5
-    # A new bag with the bias slope of the first four bags is not reported as another environment.
+    # A new bag with the bias slope of the first four bags gives no note `environment`.
     again = tc.fit(columns_of([SLOPE] * 5)[-1:], gravity=G, input='m/s^2', prior=alone)
     assert not [note for note in again.provenance.notes if note.startswith('environment')]

@@ -90,7 +90,7 @@ def test_errors_of_fitted_constants_are_below_4_claimed_sd(response):
     pull = pulls(response, OWN_LAGS)
     assert np.abs(pull).max() < 4.0
     assert np.sqrt(np.mean(pull**2)) < 2.0
-    # The drift is some 100 ug; the claimed sd of bias, scale and M are some ug and ppm.
+    # The raw drift is some 100 ug; the claimed sd of bias, scale and M are some ug and ppm.
     bias_sd, scale_sd, M_sd = claimed(response.calibration)
     assert (bias_sd / np.array(OWN_LAGS.counts_per_micro_g)).max() < 5.0
     assert scale_sd.max() < 10e-6
@@ -112,13 +112,13 @@ def test_the_paper_s_model_fits_a_unit_of_the_paper_s_physics(golovach):
     assert calibration.response == ()
     assert calibration.provenance.model == 'golovach'
     for row in golovach.residuals[1:]:
-        # The paper's model has a curve per regime; residuals of a single curve are not computed.
+        # Golovach's model has a curve per regime; residuals of a single curve are not computed.
         assert not row.one_set.n
         assert row.two_sets.rms < row.raw.rms, row.section
-    # The paper's model has a linear static set and a quadratic dynamic set.
+    # In Golovach's model the bias is linear in the static set, quadratic in the dynamic set.
     assert calibration.static.x.bias_function.n_free == 1
     assert calibration.dynamic.x.bias_function.n_free == 2
-    # The errors of the biases are below the largest residual of the paper's model.
+    # The errors of the biases are below the largest residual of Golovach's model.
     left = golovach.residuals[-1].fitted
     bias, scale, M = constants(calibration)
     error = (bias - PAPER.bias_at_reference) / np.array(PAPER.counts_per_micro_g)
@@ -167,6 +167,14 @@ def test_the_error_of_the_compensator_is_that_stated_by_the_fit(response):
     assert 0.5 < np.sqrt(np.mean(error**2)) < 1.6
 
 
+def test_slow_noise_for_an_unmodelled_drift_leaves_the_white_noise():
+    # WHY: the file stated white noise of 0.3 ug/sqrt(Hz) for a unit with 5 ug/sqrt(Hz), so that no
+    # window of the node's check of |f| counted as still.
+    paper = fitted(OWN_LAGS, positions(2, 1), 1, model='golovach')
+    stated = np.array(paper.calibration.noise_density_m_s2_sqrt_hz) / MICRO_G
+    np.testing.assert_allclose(stated, 5.0, rtol=0.4)
+
+
 def test_six_faces_leave_misalignment_at_its_prior():
     repeats = 1e-6 * STANDARD_GRAVITY
     result = fitted(PLAIN, FACES, 2, groups=('curve', 'set'), mounting_sd=repeats)
@@ -183,7 +191,7 @@ def test_six_faces_leave_misalignment_at_its_prior():
 
 
 def test_the_claimed_sd_of_nine_positions_includes_turn_on_offsets(rng):
-    # WHY: nine constants fit nine norms exactly, whatever the offsets, and the claimed sd of the
+    # WHY: nine constants fit nine |f| exactly, whatever the offsets, and the claimed sd of the
     # constants was 3 to 5 times too small.
     turn_ons = PLAIN.scale_factor * rng.normal(0.0, 50e-6 * STANDARD_GRAVITY, (9, 3))
     records = records_of(PLAIN, positions(9, 1), 1)
@@ -261,10 +269,10 @@ def test_counts_of_24_bits_that_a_driver_averages_are_fitted(n_averaged, rng):
 
 @pytest.mark.slow
 def test_misalignments_of_a_mems_unit_are_determined_by_nine_positions():
-    # WHY: mounting offsets of 5 mg fit nine positions' norms as well as misalignments do.
+    # WHY: mounting offsets of 5 mg fit |f| in nine positions as well as misalignments do.
     unit = unit_preset('mems', 0).with_thermometers(rate_hz=0.25)
     records = arrays(unit, plan('chamber-9'), 0, rate_hz=1.0)
-    # A fit with only the groups of the simulated unit takes half the time.
+    # A fit with only the groups of columns that the unit needs takes half the time.
     options = FitOptions(gravity=STANDARD_GRAVITY, groups=('curve', 'set', 'gradient', 'board'))
     calibration = fit(sources_of(records), options).calibration
     M = np.array(calibration.misalignment)

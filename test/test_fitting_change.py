@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""With self-heating, even effects of T_case - T_board are even about its value in a soak."""
+"""Effects even in T_case - T_board are symmetric about its value in a soak (self-heating)."""
 
 from itertools import pairwise
 
@@ -26,7 +26,7 @@ def lagged(values, tau):
 
 
 def recorded(rng, up, name, targets):
-    """Simulate a unit whose bias is even in T_case - T_board less its value in a soak."""
+    """Simulate a bias that is an even function of T_case - T_board minus its value in a soak."""
     corners = [(0.0, targets[0]), (900.0, targets[0])]
     for before, after in pairwise(targets):
         corners += [(corners[-1][0] + 60.0 * abs(after - before), after)]
@@ -56,7 +56,7 @@ def test_effects_even_about_the_rest_gradient_are_found(rng):
     programs = ((20.0, 35.0, 5.0, 20.0), (5.0, 25.0, 12.0), (35.0, 15.0, 30.0))
     bags = [recorded(rng, up, f'p{k}', programs[k % 3]) for k, up in enumerate(positions(4, 3))]
     reduced = [reduce_source(bag, full_scale=None) for bag in bags]
-    # The error is mainly that of rates from differences over 120 s; noise adds 0.1 mK only.
+    # Rates computed over 120 s cause most of the error of the gradient; noise adds only 0.1 mK.
     assert abs(gradients_at_rest(reduced, ('case',))['case'] + OWN_HEAT_K) < 0.005
     groups = ('curve', 'gradient', 'board', 'gradient_even', 'gradient_even_about_rest')
     about_rest, about_0 = (
@@ -66,7 +66,7 @@ def test_effects_even_about_the_rest_gradient_are_found(rng):
     kept = {column.group for column in about_rest.calibration.response}
     assert 'gradient_even_about_rest' in kept
     assert 'gradient_even' not in kept
-    # Columns that are even in T_case - T_board itself cannot describe the whole effect.
+    # Functions even about T_case - T_board = 0 describe only part of an effect even about -0.6 K.
     floor = NOISE / np.sqrt(30.0)
     assert about_rest.residuals[-1].fitted.rms < 1.1 * floor
     assert about_0.residuals[-1].fitted.rms > 1.5 * floor

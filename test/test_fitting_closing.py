@@ -40,7 +40,7 @@ def weight(record, end_condition):
         for stamp, value in zip(stamps.tolist(), values.tolist(), strict=True)
     )
     at, result = 0, []
-    # The weight changes over 300 s, so every fourth sample (2 Hz) suffices.
+    # The dynamic set's weight changes over 300 s, so every fourth sample (2 Hz) suffices.
     for stamp in record.accel_stamp_ns[::4].tolist():
         while at < len(readings) and readings[at][0] <= stamp:
             tracker.read(readings[at][1], readings[at][0], readings[at][2])
@@ -64,7 +64,7 @@ def test_the_evidence_selects_the_condition_that_ends_the_dynamic_regime(end_con
         records.append(replace(record, counts=record.counts + step))
     result = fit(sources_of(records), FitOptions(gravity=STANDARD_GRAVITY, **options))
     assert result.calibration.detector.end_condition == end_condition
-    # The fit estimates the detector settings; with the true settings the switches differ slightly.
+    # The detector settings are estimated, so regime switches differ slightly from the true ones.
     last = result.residuals[-1]
     assert last.fitted.rms < 0.35 * last.raw.rms
 
@@ -124,7 +124,7 @@ def drawn(rng, n, steps, noise):
 
 @pytest.mark.parametrize('noise', [Noise(1.0, 600.0), Noise(0.3, 2000.0), Noise(30.0, 300.0)])
 def test_variance_ratio_and_correlation_time_are_estimated(rng, noise):
-    # 240 correlation times of data determine the variance to 9 % and the time to about 15 %.
+    # 240 correlation times of data determine the variance to 9 %, the correlation time to 15 %.
     whitener, weight, series = drawn(rng, 9, 300, noise)
     fitted = whitener.estimate(5.0 * series, weight)
     assert 0.5 < fitted.ratio / noise.ratio < 2.0
@@ -132,7 +132,7 @@ def test_variance_ratio_and_correlation_time_are_estimated(rng, noise):
 
 
 def test_white_noise_is_not_taken_for_gauss_markov_noise(rng):
-    # The fit finds Gauss-Markov noise in 1 % of series of white noise, but not in these ten.
+    # In 1 % of all series of white noise the fit finds Gauss-Markov noise, but not in these ten.
     assert [
         whitener.estimate(series, weight)
         for whitener, weight, series in (drawn(rng, 5, 100, Noise()) for _ in range(10))
@@ -140,7 +140,7 @@ def test_white_noise_is_not_taken_for_gauss_markov_noise(rng):
 
 
 def test_no_correlation_time_longer_than_a_position_is_estimated(rng):
-    # Only correlation times up to a sixth of a position, which lasts 2000 s, are tried.
+    # Only correlation times up to a sixth of a position (at most 2000 s long) are tried.
     whitener, weight, series = drawn(rng, 12, 20, Noise(100.0, 1e5))
     assert 0.0 < whitener.estimate(series, weight).time_s <= 20.0 * 100.0 / 5.0
     alone = Whitener(np.arange(3), np.zeros(3))
@@ -151,7 +151,7 @@ MICRO = 9.80665e-6  # a micro-g [m/s^2]
 
 
 def score(drift, norms=(), by_thermometer=0.0):
-    """Return a score with left-out drifts of equal size and the given errors of |f| [ug]."""
+    """Return a score of equal left-out drifts `drift` and left-out |f| errors `norms` [ug]."""
     drifts = Folds(np.full(18, (drift * MICRO) ** 2), np.full(18, 20.0))
     of_norms = Folds((np.array(norms) * MICRO) ** 2, np.full(len(norms), 20.0))
     none = np.zeros((0, 3))
@@ -161,9 +161,9 @@ def score(drift, norms=(), by_thermometer=0.0):
 
 
 def test_few_norms_that_both_models_predict_do_not_select_the_model():
-    # WHY: a MEMS was recorded in six faces at three temperatures. Only four left-out values of |f|
-    # could be predicted both with and without a curve over temperature. The curve reduced their
-    # errors by less than two standard errors, so the fit left it out: the force error was 7 mg.
+    # WHY: for a MEMS in six faces at three temperatures only four left-out values of |f| could be
+    # predicted both with and without a curve over temperature. The fit rejected the curve, which
+    # reduced the four errors of |f| by less than two standard errors: the force error was 7 mg.
     constants = score(20.0, [22.4, 457.7, 54.6, 26.1])
     curve = score(20.0, [16.8, 21.0, 22.5, 25.2])
     assert not is_better(constants, curve)
@@ -174,16 +174,16 @@ def test_few_norms_that_both_models_predict_do_not_select_the_model():
 
 def test_a_larger_model_must_not_explain_the_errors_of_a_coarse_thermometer():
     # WHY: readings in steps of 1 K have equal errors in all bags of one temperature program. Knees
-    # in the curve halved the left-out drift, but doubled the error in another program.
+    # of a curve halved the left-out drift, but doubled the error in other temperature programs.
     by_thermometer = 49.0
     curve, parts, bends = (score(drift, (), by_thermometer) for drift in (120.0, 46.0, 20.0))
     assert is_better(curve, parts)
     assert not is_better(parts, bends)
-    # Errors of |f| above those by the thermometer (49 ug) select the curve that reduces them.
+    # A curve is chosen if |f| errors without it far exceed those by the thermometer, 49 ug.
     flat, curved = (score(46.0, size * np.ones(9), by_thermometer) for size in (3000.0, 60.0))
     assert is_better(flat, curved)
     assert not is_better(curved, score(20.0, 30.0 * np.ones(9), by_thermometer))
-    # If the thermometer causes 5 ug, a fall of the left-out drift from 46 to 20 ug is significant.
+    # If errors by the thermometer are 5 ug, a left-out drift of 20 ug is better than one of 46 ug.
     assert is_better(score(46.0, (), 5.0), score(20.0, (), 5.0))
 
 

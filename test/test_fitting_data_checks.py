@@ -78,7 +78,7 @@ def test_a_complete_thermal_test_gives_only_good_findings(good):
         ('ramps', lambda w: {'rate': 0.0 * w.rate}, 'no ramp'),
         ('directions', lambda w: {'rate': np.abs(w.rate)}, 'hardly any cooling was recorded'),
         ('soak', lambda w: {'weight': 0.0 * w.weight + 1.0}, 'only 0 % of the windows are static'),
-        # WHY: with soaks at a single temperature the error was 800 ug, the claimed sd 100 ug.
+        # WHY: with soaks at one temperature the force error was 800 ug, the claimed sd 100 ug.
         ('soak', lambda w: {'weight': 1.0 * (np.abs(w.temperature - 20.0) > 3.0)},
          r'% of the windows are static, over [56]\.\d of \d\d\.\d K'),
         ('swapped', lambda w: {'gradient': -w.gradient}, r'exchanged, or is the case thermometer'),
@@ -93,8 +93,8 @@ def test_missing_data_of_a_test_are_reported(good, name, changed, message):
 
 
 def test_the_noise_of_soaks_is_not_taken_for_a_ramp_or_for_exchanged_sensors(good, rng):
-    # WHY: bags of soaks were refused, because noise of the readings in rate and gradient was taken
-    # for ramps with exchanged sensors.
+    # WHY: bags of soaks were refused, because noise of readings gave rates and gradients as in
+    # ramps with exchanged thermometers.
     windows, up = good
     noise = rng.standard_normal(len(windows.rate))
     soaks = 5.0 + 15.0 * (windows.data.position % 3)
@@ -127,7 +127,7 @@ def test_rests_at_room_temperature_are_sufficient_with_a_prior_of_the_unit(good)
     track = Track(0.0, 1.0, np.full((2, 9), 50.0), np.ones(2, dtype=bool))
     advised = findings_of(replace(desk, tracks=(track,)), up, prior=prior)['span']
     assert 'to 50 degC' in advised.message
-    # With a prior of the type of unit, not of this unit, a chamber test is advised.
+    # If the prior is from other units of the type, not from this unit, a chamber test is advised.
     of_type = replace(prior, provenance=replace(prior.provenance, model='population'))
     assert {'span', 'ramps'} <= {*findings_of(desk, up, prior=of_type)}
 
@@ -152,7 +152,7 @@ def test_six_faces_do_not_determine_the_misalignment(good):
 
 
 def test_geometry_is_the_largest_sd_of_nine_parameters_per_sd_of_the_norm(rng):
-    # Expected: sd of nine parameters fitted by least squares to norms with noise of 1 (1 sd).
+    # Expected: sd of nine parameters fitted by least squares to values of |f| with an sd of 1.
     up = positions(12, 5)
     x, y, z = up.T
     jacobian = np.column_stack((x, y, z, x * x, y * y, z * z, x * y, x * z, y * z))

@@ -33,8 +33,8 @@ from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 def ratios_to_sd(seed, effect_sd):
     """
-    Return the errors of the response weights, divided by the fit's sd and by the claimed sd, if
-    the biases change randomly by `effect_sd` from section to section, alike in all positions.
+    Return error / fit's sd and error / claimed sd of the response weights. The biases change
+    randomly by `effect_sd` from section to section, alike in all positions.
     """
     truth, rng = Truth(), np.random.default_rng(seed)
     windows, up = table_of(truth, 12, rng, n_windows=24)

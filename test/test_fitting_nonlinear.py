@@ -49,7 +49,7 @@ SIZES = np.tile([GRAVITY, 30.0, 60.0, 95.0], 6)
 
 
 def table(rng, k2=0.0, kq=0.0, k3=0.0, *, share=0.01, radius_sd=0.0, radius_error=0.0):
-    """Draw windows of 24 positions on a centrifuge; terms grow by 100 * `share` % per K."""
+    """Draw windows at 24 centrifuge positions; nonlinear terms grow by 100 * `share` % per K."""
     truth = Truth(on_bias=np.zeros((3, 6)), on_scale=np.zeros((3, 6)), offset_sd=MICRO)
     windows, up = table_of(truth, 24, rng, n_windows=10)
     t = windows.columns[:, 0]
@@ -216,7 +216,7 @@ def test_a_constant_rotation_counts_as_a_rest_and_a_changing_rotation_does_not(r
     summed = accumulator.cells()
     still = still_intervals(without_rotation(summed), 3.0)
     edges = [(summed.time[a], summed.time[b - 1]) for a, b in still]
-    # The median rate shows a change after 5 s; samples next to a motion do not count as rest.
+    # The 10 s median reaches a new angular rate after 5 s; cells next to a motion are no rest.
     assert len(edges) == 3
     for (a, b), (begun, ended) in zip(edges, ((0, 80), (100, 180), (190, 240)), strict=True):
         assert begun <= a < begun + 8.0

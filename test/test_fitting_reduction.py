@@ -64,7 +64,7 @@ def test_the_reduction_does_not_depend_on_how_samples_are_divided_into_blocks(rn
         other = reduced(split(whole, n_parts))
         for a, b in zip(at_once.intervals, other.intervals, strict=True):
             np.testing.assert_array_equal(a.count, b.count)
-            # The order of additions, and therefore the rounding, depends on the blocks.
+            # The order of additions, and so the rounding, depends on the size of the blocks.
             np.testing.assert_allclose(a.mean, b.mean, rtol=1e-13, atol=1e-11)
             np.testing.assert_allclose(a.time, b.time, rtol=1e-12)
         np.testing.assert_array_equal(at_once.board.value, other.board.value)
@@ -89,7 +89,7 @@ def test_short_rests_of_slow_samples_are_found(rng, rest_s):
 
 @pytest.mark.parametrize('cycle_s', [0.01, 0.02, 0.04, 0.05, 0.1, 0.3, 1.0])
 def test_the_estimated_interval_between_samples_is_right_to_0_1_percent(rng, cycle_s):
-    # WHY: at 10 Hz averages have 33 or 34 samples; the rate was computed as 9.9 Hz.
+    # WHY: at 10 Hz averages have 33 or 34 samples; the sample rate was computed as 9.9 Hz.
     n = round(1800.0 / cycle_s)
     kept = rng.random(n) > 2.0 / n  # a few samples are lost
     samples = 9.8 + 0.01 * rng.standard_normal((n, 3))
@@ -161,6 +161,8 @@ def test_readings_of_a_lost_thermometer_are_counted_and_left_out(rng):
     # The first and the last reading may be spikes, too.
     at_ends = np.array([85.0, 20.0, 20.1, 20.2, 20.3, 20.4, -127.0])
     assert np.flatnonzero(is_spike(at_ends)).tolist() == [0, 6]
+    # Infinite readings, which are dropped later, give no warning.
+    assert not is_spike(np.array([np.inf, np.inf, np.inf, np.inf, 20.0, 20.0, np.inf])).all()
     # Readings of a temperature that changes by up to 18 K from reading to reading are no spikes.
     assert not is_spike(np.array([-18.0, 0.0, 12.0, 18.0, 20.0, 21.0, 21.0])).any()
 
@@ -208,7 +210,7 @@ def test_several_samples_with_one_stamp_are_reported(rng):
 
 @pytest.mark.parametrize('n', [0, 1, 70])
 def test_a_few_stamps_that_do_not_rise_are_reported(n, rng):
-    # WHY: if less than 1 % of the stamps did not rise, `info` reported this and `fit` did not.
+    # WHY: if less than 1 % of the stamps did not rise, `info` reported them, but `fit` did not.
     whole = block(still(rng, 300.0, (0.0, 0.0, 3000.0)))
     cycle_ns = int(np.median(np.diff(whole.accel_stamp_ns)))
     # The clock is set back by n cycles, so n samples have stamps that have occurred before.
@@ -297,7 +299,7 @@ def test_a_gravity_not_found_on_earth_is_refused(gravity):
 
 
 def soak_ramp_soak(quantum, noise, rng):
-    # Three hours at 1 Hz: a soak, a ramp of 1 K/min after a lag of 300 s, and a soak.
+    # A thermometer lags the air by 300 s: 3 h at 1 Hz, a soak, a ramp of 1 K/min, a soak.
     time = np.arange(0.0, 10800.0)
     air = np.interp(time, [0.0, 3600.0, 5400.0], [5.0, 5.0, 35.0])
     celsius = np.empty_like(air)
@@ -314,8 +316,8 @@ def soak_ramp_soak(quantum, noise, rng):
 def test_thermometer_settings_are_estimated_from_readings(quantum, noise, rng):
     learned = learn_thermometer([soak_ramp_soak(quantum, noise, rng)], ThermometerSettings())
     assert learned.quantum_c == pytest.approx(quantum, rel=1e-6)
-    # Rounded readings show noise only at the rounding edges that they pass slowly, at the end of
-    # the ramp.
+    # Rounded readings show noise only where they pass a rounding edge slowly, at the end of the
+    # ramp.
     assert learned.noise_sd_c == pytest.approx(noise, rel=0.4 if quantum else 0.1)
     # Means over 60 s determine the lag of the thermometer, 300 s, to a third.
     assert learned.lag_s == pytest.approx(300.0, rel=0.35)
@@ -325,7 +327,7 @@ def test_thermometer_settings_are_estimated_from_readings(quantum, noise, rng):
 @pytest.mark.parametrize('noise', [0.02, 0.05, 0.09])
 def test_readings_that_alternate_at_edges_of_1_k_steps_show_their_noise(noise, rng):
     learned = learn_thermometer([soak_ramp_soak(1.0, noise, rng)], ThermometerSettings())
-    # The readings pass each of 30 rounding edges once; only the two slowest passes show noise.
+    # The readings cross 30 rounding edges; noise shows only at the two slowest crossings.
     assert learned.noise_sd_c == pytest.approx(noise, rel=0.3)
 
 
@@ -359,7 +361,7 @@ def test_the_detector_settings_follow_the_slowest_ramp(rng):
     readings = Readings(stamps(n, 1.0), celsius)
     bag = reduced([block(still(rng, 30.0, (0.0, 0.0, 3000.0)))])
     slow = learn_detector([replace(bag, temperatures={'board': readings, 'case': readings})])
-    # The setting `smallest_ramp_k_min` is 0.7 of the rate of the slowest ramp, 0.15 K/min.
+    # The setting `smallest_ramp_k_min` is 0.7 times the rate of the slowest ramp (0.15 K/min).
     assert slow.smallest_ramp_k_min == pytest.approx(0.105, rel=0.05)
     assert slow.relaxed_rate_k_min < slow.smallest_ramp_k_min / 1.5
 
@@ -391,8 +393,8 @@ def test_a_drift_averages_the_error_of_rounding(rng):
 
 @pytest.mark.parametrize('step', [1.0, 0.04])
 def test_steps_of_a_converter_after_a_constant_soak_do_not_divide_a_rest(rng, step):
-    # WHY: the step of the converter was searched in the first 20000 samples only. If these samples
-    # were constant, each later step of the converter began a new rest.
+    # WHY: the step of the converter was searched in the first 20000 samples only. After 20000
+    # constant samples each change by a converter step began a new rest.
     rest = Rest(rng, duration_s=3600.0, sd=0.0)
     ramp = np.maximum(rest.time - 1800.0, 0.0) / 1800.0
     rest.accel = np.rint(rest.accel / 0.04 + 6.0 * np.outer(ramp, (1.0, -1.3, 0.7))) * step
@@ -401,7 +403,7 @@ def test_steps_of_a_converter_after_a_constant_soak_do_not_divide_a_rest(rng, st
 
 
 def test_a_turn_between_constant_samples_is_not_taken_for_a_step_of_the_converter(rng):
-    # WHY: if samples change only at a turn, this change was taken for the converter's step.
+    # WHY: if samples change only at a turn, the change at the turn counted as a converter step.
     rest = Rest(rng, sd=0.0)
     rest.accel[rest.time > 300.0] = (GRAVITY, 0.0, 0.0)
     bag = reduce_source(rest.source(), full_scale=None)

@@ -57,7 +57,7 @@ class Dense:
         self.determinant = -2.0 * sum(np.log(np.diag(root)).sum() for root in self.roots)
 
     def state(self, x):
-        """Return the state at the mode of `Regression` plus the parameter changes x."""
+        """Return the state whose parameters differ by x from the mode of `Regression`."""
         layout, at = self.at.layout, self.at.state
         padded = np.append(x, 0.0)
         pose, pose_of = at.pose, at.pose_of
@@ -78,7 +78,7 @@ class Dense:
         )  # fmt: skip
 
     def residual(self, x):
-        """Return residual / sd of all windows, then of all parameters from their prior."""
+        """Return residual / sd of all windows, then (parameter - prior mean) / prior sd."""
         w, prior, state = self.windows, self.prior, self.state(x)
         rms = np.sqrt(np.mean(w.columns**2, axis=0))
         moved = w.columns.copy()
@@ -104,7 +104,7 @@ class Dense:
             state.tilt.ravel() / prior.tilt_sd,
             state.turn_on.ravel() / prior.turn_on_sd,
             state.start.ravel() / np.sqrt(prior.start_variance_ratio),
-            # The mean of the initial lag states over all bags has 0.1 of the prior sd of one bag.
+            # The initial lag states averaged over all bags have 0.1 of the prior sd of one bag.
             state.start.mean(axis=0) / (0.1 * np.sqrt(prior.start_variance_ratio)),
         ]
         if len(state.pose):
@@ -151,7 +151,7 @@ def solved(request):
     windows = replace(windows, weight=weight, bag=bag, pose=pose)
     regression, state = begin(windows, up)
     # The derivatives of the regression omit products of parameter changes. In one or two poses
-    # bias, scale and misalignment are undetermined; narrow priors keep the products small.
+    # bias, scale and misalignment are undetermined; narrow priors keep their changes small.
     narrow = {'scale_sd': 1e-5, 'misalignment_sd': 1e-5, 'bias_sd': np.full(3, 1e-4)}
     narrow['column_sd'] = column_sd(('curve', 'board'), 1e-2, 1e-5)
     narrow = narrow if pose_of else {}
@@ -183,13 +183,13 @@ def test_covariance_and_evidence_agree_with_dense_linear_algebra(solved):
         at, jacobian = dense.residual(np.zeros(dense.n)), dense.jacobian(np.zeros(dense.n))
         hessian, sd, n = jacobian.T @ jacobian, np.sqrt(mode.variance), mode.layout.n_unit
         covariance = np.linalg.inv(hessian * np.outer(sd, sd))[:n, :n]
-        # Parameters with correlations of 0.999 lose three of the eight digits of the derivatives.
+        # Of the derivatives' eight digits, correlations of 0.999 in the Hessian lose three.
         np.testing.assert_allclose(
             mode.covariance / np.outer(sd[:n], sd[:n]), covariance, atol=1e-4
         )
         assert np.diag(covariance) == pytest.approx(1.0, rel=1e-4)
-        # Laplace: -2 ln Z = misfit + ln det(noise), ln det(prior), ln det(Hessian). Directions of
-        # the attitudes have no prior.
+        # Laplace: -2 ln Z = misfit + ln det(noise) + ln det(prior) + ln det(Hessian). Directions
+        # of the attitudes have no prior.
         precision = regression.precision(wide, mode.layout)
         known = np.log(precision[precision > 0.0]).sum()
         determinants = dense.determinant + np.linalg.slogdet(hessian)[1] - known
@@ -205,7 +205,7 @@ def test_the_regression_of_windows_without_noise_gives_the_true_parameters(rng):
     regression, state = begin(windows, up)
     prior = replace(prior_of(truth), sigma=np.full(3, MICRO))
     mode = mode_of(regression, state, prior).state
-    # The priors shift the result by 1e-6 of its sd (about 1 ug).
+    # The priors shift a fitted parameter by 1e-6 of its sd (about 1 ug).
     np.testing.assert_allclose(mode.kappa, truth.kappa, atol=1e-9)
     np.testing.assert_allclose(mode.bias, truth.bias, atol=1e-8)
     np.testing.assert_allclose(mode.misalignment, truth.misalignment, atol=1e-8)
@@ -250,8 +250,8 @@ def refit_of(whole, regression, prior, kept):
 
 
 #: The left-out score is computed by linear steps from the fit to all rows. With the groups LINEAR
-#: the model is linear in all parameters but directions, and the score is exact. With PRODUCTS the
-#: score neglects the product of the changes of an initial lag state and of its weight.
+#: the model is linear in all parameters but attitudes, and the score is exact. With the
+#: groups PRODUCTS it neglects (change of an initial lag state) * (change of this lag's weight).
 LINEAR, PRODUCTS = ('curve',), ('curve', 'board')
 
 
@@ -320,7 +320,7 @@ def test_a_position_that_alone_determines_a_parameter_has_no_left_out_norm(rng):
     score = score_of(regression, mode)
     assert np.isnan(score.force).all()
     assert np.isnan(score.norms.square).all()
-    # The drift of a left-out position does not depend on bias and scale, so its score is finite.
+    # The drift of |f| in a left-out position is predicted without bias and scale: it has a score.
     # M keeps its prior mean and sd.
     assert np.isfinite(score.positions.square).all()
     np.testing.assert_allclose(mode.state.misalignment, 0.0, atol=1e-6)
@@ -355,8 +355,8 @@ def test_excluded_columns_get_zero_weight(solved):
 
 def test_published_huygens_coefficients_come_back(rng):
     # Huygens HASI accelerometer: sf = 1.30675e-3 - 1.35046e-7 T + 4.02821e-10 T^2 [A/g] and offset
-    # = -8.9642327e-4 + 3.83652e-6 T - 7.61e-9 T^2 [g], T in kelvin. The test computes counts of 1
-    # nA from these curves over a chamber program, fits them, and converts the result back.
+    # = -8.9642327e-4 + 3.83652e-6 T - 7.61e-9 T^2 [g], T in kelvin. The test computes the
+    # current over a chamber program in counts of 1 nA, fits it, and converts the result back.
     sf, offset = (1.30675e-3, -1.35046e-7, 4.02821e-10), (-8.9642327e-4, 3.83652e-6, -7.61e-9)
     counts_per_ampere = 1e9
     windows, up = table_of(Truth(misalignment=np.zeros(3)), 12, rng)
@@ -399,8 +399,8 @@ def test_published_huygens_coefficients_come_back(rng):
 
 @pytest.mark.parametrize('noise', [Noise(), Noise(0.5, 1500.0)])
 def test_scores_of_inactive_columns_agree_with_a_fit_in_which_they_are_active(noise):
-    # In a linear problem S is the inverse covariance of the weights that inactive columns would
-    # have in a fit with these columns, and S^-1 Q is the estimate of these weights.
+    # In a linear problem a fit with the inactive columns would give their weights the covariance
+    # S^-1 and the values S^-1 Q (S: sparsity factor, Q: quality factor).
     truth, asked = Truth(noise=noise), np.isin(GROUPS, ('board', 'idle'))
     windows, up = table_of(truth, 12, np.random.default_rng(4), n_windows=30)
     regression, state = begin(without_starts(windows), up)
@@ -431,8 +431,8 @@ def test_scores_of_inactive_columns_agree_with_a_fit_in_which_they_are_active(no
 
 
 def test_inactive_and_active_columns_share_initial_lag_states(solved):
-    # WHY: the prior of the sum of the initial lag states was left out. If the bias has the lag of
-    # an inactive column of the scale, the information S on this column was 50 times too large.
+    # WHY: the sparsity factor lacked the prior of the sum of initial lag states: for an inactive
+    # column of the scale whose lag also changes the bias it was 50 times too large.
     regression, prior, mode = solved
     of_scale = np.isin(GROUPS, ('board',)) * [[0.0], [1.0]]
     without = replace(prior, column_sd=np.where(of_scale > 0.0, 0.0, prior.column_sd))

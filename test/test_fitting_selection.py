@@ -38,7 +38,7 @@ IDLE = np.array(GROUPS) == 'idle'
 
 
 def constants(truth):
-    """Return an initial prior without columns, whose noise parameters are not the true ones."""
+    """Return an initial prior with wrong noise parameters and a weight sd of 0 for all columns."""
     return prior_of(
         truth, (), offset_sd=MICRO, offset_scale=30.0 * MICRO, sigma=np.full(3, 5.0 * MICRO),
         noise=Noise(), misalignment_sd=1e-3,
@@ -94,7 +94,7 @@ def test_each_tried_model_has_a_left_out_error(calm):
     assert rms[()] > 2.0 * rms['curve',] > 10.0 * rms['curve', 'board']
     (chosen,) = (trial for trial in selected.trials if trial.is_chosen)
     assert chosen.score is selected.score
-    # By errors of the fit the left-out error is above the white noise, by 15 % at most.
+    # Errors of the fit make the left-out error larger than white noise, by 15 % at most.
     assert 1.0 < selected.score.rms / truth.sigma[0] < 1.15
     assert all(is_better(trial.score, selected.score) for trial in selected.trials[:2])
 
@@ -137,9 +137,9 @@ def test_estimated_noise_parameters_agree_with_the_truth(noisy):
     _, chosen, truth = noisy
     prior = chosen.posterior.prior
     assert {'curve', 'board'} <= chosen_groups(chosen)
-    # 1080 windows per axis determine the sd of white noise to 2 %, with slow noise less well.
+    # 1080 windows per axis determine the sd of white noise to 2 %, or less well beside slow noise.
     np.testing.assert_allclose(prior.sigma, truth.sigma, rtol=0.15)
-    # A position lasts six correlation times of the noise, and the curves fit part of the noise.
+    # Slow noise is known to a factor of 2, as a position lasts only six correlation times.
     assert 0.5 < prior.noise.ratio / truth.noise.ratio < 2.0
     assert 0.5 < prior.noise.time_s / truth.noise.time_s < 2.0
     # 54 means less 45 unknowns (directions, scale, bias, M) determine the mounting sd to 24 %.
@@ -150,8 +150,8 @@ def test_estimated_noise_parameters_agree_with_the_truth(noisy):
 def test_flicker_noise_has_several_correlation_times():
     # WHY: with a single correlation time, initial lag states and tilts fitted the slower part of
     # flicker noise, and the errors of the biases were 1.9 claimed sd RMS.
-    # WHY: flicker noise whose shortest correlation time is below 3 windows was taken for noise of
-    # one correlation time, because its variance was not yet estimated at the comparison.
+    # WHY: flicker noise with a shortest correlation time below 3 windows was taken for noise of
+    # one correlation time: both models were compared before the noise variance was estimated.
     errors = []
     for seed, time_s in ((0, 400.0), (5, 400.0), (6, 400.0), (6, 180.0)):
         truth = Truth(noise=Noise(4.0, time_s, 3))
@@ -178,8 +178,8 @@ def test_rounding_removes_no_correlation_time_from_the_search():
 
 
 def test_the_estimated_prior_sd_of_a_column_is_the_rms_of_its_true_weights(calm):
-    # sd^2 = sum of squared weights / effective parameters (3 per column). A hyperprior with an sd
-    # of ln 10 moves ln sd towards its centre by 1 / (2 x 3 x 5.3) of the distance.
+    # Prior variance of a column: sum of its squared weights / 3 effective parameters. A hyperprior
+    # of variance (ln 10)^2 = 5.3 moves ln sd 1 / (2 x 3 x 5.3) of the way to its centre.
     regression, chosen, truth = calm
     true = np.sqrt(np.mean((truth.on_bias * regression.rms) ** 2, axis=0))
     np.testing.assert_allclose(chosen.posterior.prior.column_sd[0, :4], true[:4], rtol=0.25)
@@ -213,7 +213,7 @@ def test_errors_of_fitted_parameters_in_claimed_sd_have_an_rms_near_1(noisy):
 
 
 def test_the_bayes_factor_of_a_group_is_the_loss_of_evidence_if_the_group_is_removed():
-    # In linear problems the Savage-Dickey ratio is the loss of evidence; directions are nonlinear.
+    # The Savage-Dickey ratio equals the loss of evidence if attitudes act linearly.
     truth = Truth()
     windows, up = table_of(truth, 12, np.random.default_rng(8))
     regression, state = begin(without_starts(windows), up)
@@ -287,7 +287,7 @@ def test_outliers_do_not_shift_the_fit(calm):
     dirty.mean[struck] += 1000.0 * rng.normal(0.0, 200.0 * MICRO, (len(struck), 3))
     _, other = selected_of(truth, dirty, calm[1].posterior.state.up)
     sd = np.sqrt(calm_fit.posterior.variance[calm_fit.posterior.layout.bias])
-    # 2 % of the windows have errors of 100 sd; down-weighting reduces their effect to 3 sd each.
+    # 2 % of the windows have errors of 100 sd, but affect the fit only like errors of 3 sd.
     assert np.abs((other.posterior.state.bias - calm_fit.posterior.state.bias) / sd).max() < 1.0
     np.testing.assert_allclose(other.posterior.prior.sigma, truth.sigma, rtol=0.2)
     used, used_with_outliers = (
@@ -341,8 +341,8 @@ def test_the_variance_of_initial_lag_states_is_estimated(start_sd, lower, upper)
 
 @pytest.mark.parametrize('offset', [0.0, 30.0])
 def test_the_evidence_selects_the_sd_of_an_informative_prior(calm, offset):
-    # The unit differs from the prior's mean by 0 or by 30 sd; candidates are the prior, and the
-    # prior with 100 times the sd.
+    # The unit differs from the mean of the prior by 0 or by 30 sd; the fit chooses between the sd
+    # of the prior and 100 times this sd.
     _, selected, truth = calm
     state = selected.posterior.state
     regression, _ = begin(calm[0].windows, state.up)
@@ -378,7 +378,7 @@ def test_thermal_tilts_of_supports_are_separated_from_the_drift_of_the_unit():
     chosen, left = drift_left(windows)
     # 12 positions with 2 angles and 2 columns each determine the sd of tilts to 10 %.
     assert 0.7 < chosen.posterior.prior.tilt_sd / truth.tilt_sd < 1.3
-    # A tilt of 5 urad changes a level axis by 5 ug; 720 windows give weights to 0.1 ug.
+    # A tilt of 5 urad changes a level axis' force by 5 ug; 720 windows show a drift of 0.1 ug.
     assert left < 0.5 * MICRO
     assert drift_left(stiff)[1] > 1.0 * MICRO
 
@@ -416,7 +416,7 @@ def test_the_sd_of_gravity_adds_a_common_error_to_all_scale_factors():
 
 
 def test_the_drift_of_scale_factors_determines_the_sd_of_turn_on_offsets():
-    # WHY: nine constants fit the norms of nine positions exactly, so the estimated offset sd was
+    # WHY: nine constants fit |f| of nine positions exactly, so the estimated offset sd was
     # 5 ug instead of 300 ug, and the constants were wrong by 75 claimed sd.
     truth = Truth(
         offset_sd=300.0 * MICRO,
@@ -428,8 +428,8 @@ def test_the_drift_of_scale_factors_determines_the_sd_of_turn_on_offsets():
     candidates = candidates_of(windows, ('curve', 'board'))
     candidates = replace(candidates, typical=candidates.typical * ~IDLE)
     posterior = select(regression, state, constants(truth), candidates).posterior
-    # Changes of |f| with the scale factors determine the 27 offsets, except for 9 combinations
-    # that equal changes of constants. 18 offsets determine their sd to 1 / sqrt(2 * 18), 17 %.
+    # Of the 27 offsets (9 turn-ons, 3 axes) 18 combinations are determined; 9 act like changes of
+    # the nine constants. The sd of 18 numbers is uncertain by 1 / sqrt(2 * 18), 17 %.
     assert posterior.prior.offset_sd == pytest.approx(300.0 * MICRO, rel=0.5)
     for errors in truth.errors(regression, posterior).values():
         # The RMS of three standard normal errors exceeds 2 with a probability of 0.7 %.

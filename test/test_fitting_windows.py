@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Window columns equal those of the compensator, and a calibration file equals the fit."""
+"""Columns of a fit's windows equal the compensator's; a calibration file equals the fit."""
 
 from dataclasses import replace
 from importlib import import_module
@@ -136,7 +136,7 @@ def test_columns_of_the_fit_equal_those_of_the_tracker(bags):
     phi = table.values(np.array(states).T).T
     seconds = (grid - bag.start_ns) * 1e-9
     n_sets = rows.shape[1] - phi.shape[1]
-    # The expected columns are means of the columns of the tracker over windows of 60 s.
+    # The expected columns are 60 s means of the columns computed from the tracker's states.
     mean = np.array([phi[np.abs(seconds - t) <= 30.0].mean(axis=0) for t in time])
     scale = np.sqrt(np.mean(phi**2, axis=0)) + 1e-9
     late = time > 300.0
@@ -155,8 +155,8 @@ def test_columns_of_sets_and_of_initial_lag_states_agree_with_formulas(bags):
     np.testing.assert_allclose(data.columns[:, 1], t * t, atol=0.3)
     np.testing.assert_allclose(data.columns[:, 3], w, atol=1e-9)
     assert data.in_scale[:6].tolist() == [True, True, True, False, True, True]
-    # An initial state of a lag decays with the time constant of the lag; the column of a product
-    # with t decays as t times the same function.
+    # The effect of an initial lag state decays as exp(-time / tau) in the column of the lag, and
+    # as t * exp(-time / tau) in the column of the product of lag and t.
     taus = [lag.tau_s for lag in memory_of(bank()).lags]
     for k, column in enumerate(bank(), start=6):
         lag = data.lag[k]
@@ -196,7 +196,7 @@ def test_windows_with_a_silent_or_stuck_thermometer_are_left_out(bags, name, is_
 
 
 def test_the_derivative_of_a_column_by_its_lag_agrees_with_differences():
-    # The expected derivatives are differences of columns with lags shifted by a microkelvin.
+    # Derivatives must equal differences of the columns for lags shifted by +-1 uK.
     columns = bank(span_k=(-4.0, 12.0))
     spec = memory_of(columns)
     layout, table = StateLayout(spec), ColumnTable(columns, spec, 20.0)
@@ -235,7 +235,7 @@ def test_curve_columns_of_a_fit_are_powers_of_temperature(
     weight = np.linspace(0.0, 1.0, 9)
     columns = sets.columns(t, weight)
     assert len(columns) == len(sets.groups) == sets.static.n_free + 1 + sets.dynamic.n_free
-    # At the reference temperature all columns are 0 except the level of the dynamic set.
+    # At the reference temperature only the column for the dynamic set's level is not 0.
     nothing = sets.columns(np.zeros(3), np.array([0.0, 0.5, 1.0]))
     for k, column in enumerate(nothing):
         expected = [0.0, 0.5, 1.0] if k == sets.level else 0.0
@@ -329,7 +329,7 @@ def test_sections_and_kelvins_of_columns_agree_with_formulas(bags):
         assert (np.diff(section) >= 0).all()
         assert np.ptp(np.bincount(section, minlength=N_SECTIONS)) <= 2
     rms = np.sqrt(np.mean(data.columns**2, axis=0))
-    # `kelvins`: RMS of a column / its largest slope over t, which is 1 for t, 2 max |t| for t^2.
+    # `kelvins`: RMS of a column divided by its largest slope over t: 1 for t, 2 max |t| for t^2.
     lines = [0, *(k for k, column in enumerate(bank(), start=6) if column.group == 'board')]
     np.testing.assert_allclose(data.kelvins[lines], rms[lines], rtol=1e-6)
     assert data.kelvins[1] == pytest.approx(rms[1] / (2.0 * np.abs(t).max()), rel=0.02)

@@ -29,8 +29,8 @@ from thermo_comp.recording.topics import Topics
 from thermo_comp.simulation.presets import unit_preset
 from thermo_comp.unit.calibration_file import load_calibration
 
-distributed = pytest.importorskip('distributed', reason='distributed is not installed: `fleet`')
-pytest.importorskip('pyarrow', reason='pyarrow is not installed: the extra `fleet`')
+distributed = pytest.importorskip('distributed', reason='distributed is not installed (`fleet`)')
+pytest.importorskip('pyarrow', reason='pyarrow of the extra `fleet` is not installed')
 
 
 @pytest.fixture(scope='module')
@@ -348,7 +348,7 @@ def test_the_prior_of_siblings_reduces_the_scale_error_of_a_unit_with_one_bag(sc
         ('no better than raw', 0, False),
         ('thermometers exchanged or loose: not judged', 1, False),
         ('thermometers exchanged or loose: not judged', 0, False),
-        # 'refused': for contradictory data `is_whole` is None, for missing data it is 0.
+        # Of refused units `is_whole` is None if data are contradictory, 0 if data are missing.
         ('refused', None, False),
         ('refused', 0, True),
         ('failed', None, False),

@@ -30,7 +30,7 @@ from thermo_comp.fleet.work import process_unit
 from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.calibration_file import parse_calibration
 
-fsspec = pytest.importorskip('fsspec', reason='fsspec is not installed: the extra `fleet`')
+fsspec = pytest.importorskip('fsspec', reason='fsspec of the extra `fleet` is not installed')
 
 
 @pytest.fixture(scope='module')
@@ -327,7 +327,7 @@ class TestRow:
         assert [row[f'scale_slope_sd_{axis}_ppm_k'] for axis in 'xyz'] == [None] * 3
 
     def test_the_lag_of_a_board_that_changes_before_the_case_is_negative(self, tmp_path):
-        # WHY: a calibration without a measured board lag contains 900 s, which is not measured.
+        # WHY: a calibration without a measured board lag contains the default, 900 s.
         write_unit(tmp_path / 'u', 1, 4, is_exchanged=True)
         allowed = replace(OPTIONS.fit, allow=('swapped',))
         outcome = processed(tmp_path, fit=allowed)

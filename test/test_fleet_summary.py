@@ -14,13 +14,13 @@ from thermo_comp.fleet.run import Results, render_fleet
 from thermo_comp.fleet.summary import QUANTITIES, outlier_limit, summarise
 from thermo_comp.fleet.table import COLUMNS, read_parquet, row_of, write_tables
 
-pa = pytest.importorskip('pyarrow', reason='pyarrow is not installed: the extra `fleet`')
+pa = pytest.importorskip('pyarrow', reason='pyarrow of the extra `fleet` is not installed')
 
 MONDAY = datetime(2026, 1, 5)
 
 
 def fleet_of(n, rng, *, lots=('',), day=0.0, like=()):
-    """Draw values of n units, log-normal if compared by logarithm, or add noise to `like`."""
+    """Draw values of n units (log-normal if logarithms are compared) or add noise to `like`."""
     rows = []
     for i in range(n):
         cells = {}
@@ -100,8 +100,8 @@ def spread_of(name, rows):
 
 class TestUndetermined:
     """
-    A value that a unit's data do not determine is that of the prior, with a large sd. WHY: M of
-    -3950 urad, with an sd of 9100 urad, was listed as an outlier of -32 sd.
+    A value that a unit's data do not determine keeps the prior's value and large sd. WHY: a
+    misalignment of -3950 +- 9100 urad was listed as an outlier of -32 sd of the fleet.
     """
 
     @staticmethod
@@ -184,7 +184,7 @@ class TestDrift:
         drifts = summarise(later, before).drifts
         names = sorted(drift.earlier for drift in drifts)
         assert names == [f'earlier /u00{i}@0' for i in range(3)]
-        # A table of the same calibrations gives no drift.
+        # If the earlier fleet's table has the same calibrations, no drift is computed.
         assert summarise(first, before).drifts == ()
 
 

@@ -157,7 +157,7 @@ def test_the_predicted_sd_agrees_with_hand_numbers():
     unit = slope_and_lag({0: 4e-4, 1: 1e-6, 2: 9e-4, 3: 0.0, 4: 1e-6, 5: 1e-12, 6: 4e-12})
     states = ramp_states(unit, np.array([20.0, 30.0]), 0.0, np.inf)
     bias, scale = sd_of_states(unit, states)
-    # At 30 degC the variance is 4e-4 + 100 * 1e-6 counts^2, plus the residual's (30 um/s^2)^2.
+    # Bias variance at 30 degC: 4e-4 + 100 * 1e-6 counts^2, plus the residual's (30 um/s^2)^2.
     expected = np.sqrt([4e-4, 5e-4]) / 300.0
     assert bias[:, 0] == pytest.approx(np.hypot(expected, 3e-5), rel=1e-6)
     assert bias[:, 1] == pytest.approx([3e-5, 3e-5])
@@ -186,8 +186,8 @@ def test_the_bias_in_a_soak_includes_the_gradient_by_self_heating():
         soak_gradient_k=(-3.0, 0.2),
     )
     bias, bias_sd, scale, scale_sd = in_a_soak(unit)
-    # In a soak the lagged gradient is the gradient. A part midway between board and case is colder
-    # than the board by half of the gradient.
+    # In a soak the lagged gradient equals the gradient. A part midway between board and case is
+    # colder than the board by half of the gradient.
     by_kelvin = np.array([30.0, 60.0, -45.0]) / 300.0
     assert bias == pytest.approx(-3.0 * by_kelvin)
     assert bias_sd == pytest.approx(0.2 * np.abs(by_kelvin))
@@ -214,10 +214,10 @@ def test_ramp_states_equal_those_of_the_memory_of_the_fit(rate):
         if isinstance(quantity, Gradient):
             assert state[place] == pytest.approx(100.0 * rate)
         elif isinstance(quantity, Lag):
-            # The gradient rises within 1 s in the memory, and in a step in `ramp_states`.
+            # In `memory_on_grid` the gradient rises within 1 s, in `ramp_states` it rises at once.
             assert state[place] == pytest.approx(lived[place - first], rel=2e-3), quantity
         elif isinstance(quantity, Play) and not quantity.tau_s:
-            # Skip plays of lags: a lag takes half an hour to change by the half-width of a play.
+            # Plays of lags are not tested: a lag takes half an hour to change by a half-width.
             assert state[place] == pytest.approx(-quantity.width_k * np.sign(rate))
             assert state[place] == pytest.approx(lived[place - first])
 

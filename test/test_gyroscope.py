@@ -69,7 +69,7 @@ def unit():
 def fitted(unit):
     """Fit a MEMS unit in nine positions; its gyroscope's drift is the sum of several effects."""
     records = arrays(unit, plan('chamber-9', 2), 2, rate_hz=RATE_HZ)
-    # These groups of columns are half of the model, which halves the time of the fit.
+    # A fit with five groups of columns, half of the model, takes half the time.
     options = replace(OPTIONS, groups=('curve', 'gradient', 'board', 'gradient_lag', 'product'))
     return fit([source_of(record, unit.scale_factor) for record in records], options)
 
@@ -98,7 +98,7 @@ def test_the_corrected_rate_of_a_mems_gyroscope_has_only_noise(unit, fitted, hel
     assert rms(raw - raw.mean(axis=0)) > 100.0 * FLOOR
     assert rms(changes) < 1.15 * FLOOR
     assert (np.sqrt(np.mean(changes**2, axis=0)) < 1.3 * FLOOR).all()
-    # Expected variance: the claimed one without sample noise, plus (Earth's rate)^2 / 3 per axis.
+    # Expected: claimed variance without sample noise, plus (Earth's rate)^2 / 3 per axis.
     message = gyroscope.noise_density_rad_s_sqrt_hz[0] ** 2 / calibration.unit.cycle_time_s
     claimed = np.sqrt(out.angular_rate_variance.mean(axis=0) - message + EARTH_RATE**2 / 3.0)
     assert (np.abs(means.mean(axis=0)) < 3.0 * claimed).all()
@@ -172,7 +172,7 @@ def test_a_gyroscope_is_read_back_from_a_file_bit_for_bit():
     np.testing.assert_array_equal(scale, 1.0)
     sd_bias, sd_scale = sd_of_states(triad, states[1:2])
     np.testing.assert_array_equal(sd_scale, 0.0)
-    # At 20 degC the bias is its level; its variance is the sum of those of level and turn-on.
+    # At 20 degC the bias is its level; its variance is that of the level plus that of a turn-on.
     np.testing.assert_allclose(bias[1], (0.02 + 1e-5, -0.03, 0.01 + 1e-5))
     np.testing.assert_allclose(
         sd_bias[0], np.hypot((1e-5, 2e-5, 1e-5), np.sqrt(1.01e-10)), rtol=1e-5

@@ -43,8 +43,8 @@ def test_levelling_makes_the_force_vertical(rng):
 
 
 def test_the_sd_of_the_filter_equals_the_closed_form_for_white_noise(rng):
-    # The variance of the position is the sum of that by the levelling error and that by the noise
-    # in flight, whose impulse response is sin(w t) / w.
+    # The position variance has a part by the levelling error and a part by the noise in flight;
+    # the impulse response of the position is sin(w t) / w.
     density, dt = 1e-4, 0.5
     force = G * UP + rng.normal(0.0, density / np.sqrt(dt), (40_000, 3))
     free = fly(Model(force, density, 0.0), dt, UP, G, 0.0)
@@ -53,7 +53,7 @@ def test_the_sd_of_the_filter_equals_the_closed_form_for_white_noise(rng):
     by_noise = density**2 * (T / 2.0 - np.sin(2.0 * omega * T) / (4.0 * omega)) / omega**2
     expected = np.sqrt(2.0 * (by_levelling + by_noise))
     assert free.sigma[-1, 0] == pytest.approx(expected, rel=0.01)
-    # The 298 flights overlap, so their RMS is as uncertain as that of about eight flights.
+    # The 298 flights overlap: the RMS of their errors is as uncertain as that of eight flights.
     assert 0.5 < np.sqrt(np.mean(free.position[-1] ** 2)) / expected < 1.5
 
 
@@ -66,5 +66,5 @@ def test_zupt_removes_a_bias_that_appears_after_levelling():
     free = fly(Model(force, 1e-4, 1e-3), dt, UP, G, 0.0)
     assert free.position[-1, 0] > 1000.0
     coasted = message.position[-1, 0] - message.position[2999, 0]
-    # In five minutes without updates the whole bias would cause a position error of 45 m.
+    # In five minutes without updates the uncorrected bias would cause a position error of 45 m.
     assert abs(coasted) < 4.5

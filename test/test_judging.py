@@ -117,7 +117,7 @@ class TestWindows:
         models = [('right', corrected_by(SLOPE)), ('half', corrected_by(SLOPE / 2))]
         judgements = evaluate([bag], models).judgements
         drift = SLOPE * 10.0 / K
-        # The temperature estimate has an error of 1e-7 K, which causes an error of 1e-9 m/s^2.
+        # The estimated board temperature has an error of 1e-7 K: an error of |f| of 1e-9 m/s^2.
         for name, expected in (('right', 0.0), ('half', drift / 2)):
             windows = judgements[name].windows
             np.testing.assert_allclose(windows.raw_residual, drift, atol=1e-9)
@@ -143,7 +143,7 @@ class TestWindows:
     @pytest.mark.parametrize('rate_hz', [0.5, 1.0, 3.0, 4.0, 50.0])
     @pytest.mark.parametrize('window_s', [60.0, 120.0])
     def test_windows_at_rest_have_the_stated_length(self, tmp_path, rate_hz, window_s):
-        # WHY: at 4 Hz windows consisted of cells of 32 samples, 8 s, so those of 10 s became 16 s.
+        # WHY: at 4 Hz windows consisted of cells of 32 samples (8 s): 10 s windows lasted 16 s.
         bag = resting(tmp_path / 'bag', 20.0, minutes=20.5, rate_hz=rate_hz, noise=0.3)
         windows = judged(bag, calibration(), window_s=window_s).windows
         assert windows.window_s == window_s
@@ -181,7 +181,7 @@ class TestWindows:
         assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.0, abs=0.14)
 
     def test_the_limit_of_noise_at_rest_follows_from_the_calibration(self, tmp_path):
-        # WHY: for a unit with a noise of 100 mg no window counted as rest: the limit was 50 mg.
+        # WHY: for a unit with a noise of 100 mg no window counted as rest (limit: 50 mg).
         bag = resting(tmp_path / 'bag', 20.0, noise=0.1 * K * GRAVITY)
         density = 0.1 * GRAVITY * np.sqrt(0.1)
         unit = dataclasses.replace(calibration().unit, cycle_time_s=0.1)
@@ -231,7 +231,7 @@ class TestVerdict:
             (121.0, 1000.0, 60.0, 'recalibrate'),
             (1100.0, 9000.0, 1500.0, 'valid, but it only claims 1.5 mg'),
             (50.0, 100.0, 60.0, 'valid, but it only claims 60 ug'),
-            # If the residual is not below the raw one, even a large claimed sd gives no 'valid'.
+            # A residual not below the raw residual is never 'valid', for any claimed sd.
             (1100.0, 1000.0, 1500.0, 'no better than raw'),
             (1000.0, 1000.0, 1500.0, 'no better than raw'),
         ],
@@ -260,7 +260,7 @@ class TestVerdict:
         assert 'limit 100 ug' in judgement.reason
 
     def test_the_verdict_on_bags_of_the_fit_states_the_left_out_error_first(self):
-        # WHY: the verdict stated the error in fitted attitudes, 61 ug; in new ones it is 1091 ug.
+        # WHY: the verdict stated the error in fitted, not in new attitudes: 61 ug, not 1091 ug.
         fitted = ResidualSummary('all', 40, 1e-3, 5e-4, 1e-3, left_out_rms_m_s2=300.0 * MICRO_G)
         unit = dataclasses.replace(CLAIMING, provenance=Provenance(residuals=(fitted,)))
         windows = made(50.0, 1000.0, 60.0)
@@ -288,7 +288,7 @@ class TestVerdict:
             assert judgement.left_out_rms == pytest.approx(expected, nan_ok=True)
 
     def test_a_calibration_without_covariance_gets_the_verdict_no_claim(self):
-        # WHY: without a covariance the claimed sd is that of noise alone: it gave 'recalibrate'.
+        # WHY: without a covariance only noise is claimed, so the verdict was 'recalibrate'.
         imported = corrected_by(SLOPE)
         windows = made(50.0, 1000.0, 2.0)
         judgement = judge(windows, imported)

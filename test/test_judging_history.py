@@ -37,7 +37,7 @@ def dated(created, bias_ug=0.0, ppm=0.0, sd_ug=3.0):
 
 
 def test_changes_between_calibrations_and_their_sd_equal_those_found_by_hand():
-    # The later calibration is given first; dates give the order. Sd of z: sqrt(3^2 + 4^2) = 5 ug.
+    # Dates give the order of calibrations. The change of z bias has the sd hypot(3, 4) = 5 ug.
     drifts = drifts_of(history_of([dated('2026-02-01', 20.0, 50.0, 4.0), dated('2026-01-01')]))
     assert [drift.constant for drift in drifts] == [
         *('bias x', 'bias y', 'bias z', 'scale x', 'scale y', 'scale z')

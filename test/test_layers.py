@@ -126,7 +126,7 @@ def test_no_package_imports_from_a_higher_layer(path):
 
 @cache
 def own_file(name):
-    """Return the file of thermo_comp that contains an imported absolute name, as a dotted name."""
+    """Return the dotted name of the thermo_comp file that contains an imported absolute name."""
     parts = name.split('.')[1:]
     while parts:
         path = PACKAGE.joinpath(*parts)

@@ -93,7 +93,7 @@ def test_foxglove_paths_name_numbers_in_the_messages(topics):
         else:
             assert field_kind(topics[topic], fields) in ('float64', 'bool')
         used.add(topic)
-    # The layout shows `regime/dynamic`, so it need not show the same flags of `regime/stamped`.
+    # `regime/stamped` repeats the flags of `regime/dynamic`, which the Foxglove layout shows.
     assert used == {output, *topics} - {'/regime/stamped'}
 
 

@@ -17,7 +17,7 @@ TAUS = (60.0, 900.0, 7680.0)
 
 @pytest.mark.parametrize('step_s', [0.5, 5.0, 77.0])
 def test_the_lag_of_a_ramp_agrees_with_the_closed_formula(step_s):
-    # For a ramp u = r t from rest, u - lagged u = r tau (1 - exp(-t / tau)), at any interval.
+    # For a ramp u = r t after a soak, u - lagged u = r tau (1 - exp(-t / tau)), for any step.
     rate, n = 0.01, 200
     bank = LagBank(TAUS)
     for k in range(n + 1):
@@ -60,7 +60,7 @@ TWO_STAGES = Lag('board', 900.0, 150.0)
 
 
 def after_two_stages(times, board):
-    """Integrate two lags in series, from rest, with the board as input; return the output."""
+    """Integrate two lags in series after a soak, with the board as input; return the output."""
 
     def slope(t, parts):
         u = np.interp(t, times, board)
@@ -114,7 +114,7 @@ def test_the_lag_of_a_part_coupled_to_board_and_case_agrees_with_a_solver(rng):
     np.testing.assert_allclose(board - streamed[:, 0], part, atol=1e-5)
     on_grid = memory_on_grid(spec, 30.0, board, [case - board])
     np.testing.assert_allclose(on_grid[:, [0, 2, 4]], streamed[:, [0, 2, 4]], atol=1e-9)
-    # The case's lag contributes to the part's lag with a negative sign.
+    # In a part's lag the lagged gradient has a negative sign: the states' covariance is below 0.
     P = start_covariance(spec.lags)
     assert P[0, 1] < 0.0 < P[0, 0] + 2.0 * P[0, 1] + P[1, 1]
     # The age of a lag with two inputs counts from the first value of the later input.
@@ -144,7 +144,7 @@ def test_the_lag_of_a_part_agrees_with_a_solver_if_the_thermometer_lags(rng, sec
     reading, _, part = solve_ivp(slope, (0.0, fine[-1]), [board[0]] * 3, t_eval=fine, rtol=1e-9,
                                  atol=1e-9, max_step=1.0).y  # fmt: skip
     behind = memory_on_grid(MemorySpec(lags=(lag,)), 1.0, reading, [reading])[:, 0]
-    # The memory interpolates the readings linearly between their stamps.
+    # `memory_on_grid` interpolates the readings linearly between their stamps.
     np.testing.assert_allclose(reading - behind, part, atol=1e-3)
     memory = ThermalMemory(MemorySpec(lags=(lag,)))
     for time, celsius in zip(fine, reading, strict=True):
@@ -166,7 +166,7 @@ def test_the_prior_of_the_initial_state_of_two_stages_is_that_of_a_random_walk(r
         parts[:, 0] *= math.exp(-step / tau[0])
         parts[:, 1] += (parts[:, 0] - parts[:, 1]) * -math.expm1(-step / tau[1])
     P = start_covariance([TWO_STAGES])
-    # The variance of n draws is uncertain by sqrt(2 / n) = 2.2 %; the step is 4 % of tau, 150 s.
+    # The variance of n draws is uncertain by sqrt(2 / n) = 2.2 %; a step is 4 % of tau = 150 s.
     assert np.mean(parts[:, 1] ** 2) == pytest.approx(P[0, 0], rel=0.11)
     for age in (150.0, 900.0, 2700.0):
         first = parts[:, 0] * math.exp(-age / tau[0])
@@ -181,8 +181,8 @@ def test_a_jump_gives_a_lag_of_two_stages_the_errors_of_both_stages():
     memory = ThermalMemory(MemorySpec(lags=(TWO_STAGES,)))
     memory.board_step(0, 0.0)
     memory.note_jump(2.0)
-    # The lag is a difference of two first-order lags: (900 * lag_900 - 150 * lag_150) / 750. Their
-    # errors may have opposite signs: 1.4 = (900 + 150) / (900 - 150).
+    # The lag is a difference of two first-order lags: (900 * lag_900 - 150 * lag_150) / 750.
+    # Errors of +2 K in lag_900 and -2 K in lag_150 add up to 2 K * (900 + 150) / 750 = 2 K * 1.4.
     assert memory.at(0, 0.0, [0.0])[1] == pytest.approx((2.0 * 1.4) ** 2)
 
 
@@ -231,7 +231,7 @@ def test_the_prior_of_initial_lag_states_is_their_covariance_after_a_random_walk
         e = np.exp(-step / tau)
         m = m * e + walk * (tau / step) * (1.0 - e)
     P = start_covariance([('board', t) for t in tau])
-    # The variance of n draws is uncertain by sqrt(2 / n) = 2.2 %; the step is 10 % of tau, 60 s.
+    # The variance of n draws is uncertain by sqrt(2 / n) = 2.2 %; a step is 10 % of tau = 60 s.
     np.testing.assert_allclose(m.T @ m / n, P, rtol=0.11)
 
 

@@ -115,13 +115,13 @@ def wakes_per_sample(peer, drivers, node_arguments):
 
 
 def test_samples_do_not_wake_the_event_thread(peer, node_arguments, tmp_path, monkeypatch):
-    # With a profile without the node's settings, each sample or group of samples wakes the thread.
+    # With another Fast DDS profile each sample, or group of them, wakes the node's event thread.
     other = tmp_path / 'other.xml'
     other.write_text(OTHER)
     monkeypatch.setenv(VARIABLE, str(other))
     drivers = []
     by_default = wakes_per_sample(peer, drivers, node_arguments)
-    # With the node's profile the thread is woken 50 times per second at 700 samples per second.
+    # With the node's profile 700 samples per second wake its event thread 50 times per second.
     monkeypatch.delenv(VARIABLE)
     assert wakes_per_sample(peer, drivers, node_arguments) < 0.5 * by_default
 

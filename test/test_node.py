@@ -120,7 +120,7 @@ def test_the_regime_flag_is_latched_and_not_published_while_unknown(peer, saved)
         assert not flags
         n = 0
         while not flags and n < 4000:
-            # Send two minutes of data at a time until the detector has recognised the soak.
+            # Send samples and readings of 2 min at a time until the soak is recognised.
             for _ in range(120):
                 n += 1
                 driver.temperatures(START_NS + n * SECOND_NS, 20.0, 20.0)
@@ -272,7 +272,7 @@ def test_a_node_with_constants_needs_no_thermometer(peer, saved):
         for k in range(20):
             driver.counts(START_NS + k * CYCLE_NS, *standing(k))
         _, status, values = wait(lambda _, values: values['samples out'] == '20')
-        # The report may arrive before the last samples, which are on a different topic.
+        # The diagnostics may arrive before the last samples, which have a different topic.
         peer.wait_for(lambda: len(heard) == 20)
     # The samples are sent without pauses, so the report may warn of a wrong sample rate.
     assert 'not corrected for temperature' in status.message or 'samples/s' in status.message
@@ -315,7 +315,7 @@ def test_the_node_uses_the_namespace_and_remapped_topics(peer, saved):
         assert '/accel/counts' not in topics
         names = {name for name, _ in node.node.get_service_names_and_types()}
         assert '/imu0/thermo_comp/set_parameters' in names
-        # One group in the aggregator's configuration has entries of all nodes, such as /imu0's.
+        # A group of the diagnostic aggregator has the diagnostics of all nodes, also of /imu0.
         _, status, _ = diagnosis(peer)(lambda *_: True)
         assert status.name == '/imu0/thermo_comp: compensation'
         config = ROOT / 'config' / 'diagnostic_aggregator.yaml'

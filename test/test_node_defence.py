@@ -127,7 +127,7 @@ def test_parameter_requests_of_any_length_are_answered(peer, unit, kind, field):
 
 
 def test_a_callback_that_fails_is_logged_counted_and_survived(peer, unit):
-    # An unexpected exception in a service, a timer or the relay must not end the node.
+    # An unexpected exception in a service, a timer or a subscription must not end the node.
     with node_in_thread(*node_arguments(unit)) as node:
         samples = Samples(peer, node)
 

@@ -213,7 +213,7 @@ def test_a_change_that_fails_at_any_line_is_not_applied(tmp_path):
                 sample = START_NS + k * CYCLE_NS, *standing(k)
                 assert running.compensator.process(*sample) == undisturbed.process(*sample)
                 k += 1
-        # Setting the parameters executes over 150 lines; each of them has raised an exception.
+        # Setting the parameters executes over 150 lines; an exception was raised at each line.
         assert number > 150
         assert {name: node.node.get_parameter(name).value for name in values} == {
             change.name: change.value for change in changes

@@ -71,7 +71,7 @@ def test_samples_of_a_second_publisher_are_never_published(peer, unit):
         assert all(stamp_of(imu) % CYCLE_NS == 0 for imu in samples.heard)
 
 
-#: A driver process: it sends at 100 Hz once it has a subscriber, with its name as frame_id.
+#: A driver process: once it has a subscriber it sends samples at 100 Hz; frame_id: its name.
 DRIVER = """
 import sys, time, rclpy
 from geometry_msgs.msg import Vector3Stamped

@@ -31,7 +31,7 @@ def term(kind, x, y, z, slope=0.0):
 
 
 def test_a_nonlinear_term_that_depends_on_temperature_needs_a_thermometer():
-    # WHY: if bias and scale were constant, terms with a slope needed no board temperature.
+    # WHY: if only a nonlinear term had a slope, the calibration needed no board temperature.
     for slope in (0.0, 1e-7):
         square = NonlinearTerm('square', (1e-5,) * 3, (0.0, 0.0, slope), 1e-4)
         value = calibration(nonlinearity=Nonlinearity((0.0, 20.0), 1e-5, (square,)))
@@ -103,7 +103,7 @@ def test_a_nonlinearity_without_terms_does_not_change_a_bit(rng):
 
 
 def test_the_variance_of_a_nonlinear_axis_includes_all_parameters(rng):
-    # The term |f| f is left out: its claimed variance is larger than the exact variance.
+    # The claimed variance of a term |f| f exceeds the exact one, so the unit has no such term.
     unit = calibration(nonlinearity=replace(BENT, terms=(SQUARE, CUBE)))
     unit = with_covariance(unit, rng)
     layout, correction = parameter_layout(unit), Correction(unit)
@@ -166,5 +166,5 @@ def test_rests_in_the_field_depend_on_every_nonlinear_coefficient():
             unit, scale, values + step * (np.arange(len(values)) == k), covariance
         )
         slope = (series.residual - series_of(logged, moved).residual) / step
-        # The derivatives neglect the slope of nonlinear terms, a relative error of 2 * K2 * 1 g.
+        # The derivatives neglect d(K2 f^2)/df, which gives them a relative error of 2 * K2 * 1 g.
         assert np.allclose(slope, series.by_parameter[:, k], atol=1e-3 * abs(slope).max() + 1e-7)

@@ -105,8 +105,8 @@ def test_the_offset_of_a_prior_is_used(rng, plain):
 
 
 def test_drifts_and_rotations_in_one_pose_are_not_taken_for_an_offset(rng):
-    # WHY: the readings of four bags in one pose fit a sphere by chance, whose centre was taken for
-    # the offset of the words: the corrected drift had an error of 143 mg.
+    # WHY: the readings of four bags in one pose fit a sphere by chance; its centre was taken for
+    # the zero of unsigned integers, and the corrected drift had an error of 143 mg.
     for up in (np.eye(3)[2], np.array([-0.06, -0.25, -0.97])):
         for n in (4, 6, 8):
             for _ in range(100):

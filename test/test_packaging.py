@@ -121,7 +121,7 @@ def test_the_installed_share_folder_contains_the_files_that_ros_needs(tmp_path):
 
 
 SOURCES = [str(ROOT / name) for name in ('thermo_comp', 'test', 'setup.py')]
-#: Rules not checked, as in setup.cfg: a summary is on the second line and may have two lines.
+#: Ignored docstring rules, as in setup.cfg: a summary may begin on line 2 and have two lines.
 STYLE = ['D200', 'D205', 'D400', 'D403']
 
 

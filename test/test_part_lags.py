@@ -48,7 +48,7 @@ SOAKS = tuple(program(celsius, 25.0) for celsius in (8.0, 19.0, 34.0))
 
 
 def study_of(*name, up=9, corners=HALF, held=HELD, grade=navigation, **given):
-    """Simulate bags of a unit: for a fit, in directions `up` (or their number), and held-out."""
+    """Return a unit and its bags: for a fit, in directions `up` (or their number); held-out."""
     rng = rng_of(*name)
     unit = grade(rng, **given)
     is_mems = grade is not navigation
@@ -102,7 +102,7 @@ def judged(calibration, study):
 
 def test_the_fitted_lag_of_each_axis_is_that_of_its_part(parts):
     unit, study, calibration, _ = parts
-    # A part of 10 ug/K lags a ramp by 10 K, so an error of 1 % of its time constant is 1 ug.
+    # In a ramp a lag of 10 K changes the bias by 100 ug, an error of the lag of 1 % by 1 ug.
     assert np.array(taus_of(calibration)) == pytest.approx(unit.part_s[:, None], rel=0.01)
     # The noise of |f| in a mean over 60 s is 0.65 ug.
     assert judged(calibration, study).norm < 2.0
@@ -136,11 +136,11 @@ def test_lags_of_the_thermometers_themselves_are_fitted(sensors):
     parts = {term.part for term in calibration.response if term.kind == 'board'}
     taus, _, shares, leads = np.array(sorted(parts)).T
     if 'case' in sensors:
-        # A lag of both thermometers acts like equal shares of (case - board) in all parts' inputs.
+        # If both thermometers lag equally, the case has an equal share in the inputs of all parts.
         assert shares == pytest.approx([np.mean(shares)] * 3, abs=0.02)
     else:
         assert taus == pytest.approx(unit.part_s, rel=0.02)
-        # `leads / taus` is the lag of the thermometer (60 s) / lag of the part.
+        # Expected `leads / taus`: lag of the thermometer (60 s) / lag of the part.
         assert leads / taus == pytest.approx(60.0 / unit.part_s, abs=0.01)
 
 
@@ -152,7 +152,7 @@ def test_with_a_coarse_or_noisy_thermometer_the_fit_is_as_good_as_a_cubic_by_sci
     bags = [minutes(bag) for bag in study.tests['']]
     correct = strangers.scipy_baselines(study)['cubic']
     by_cubic = strangers.error_of([correct(bag) for bag in bags], bags, is_drift=False)
-    # For a single unit the ratio of fit error to cubic's error scatters by some 20 %.
+    # The ratio (error of the fit) / (error of the cubic) of a unit scatters by some 20 %.
     assert ours.vector < 1.2 * by_cubic.vector
     assert ours.ratio < 1.5
 
@@ -229,19 +229,19 @@ def test_the_lags_of_parts_are_found_beside_an_effect_of_the_gradient():
 
 @pytest.mark.slow
 def test_a_bump_of_the_bias_over_temperature_is_fitted_by_knees():
-    # The bump lasts for two means over 60 s, and must not be taken for motion.
+    # The bump of the bias lasts for 2 min, and must not be taken for motion.
     _, study = study_of('bump', bump=np.array([450.0, -400.0, 500.0]), bump_c=17.0)
-    # A fit of all groups of columns chooses these three, too, but takes three times as long.
+    # The three stated groups of columns make the fit three times as fast as a choice of groups.
     calibration = strangers.fitted(study, groups=('curve', 'part', 'bend'))
     judgement = judged(calibration, study)
-    # The bump is a bell with an sd of 0.85 K; the fit has straight lines of 0.5 K.
+    # The bump is a bell curve (sd 0.85 K) of the bias, fitted by straight lines of 0.5 K each.
     assert judgement.norm < 60.0
     assert judgement.norm_ratio < 1.5
 
 
 @pytest.mark.slow
 def test_two_lags_in_series_are_fitted_as_two_stages():
-    # Heads lag the board and pendulums lag the heads; T_board - T_pendulum changes the bias.
+    # Sensor heads lag the board, pendulums lag the heads; T_board - T_pendulum changes the bias.
     unit = second_simulator.unit_of('products', 2)
     # Two equal time constants are fitted as two time constants with a ratio of 0.89.
     unit.pendulum_s[0] = unit.head_s[0]
@@ -283,8 +283,8 @@ def test_norms_of_soaks_determine_the_curve_over_temperature(grade):
 
 @pytest.mark.slow
 def test_six_faces_in_three_soaks_determine_the_curve_at_other_temperatures():
-    # WHY: the fit to norms of six faces had misalignments of 0.3 rad (true: 0): the force error
-    # was 40 mg for drifts of 10 mg, and the fit divided by zero if `mounting_sd` was stated.
+    # WHY: a fit to |f| on six faces found misalignments of 0.3 rad (true: 0): the force error
+    # was 40 mg, the unit's drift 10 mg. With a stated `mounting_sd` the fit divided by zero.
     _, study = study_of(
         'faces in soaks', 1, up=FACES.repeat(3, axis=0), corners=SOAKS, held=program(19.0, 90.0),
         grade=lambda rng: replace(consumer_grade(rng), misalignment=np.zeros(3)),
@@ -297,8 +297,8 @@ def test_six_faces_in_three_soaks_determine_the_curve_at_other_temperatures():
 
 @pytest.mark.slow
 def test_the_claimed_sd_between_two_soaks_includes_the_undetermined_curve():
-    # WHY: two soaks do not determine the powers of temperature. The covariance lacked these
-    # powers, and the claimed sd was 1/8 of the error.
+    # WHY: soaks at two temperatures do not determine a curve over temperature. The covariance
+    # lacked the uncertainty of the curve's shape: the claimed sd was 1/8 of the error.
     given = {'held': program(19.0, 90.0), 'grade': consumer_grade}
     _, study = study_of('two soaks', up=18, corners=SOAKS[::2], **given)
     assert judged(strangers.fitted(study), study).ratio < 2.0
@@ -339,7 +339,7 @@ def test_a_bias_decay_after_power_on_is_not_fitted_by_a_lag():
         for way, n in ((WARM, 12), (WARM_HELD, 4))
     )
     study = Study('', fit, one_test(held), {'full_scale': 32767.0})
-    # The decay has an RMS of 0.32 mg over a bag. Its mean, which the constants absorb, is smaller.
+    # The bias decay has an RMS of 0.32 mg over a bag, and a smaller mean, which constants absorb.
     assert judged(strangers.fitted(study), study).vector < np.sqrt(2.0) * 320.0
 
 
@@ -351,7 +351,7 @@ def lags_of(calibration):
 def test_lags_of_a_unit_with_a_hidden_node_are_those_of_the_bank():
     # The bias of each axis depends on its part and on a hidden node without a thermometer.
     study = next(third_node(0))
-    # A fit of all groups of columns chooses these six, too, but takes 1.5 times as long.
+    # The six stated groups of columns make the fit 1.5 times as fast as a choice of groups.
     groups = ('curve', 'part', 'board', 'gradient_lag', 'product', 'square')
     calibration = strangers.fitted(replace(study, bags=study.bags[:8]), groups=groups)
     assert lags_of(calibration) <= {*FINE_TAUS}

@@ -35,7 +35,7 @@ def tracker_of(sensor='continuous', memory=None, board_lag_s=900.0, **config):
 
 
 def soak(tracker, celsius=20.0, seconds=60, start_s=0):
-    """Push readings of both sensors each second, alternating by some mK; return the end time."""
+    """Give both thermometers a reading per second, alternating by some mK; return the end [s]."""
     for second in range(start_s, start_s + seconds):
         flicker = 0.004 * (-1) ** second
         tracker.read('board', second * SECOND_NS, celsius + flicker)
@@ -44,7 +44,7 @@ def soak(tracker, celsius=20.0, seconds=60, start_s=0):
 
 
 def test_the_first_reading_of_a_sensor_may_be_wrong():
-    """A DS18B20 reads 85 degC before its first conversion; most of ten later readings are used."""
+    """A DS18B20 reads 85 degC before its first conversion; six of ten later ones must be used."""
     tracker = tracker_of()
     tracker.read('board', 0, 85.0)
     tracker.read('board', SECOND_NS, 85.0)
@@ -151,7 +151,7 @@ def test_readings_that_may_repeat_by_chance_are_no_fault():
 
 @cache
 def in_its_chamber(preset, sensor):
-    """Simulate a unit; return its readings as (stamp, whether of the case, degC)."""
+    """Simulate a unit; return its readings: (stamp [ns], 0 for board or 1 for case, degC)."""
     settings = SENSORS[sensor]
     unit = unit_preset(preset, 1).with_thermometers(
         noise_sd=settings.noise_sd_c, quantum=settings.quantum_c, rate_hz=0.5
@@ -198,7 +198,7 @@ def test_swapped_topics_are_reported(preset, sensor):
 
 
 def test_the_warm_up_after_power_on_is_not_taken_for_swapped_topics():
-    # WHY: in the warm-up after power-on the board leads the case, which was taken for exchanged
+    # WHY: a board that leads the case, as in the warm-up after power-on, was taken for exchanged
     # topics; the claimed sd was 20 times too large. WHAT: the board warms up by 4 K, the case by
     # 1.3 K; in the ramp after the warm-up the case leads.
     tracker = tracker_of(memory=LAG)
@@ -230,7 +230,7 @@ def test_one_topic_given_for_both_thermometers_is_named_and_claimed(order):
     # In a ramp of 1 K/min the case of a unit with a board lag of 900 s is 15 K above the board.
     assert abs(state[GRADIENT]) < 0.1
     assert state[VAR_GRADIENT] ** 0.5 == pytest.approx(15.0, rel=0.2)
-    # Case readings that differ from the board's end the fault.
+    # A case reading that differs from the board reading ends the fault.
     tracker.read('board', 300 * SECOND_NS, 25.0)
     tracker.read('case', 300 * SECOND_NS, 25.1)
     assert not tracker.copies['case'].is_copy

@@ -150,11 +150,11 @@ def test_six_faces_determine_attitudes_at_the_corners_of_a_cube_least(rng):
     result = fitted(rng, FACES)
     least = result.least_known
     assert least_known(replace(result.calibration, posterior=None), FACES) is None
-    # Near a corner of the cube the variance changes little: the result may lie beside the corner.
+    # Near a corner of the cube the variance changes little: the direction found may lie beside it.
     np.testing.assert_allclose(np.abs(least.up), 3.0**-0.5, atol=0.05)
     assert least.away_deg == pytest.approx(np.degrees(np.arccos(3.0**-0.5)), abs=4.0)
-    # Each of three misalignment angles (prior sd of a MEMS: 0.01 rad) changes |f| by g times the
-    # product of two components of the direction of gravity, each of them 1 / sqrt(3) at a corner.
+    # Three misalignment angles (prior sd of a MEMS: 0.01 rad each) change |f|, each by g times the
+    # product of two components of gravity's direction: 1 / 3 at a corner of the cube.
     assert least.sd_m_s2 == pytest.approx(GRAVITY * 1e-2 / 3.0**0.5, rel=0.2)
 
 

@@ -28,7 +28,7 @@ from thermo_comp.unit.prediction import in_a_soak
 
 PROGRAM = parse_cyclogram('20 5min, 33@1 15min, 8@1 15min')
 KIND = triad('products', 1)
-#: The groups that the simulated unit needs are a third of all columns, and halve the fit's time.
+#: Groups of columns that the unit needs: a third of all columns, half of the fit's time.
 OPTIONS = FitOptions(STANDARD_GRAVITY, groups=('curve', 'board', 'product'))
 
 
@@ -88,9 +88,9 @@ def test_a_population_has_the_mean_of_its_units_and_their_scatter():
     variance = np.diag(prior.posterior.covariance())
     at = parameter_layout(prior).bias[0].static + 1
     sd = np.sqrt(variance[at]) / prior.axes.x.scale_factor
-    # Predicted variance of a fourth unit: 4/3 of the scatter of three units, mean over the axes,
-    # times 6 / (6 - 2) for Student's distribution with 6 degrees of freedom, plus the variance
-    # claimed by the calibrations of the three units.
+    # Expected variance of a fourth unit: 4/3 of the variance of three units (mean over the axes)
+    # times 6 / (6 - 2), for Student's distribution with 6 degrees of freedom, plus the claimed
+    # variance of the three units.
     own = []
     for unit in siblings():
         variance = np.diag(unit.posterior.covariance())
@@ -119,7 +119,7 @@ def test_chance_correlations_between_parameters_of_twelve_units_are_reduced(rng)
     n = layout.n_parameters
 
     def share_left(units, k):
-        """Return the variance of parameter k given all others, divided by its variance."""
+        """Return the share of the variance of parameter k that all others do not explain."""
         deviations = (units - units.mean(axis=0)) / np.sqrt(len(units) - 1.0)
         scatter = _scatter(deviations, layout, np.ones(3))
         return 1.0 / (np.linalg.inv(scatter)[k, k] * scatter[k, k])
@@ -132,7 +132,7 @@ def test_chance_correlations_between_parameters_of_twelve_units_are_reduced(rng)
     pair = np.corrcoef(independent[:, [layout.bias[0].static, level]].T)[0, 1]
     assert share_left(independent, level) == pytest.approx(1.0 - pair**2)
     assert share_left(independent, bias) > 0.5
-    # A correlation that all twelve units show is kept.
+    # The prior keeps a correlation that all twelve units show.
     common = rng.standard_normal((12, 1)) + 0.01 * independent
     assert share_left(common, bias) < 0.1
 
@@ -148,7 +148,7 @@ def test_equal_curves_of_both_sets_stay_equal_in_a_population():
         for static, dynamic in zip(*curves, strict=True):
             contrast = np.zeros(layout.n_parameters)
             contrast[[static, dynamic]] = 1.0, -1.0
-            # The posterior has single precision, so unused coefficients have a variance of 1e-24.
+            # 1e-24: variance of unused coefficients, by rounding to single precision.
             limit = 1e-5 * covariance[static, static] + 1e-24
             assert float(contrast @ covariance @ contrast) <= limit
 
@@ -175,8 +175,8 @@ def helped():
 @pytest.mark.slow
 def test_a_fit_begins_with_the_widest_of_its_priors():
     # WHY: a fit that began with the narrow prior of three units found mounting offsets of 190 ug,
-    # a local minimum: |f| - g of a held-out bag was 271 ug, not 0.9 ug. WHAT: a fit begins with
-    # the prior that has the largest variance in all directions.
+    # a local minimum: |f| - g of a held-out bag was 271 ug, not 0.9 ug. WHAT: of all priors it
+    # tries, a fit begins with that of largest variance in all directions.
     *tried, widest = (prior.root.T @ prior.root for prior in helped())
     assert len(tried) > 2
     root = np.sqrt(np.diag(widest))
@@ -222,8 +222,8 @@ def test_rests_at_one_temperature_correct_a_bias_change_and_keep_the_response():
         for calibration, changed in ((old, lambda record: record), (old, aged), (new, aged))
     ]
     assert left[1] > 10.0 * left[0]
-    # In a rest of 10 min a lag of 1 h with an unknown initial state acts like a bias: sd 10 ug if
-    # six norms determine three biases, 20 ug if they also determine three scale factors.
+    # In a rest of 10 min the unknown initial state of a lag of 1 h acts like a bias. Six means
+    # of |f| determine three biases to 10 ug (1 sd), or to 20 ug if also three scale factors.
     sd = float(sd_of_levels(new).max())
     assert sd < 20e-6 * STANDARD_GRAVITY
     assert left[2] < np.hypot(left[0], sd)
@@ -251,7 +251,7 @@ def after(change, ups):
 def test_one_to_three_faces_of_an_unchanged_unit_keep_the_calibration(n_faces):
     # WHY: one unchanged face had increased the claimed sd of bias and scale from 0.2 to 424 ug.
     bias, bias_sd, scale, scale_sd = after(lambda counts, _: counts, np.eye(3)[:n_faces])
-    # The limit, 30 ug, is a tenth of the usual repeatability of turn-ons, 300 ug.
+    # Limit of the claimed sd: 30 ug, a tenth of the usual repeatability of turn-ons, 300 ug.
     assert max(bias_sd.max(), scale_sd.max() * STANDARD_GRAVITY) < 30e-6 * STANDARD_GRAVITY
     assert np.abs(bias).max() < 2.0 * bias_sd.max()
     assert np.abs(scale).max() < 2.0 * scale_sd.max()
@@ -260,7 +260,7 @@ def test_one_to_three_faces_of_an_unchanged_unit_keep_the_calibration(n_faces):
 @pytest.mark.parametrize('kind', ['bias', 'scale'])
 def test_three_faces_halve_the_error_of_a_change_of_bias_or_scale(kind):
     # WHY: an update with three faces took a bias change of 100 ug for mounting offsets.
-    # WHAT: in each face one count, 300 ug, is added by a change of the bias or of the scale.
+    # WHAT: the bias or the scale changes so that each face reads 1 count (300 ug) more or less.
     K = np.array([axis.scale_factor for axis in fitted(9).calibration.axes])
     change = np.array([1.0, -1.0, 1.0]) / (K * STANDARD_GRAVITY)
 
@@ -273,8 +273,8 @@ def test_three_faces_halve_the_error_of_a_change_of_bias_or_scale(kind):
     bias, bias_sd, scale, scale_sd = after(changed, np.eye(3))
     wrong = np.array([bias / STANDARD_GRAVITY, scale])
     wrong[('bias', 'scale').index(kind)] -= change
-    # The rests determine only the sum of the errors of bias and scale, so each gets half of the
-    # change. Noise of 10 min and unknown initial lag states leave an error of some ug.
+    # The rests determine only the sum of bias and scale errors: bias and scale each get half of
+    # the change. The noise of a rest and unknown initial lag states leave an error of some ug.
     assert np.abs(wrong.sum(axis=0)).max() < 10e-6
     assert np.abs(np.abs(wrong) / np.abs(change) - 0.5).max() < 0.1
     assert (np.abs(wrong) < 2.0 * np.array([bias_sd / STANDARD_GRAVITY, scale_sd])).all()
@@ -351,7 +351,7 @@ def test_the_calibration_of_another_unit_is_refused_as_a_prior():
     messages = [finding.message for finding in allowed.findings if finding.name == 'prior']
     assert any('allowed: ' in text for text in messages)
     assert any('bags contradict the prior' in text for text in messages)
-    # A prior has curves for each regime, so the fit has no residual of a single curve.
+    # A fit with a prior has a curve per regime; residuals of a single curve are not computed.
     assert not allowed.residuals[-1].one_set.n
 
 

@@ -76,7 +76,7 @@ def test_a_wrong_value_at_any_key_is_refused_with_the_key(place, value):
 
 EXAMPLE = Path(__file__).parents[1] / 'config' / 'calibration.example.yaml'
 TREES = (TREE, yaml.safe_load(dump_calibration(unit())), yaml.safe_load(EXAMPLE.read_text()))
-#: Index in TREES and path of every value of these calibrations.
+#: Each value of the calibrations in TREES: index of its calibration, and path to the value.
 EDITS = [(k, place) for k, tree in enumerate(TREES) for place in leaves(tree)]
 magnitudes = st.builds(
     lambda sign, digits, power: sign * digits * 10.0**power,
@@ -98,7 +98,7 @@ factors = st.integers(-60, 60).map(lambda power: 2.0**power)
 
 
 class Edited(dict[str, Any]):
-    """A calibration file with changed values; hypothesis prints only the changed values."""
+    """The content of a calibration file, of which hypothesis prints only the changed values."""
 
     edits: tuple[Any, ...] = ()
 
@@ -177,8 +177,8 @@ def whole_range(of):
 
 @settings(deadline=None, max_examples=max(120, settings.default.max_examples))
 @given(edited())
-# First example: variances of the axes differ by 23 powers of ten. Second: two lags differ by
-# rounding.
+# In the first example variances of axes differ by 23 powers of ten, in the second example two lags
+# differ by rounding.
 @example(changed(1, ('axes', 'z', 'scale_factor'), 1.0))
 @example(changed(0, ('response', 3, 'sensor_share'), 1e-12))
 def test_whatever_file_is_accepted_gives_finite_numbers_over_its_whole_range(tree):
@@ -207,7 +207,7 @@ def test_whatever_file_is_accepted_gives_finite_numbers_over_its_whole_range(tre
             assert min(rate[3:]) > 0.0
     counters = compensator.counters
     assert counters.n_unsound == 0
-    # Samples have no output only if they were too fast, or temperatures too old or missing.
+    # Samples have output unless they came too fast, or temperatures were too old or missing.
     assert n_sound or counters.n_too_fast or counters.n_stale or counters.n_no_temperature
     status = compensator.status()
     assert all(map(math.isfinite, status.state))

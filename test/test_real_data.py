@@ -40,7 +40,7 @@ def means_of(result):
 
 def test_the_residual_of_handheld_units_is_the_noise_of_their_samples(unit):
     assert 21 <= len(unit.positions) <= 23
-    # In windows of 1 s the noise is 0.48 to 0.57 mg; the fit has windows of 0.5 s.
+    # Means over 1 s have a noise of 0.48 to 0.57 mg; the fit has means over 0.5 s.
     assert 0.5 < unit.residuals[-1].fitted.rms / MG < 0.9
     assert unit.residuals[-1].left_out.rms < 1.15 * unit.residuals[-1].fitted.rms
 
@@ -70,8 +70,8 @@ def test_six_faces_leave_the_misalignment_at_its_prior(real_data, work):
     result = fit(sources, replace(OPTIONS, input=kind))
     calibration = result.calibration
     assert len(result.positions) == 6
-    # The prior sd of the misalignment of a MEMS is 0.01. Faces are tilted by up to 1 degree, which
-    # determines the misalignment by less than 1 % of this sd.
+    # Six faces, tilted by up to 1 degree, hardly determine misalignments: their sd stays within
+    # 1 % of the prior sd for a MEMS, 0.01 rad.
     np.testing.assert_allclose(calibration.misalignment, np.eye(3), atol=1e-4)
     np.testing.assert_allclose(calibration.misalignment_sd, 1e-2, rtol=0.01)
     # Expected bias: half of the sum of opposite faces; scale factor: half of their difference.
@@ -127,7 +127,7 @@ def test_the_error_of_the_freezer_run_on_held_out_minutes(
         ]
         calibration = fit(seen, OPTIONS).calibration
         for part in held_out:
-            # Some parts have no minute at rest, because the freezer was knocked.
+            # Some held-out parts have no minute at rest, because the freezer was knocked.
             with suppress(RecordingError):
                 judged = evaluate([bag], [('unit', calibration)], topics=Topics(part=part))
                 windows = judged.judgements['unit'].windows
@@ -136,8 +136,8 @@ def test_the_error_of_the_freezer_run_on_held_out_minutes(
     assert len(raw) >= 17 * len(sets) // n_sets
     # One attitude does not determine the constants, so compare the sd of |a|.
     assert np.std(raw) / MG == pytest.approx(drift, abs=0.2)
-    # Means over 60 s have a noise of 0.19 mg. The first of five parts is outside the temperatures
-    # of its fit.
+    # Means over 60 s have a noise of 0.19 mg. The first of five held-out parts is at temperatures
+    # that the fit to the other parts does not contain.
     assert np.sqrt(np.mean(np.square(left))) / MG == pytest.approx(mg, rel=0.35)
 
 

@@ -165,7 +165,7 @@ def test_faults_of_a_recording_are_reported(tmp_path, temperature, options, text
     ],
 )
 def test_samples_after_a_backward_jump_of_the_clock_are_counted(tmp_path, back_s, text):
-    # WHY: if the clock jumps back by 10 min a fit leaves out 10 min of samples, not the 1 stated.
+    # WHY: if the clock jumps back by 10 min, a fit leaves out 3000 samples; the survey stated 1.
     result = survey(tmp_path / 'bag', up_and_down(5.0, 35.0), gap_s=-back_s)
     assert any(text in finding for finding in result.findings)
 

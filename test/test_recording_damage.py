@@ -65,7 +65,7 @@ def every_cut(content, position, length):
 def test_a_bag_cut_in_its_last_chunk_is_read_up_to_the_cut(tmp_path):
     content, position, length = small_bag('none')
     messages = regular_messages(24)
-    # `last`: the position in the file at which each message of the last chunk ends.
+    # `last`: the positions in the file at which the messages of the last chunk end.
     at = position + 9 + 40
     last = []
     while at < position + length:

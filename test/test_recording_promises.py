@@ -83,7 +83,7 @@ def test_missing_messages_are_reported_at_the_end_of_the_first_reading(tmp_path)
     with open_recording(tmp_path / 'bag.mcap') as reader:
         kind = reader.info.topics[ACCEL][0]
         reader.info = replace(reader.info, topics={**reader.info.topics, ACCEL: (kind, 64)})
-        for _ in range(2):  # the second reading of the bag does not repeat the report
+        for _ in range(2):  # a second pass over the bag must not add a second message
             assert sum(map(len, reader.blocks())) == 40
         assert reader.info.truncated == f'{ACCEL}: 40 of 64 listed messages are in the bag'
 
@@ -217,7 +217,7 @@ def listed(messages):
     return list(zip(*(column.tolist() for column in columns), strict=True))
 
 
-#: Contents of messages that look like records.
+#: Contents of messages that look like MCAP records.
 DECEITFUL = [
     b'\x05' * 40, message(1, 5, b'\x05' * 9), (message(1, 7, b'') * 3)[:40],
     struct.pack('<BQ', MESSAGE, 22 + 40) * 4, bytes(40),

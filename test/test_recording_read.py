@@ -182,7 +182,7 @@ def test_blocks_end_where_the_frame_changes_and_together_have_all_messages(tmp_p
     assert [frame for block in blocks for frame in [block.frame_id] * len(block)] == frames
     before, n_accel = 0, 0
     for block in blocks:
-        # `after` is the index in the block of the first sample after a reading.
+        # `after`: for each reading, the index in the block of the first sample after it.
         after = block.temperatures['board'].after
         assert ((after >= 0) & (after <= len(block))).all()
         before += len(after)

@@ -226,7 +226,7 @@ def driver_bag(path, *topics, metadata=None):
         # Free acceleration and angular rate of an Xsens are vectors, and not chosen.
         ([('imu/data', 'imu'), ('filter/free_acceleration', 'vector')], '/imu/data'),
         ([('imu/data', 'imu'), ('imu/angular_velocity', 'vector')], '/imu/data'),
-        # imu/data_raw, the input of a filter, is chosen, its output imu/data is not.
+        # The input of a filter, imu/data_raw, is chosen, not the output of the filter, imu/data.
         ([('imu/data', 'imu'), ('imu/data_raw', 'imu')], '/imu/data_raw'),
         ([('a/imu/data_raw', 'imu'), ('a/accel/counts', 'vector')], '/a/accel/counts'),
         ([('adc/words', 'vector'), ('imu/mag', 'vector')], '/adc/words'),

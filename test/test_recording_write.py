@@ -72,7 +72,7 @@ def test_rosbags_and_mcap_read_the_written_messages(
                 ]
                 for topic, content in (('/regime/dynamic', flags), ('/diagnostics', raw)):
                     group += [(int(log), topic, c) for log, c in zip(log_ns, content, strict=True)]
-                # A flush writes messages in order of log time, then of the calls.
+                # A flush sorts messages by log time; equal log times keep the order of the calls.
                 wanted += sorted(group, key=lambda message: message[0])
         times = sorted(log for log, *_ in wanted)
         with (path if is_file else path / 'bag_0.mcap').open('rb') as stream:

@@ -70,7 +70,7 @@ def test_a_rest_of_one_sample_has_a_report(rng):
 
 
 def test_if_the_second_fit_is_refused_the_first_is_kept(rng, monkeypatch):
-    # WHY: the fit of the pieces may be refused, because each piece contains less data than a rest.
+    # WHY: a fit to pieces of rests may be refused, as a piece contains less data than its rest.
     first_fit = fit_module._fit
 
     def refusing(*args, **given):

@@ -4,8 +4,8 @@
 The regime detector detects ramps early and with few false alarms (benchmarks/regime.py has long
 runs).
 
-All runs are seeded. The limits allow for the scatter of the median of 12 onset delays: 1.4 s for a
-sensor with 1 mK of noise, 4 s for a sensor with steps of 62.5 mK.
+All runs are seeded. Limits of delays allow for the scatter of the median of 12 onset delays: 1 s
+for a sensor with 1 mK of noise, 3 to 10 s for sensors with steps of 62.5 mK.
 """
 
 import math
@@ -46,7 +46,7 @@ def case_and_board(t, corners, lag=LAG_S, start=20.0):
 
 
 def onsets(noise, quantum, rate_k_min, lag, n, *, dt=1.0, end_s=1500.0, soak_s=1500.0):
-    """Run n ramps; return switches after each onset, and the number of runs static at onset."""
+    """Run n ramps; return switches after each onset, and the number of onsets while static."""
     settings = detector_settings(noise, quantum, lag)
     collected, n_static = [], 0
     for seed in range(n):
@@ -78,7 +78,7 @@ def headline():
     [
         ('1 mK', 45.0, 90.0),
         ('10 mK', 150.0, 180.0),
-        # Two steps of 62.5 mK are needed, on average a change by 94 mK, which takes 146 s +- 6 s.
+        # The second step of 62.5 mK is detected, on average at 94 mK, reached after 146 +- 6 s.
         ('1 mK, 62.5 mK steps', 158.0, 180.0),
         ('10 mK, 62.5 mK steps', 150.0, 180.0),
     ],
@@ -94,15 +94,15 @@ def test_the_onset_of_a_ramp_is_detected_early(headline, sensor, median_s, late_
 
 @pytest.mark.parametrize(('sensor', 'threshold'), [('1 mK', 9.65), ('10 mK', 8.87)])
 def test_the_onset_delay_is_below_twice_that_of_a_cusum_test(headline, sensor, threshold):
-    # A CUSUM test that is given ramp, baseline and noise has the shortest delay; docs/regime.md
-    # has its thresholds (log likelihood ratios) for one false alarm in 50 h.
+    # A CUSUM test that knows ramp, baseline and noise has the shortest delay. `threshold`: log
+    # likelihood ratio at which this CUSUM gives one false alarm in 50 h.
     noise = SENSORS[sensor][0]
     rng = np.random.default_rng(4)
     k = np.arange(1.0, 121.0)
     signature = lagged(np.append(0.0, k), [(0.0, 0.5)], LAG_S)[1:]
     delays = []
     for _ in range(40):
-        # This likelihood-ratio test, given the onset, too, is at most 1 s faster than CUSUM.
+        # A likelihood-ratio test that also knows the onset is at most 1 s faster than CUSUM.
         x = signature + rng.normal(0.0, noise, len(k))
         ratio = np.cumsum(signature * x - 0.5 * signature**2) / noise**2
         delays.append(k[np.argmax(ratio > threshold)])
@@ -129,7 +129,7 @@ def test_each_ramp_switches_the_regime_to_dynamic_once(noise, quantum, rate_k_mi
     delays, _ = onsets(noise, quantum, rate_k_min, lag, 2 if dt < 1.0 else 3, dt=dt, end_s=end_s)
     for each in delays:
         assert [regime for _, regime, _ in each] in ([DYNAMIC], [STATIC, DYNAMIC])
-        # The longest delay is that of two steps of 1 K at 0.2 K/min behind a lag of 15 min.
+        # The slowest detection needs two steps of 1 K at 0.2 K/min behind a lag of 15 min.
         assert each[-1][0] < 0.5 * end_s
 
 
@@ -166,9 +166,9 @@ def test_three_soaks_of_5_h_have_at_most_two_false_alarms(sensor):
 
 
 def test_the_rate_of_false_alarms_is_below_that_of_the_setting():
-    # The setting allows 20 alarms per hour, 1000 in 50 h; the signal is noise. The threshold is
-    # set by Rice's formula for crossings, which come in groups, so there are fewer separate
-    # alarms. The lower limit shows that the detector is active.
+    # The setting allows 20 false alarms per hour, 1000 in 50 h; the readings are noise only. The
+    # threshold is set by Rice's formula for crossings; as crossings come in groups, there are
+    # fewer separate alarms. A lower limit of alarms excludes a detector that does nothing.
     settings = ThermometerSettings(0.01, lag_s=LAG_S)
     test = ChangeDetector(settings, 0.2 / 60.0, ripple=0.0, false_alarms=20.0 / 3600.0)
     rng = np.random.default_rng(6)
@@ -190,7 +190,7 @@ def test_the_rate_of_false_alarms_is_below_that_of_the_setting():
 @pytest.mark.parametrize('dt', [0.1, 1.0, 10.0])
 def test_the_threshold_follows_from_the_noise_of_the_filter(dt):
     # Expected threshold: filter gain by the Riccati equation, noise and correlation by the impulse
-    # response, alarms by Rice's formula. `_tune` neglects second-order terms, up to 4 %.
+    # response, alarms by Rice's formula. The first-order formulas of `_tune` differ by up to 4 %.
     test = ChangeDetector(ThermometerSettings(0.01, lag_s=LAG_S), 0.2 / 60.0, 0.0, 0.02 / 3600.0)
     test._tune(dt)
     for threshold, power in zip(test._thresholds, test._powers, strict=True):
@@ -210,7 +210,7 @@ def test_the_threshold_follows_from_the_noise_of_the_filter(dt):
         noise = 1e-4 * np.sum(response**2)
         correlation = np.sum(response[1:] * response[:-1]) / np.sum(response**2)
         per_reading = math.acos(correlation) / (2.0 * math.pi)
-        allowed = 0.02 / 3600.0 / 4.0 * dt  # alarms per reading, filter and sign
+        allowed = 0.02 / 3600.0 / 4.0 * dt  # false alarms per reading, filter and sign
         squared = 2.0 * math.log(per_reading / allowed)
         assert threshold * covariance[1, 1] == pytest.approx(squared * noise, rel=0.04)
 
@@ -223,7 +223,7 @@ def test_the_regime_is_unknown_until_there_are_enough_readings():
 
 
 def run_once(corners, *, noise=0.001, quantum=0.0, lag=LAG_S, begin=-1800.0, end=8000.0, **parts):
-    """Return the switches of a run; `parts`: functions of (t, readings) that change readings."""
+    """Return a run's regime switches; `parts`: functions of (t, readings) changing readings."""
     rng = np.random.default_rng(8)
     t = np.arange(begin, end)
     truths = dict(zip(('case', 'board'), case_and_board(t, corners, lag), strict=True))
@@ -242,7 +242,7 @@ RAMP = [(0.0, 0.5), (3600.0, 0.0)]
 
 
 def test_the_dynamic_regime_ends_when_the_board_rate_is_below_the_relaxed_rate():
-    # The end is when the board's rate has been below 0.05 K/min for the dwell time, 60 s.
+    # The regime ends when the board's rate has been below 0.05 K/min for the dwell time, 60 s.
     changes = run_once(RAMP)
     assert [regime for _, regime, _ in changes] == [STATIC, DYNAMIC, STATIC]
     t = np.arange(3600.0, 12000.0)
@@ -259,7 +259,7 @@ def test_the_relaxed_rate_sets_the_end_of_the_dynamic_regime():
         switches(detector_settings(0.001, relaxed_rate_k_min=rate), t, case, board)[-1][0]
         for rate in (0.025, 0.05, 0.1)
     ]
-    # The longest lag, LAG_S, determines the end: the board's rate halves in LAG_S * ln 2.
+    # If the relaxed rate is halved, the dynamic regime ends later by LAG_S (longest lag) * ln 2.
     assert ends[0] - ends[1] == pytest.approx(LAG_S * math.log(2.0), rel=0.25)
     assert ends[1] - ends[2] == pytest.approx(LAG_S * math.log(2.0), rel=0.25)
 
@@ -287,8 +287,8 @@ def test_the_dynamic_regime_ends_by_the_case_or_the_board(sensor):
     assert [regime for _, regime, _ in early] == [STATIC, DYNAMIC, STATIC]
     assert early[1] == late[1]
     assert late[2][0] - early[2][0] == pytest.approx(earlier, abs=300.0)
-    # The end condition `case` acts like a missing board thermometer; without a case thermometer
-    # both end conditions use the board thermometer.
+    # With the end condition 'case' the regime switches as without a board thermometer. Without a
+    # case thermometer both end conditions of the dynamic regime use the board thermometer.
     assert early == switches(board_too, t, case, None)
     t, board = t[:3000], board[:3000]
     assert switches(case_alone, t, None, board) == switches(board_too, t, None, board)

@@ -107,6 +107,18 @@ def test_replay_of_constants_needs_no_thermometer(tmp_path):
         replay(bag, rich_calibration(), tmp_path / 'other')
 
 
+def test_infinite_board_readings_hide_no_warning_of_the_range(tmp_path):
+    # WHY: they gave a RuntimeWarning of numpy, and the note about the range was missing.
+    bag, stamps = tmp_path / 'bag', START_NS + np.arange(300) * SECOND_NS
+    celsius = np.full(300, 90.0)
+    celsius[100:150], celsius[200:205] = np.inf, -np.inf
+    with BagWriter(bag) as writer:
+        writer.write_counts(TOPICS.counts, stamps, 2000.0 + np.arange(900).reshape(300, 3), 'imu')
+        writer.write_temperature(TOPICS.board, stamps, celsius)
+    result = replay(bag, rich_calibration(), tmp_path / 'out')
+    assert any('board temperature +' in note for note in result.notes)
+
+
 def test_inputs_are_copied_unchanged(tmp_path):
     bag = thermal_test(tmp_path / 'bag', minutes=3.0)
     replay(bag, rich_calibration(), tmp_path / 'out', keep_inputs=True)
@@ -146,7 +158,7 @@ def test_an_imu_is_refused_by_a_calibration_of_counts(tmp_path):
 
 
 def test_memory_does_not_grow_with_the_bag(tmp_path, monkeypatch):
-    # Blocks of 2048 messages give the short bag many blocks; a cycle of 2 ms allows 500 Hz.
+    # With blocks of 2048 messages each bag has many blocks; a unit cycle of 2 ms allows 500 Hz.
     monkeypatch.setattr('thermo_comp.recording.blocks.BLOCK_MESSAGES', 1 << 11)
     calibration = rich_calibration()
     unit = dataclasses.replace(calibration.unit, cycle_time_s=0.002)

@@ -65,7 +65,7 @@ def page_of(evidence, folder, **keys):
 
 
 def bare():
-    """Make the evidence for a page of a calibration without bags."""
+    """Gather the data for a report on a calibration alone, without bags."""
     return evidence_of_bags([], fitted().calibration)
 
 

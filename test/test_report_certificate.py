@@ -158,7 +158,7 @@ def test_the_uncertainty_budget_adds_up_to_the_claimed_sd(tmp_path):
     standards = {source.name: source.standard for source in budget(evidence(), CertificateInfo())}
     assert standards['gravity'] is None
     assert standards['thermometers'] is None
-    # The residual is below the claimed sd, so noise, attitude and model add up to the claimed sd.
+    # As the residual is below the claimed sd, `noise`, `attitude` and `model` add up to this sd.
     windows = evidence().judgement.windows
     claim = float(np.sqrt(np.mean(windows.claimed_sd[windows.is_inside] ** 2)))
     parts = [standards[name] for name in ('noise', 'attitude', 'model')]
@@ -193,7 +193,7 @@ def test_without_a_stated_uncertainty_of_gravity_that_of_scale_factors_is_withhe
     assert 'combined, without gravity' in page
     info = load_certificate_info(lab(tmp_path))
     assert 'withheld' not in render_report(evidence(), info)
-    # An sd of gravity that the fit was given is in the covariance, so nothing is withheld.
+    # If the fit was given an sd of gravity, the covariance contains it, and no U is withheld.
     stated = replace(evidence(), gravity_sd=2e-5)
     assert 'withheld' not in render_report(stated)
     assert {source.name: source.standard for source in budget(stated, info)}['gravity'] == 0.0
@@ -232,7 +232,7 @@ def without_uncertainty(calibration):
 
 @pytest.mark.parametrize('is_known', [True, False])
 def test_values_and_deviations_have_equal_decimals_if_u_is_withheld(is_known, tmp_path):
-    # WHY: the scale was printed as -1777 ppm, its deviation as 23.12 ppm.
+    # WHY: the scale was printed without decimals, -1777 ppm, its deviation with two, 23.12 ppm.
     calibration = fitted().calibration
     if not is_known:
         calibration = without_uncertainty(calibration)
@@ -247,7 +247,7 @@ def test_values_and_deviations_have_equal_decimals_if_u_is_withheld(is_known, tm
                 text, expanded, deviation = cells[k : k + 3]
                 n_withheld += expanded == '–'
                 assert len(text.partition('.')[2]) == len(deviation.partition('.')[2])
-                # With and without the uncertainty the numbers are equal within their rounding.
+                # Values and deviations are equal, but for rounding, whether U is stated or not.
                 for value, place in ((text, k), (deviation, k + 2)):
                     half = 0.5 * 10.0 ** -len(value.partition('.')[2])
                     number, expected = (

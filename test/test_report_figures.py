@@ -67,8 +67,8 @@ def test_measured_errors_in_soaks_are_those_of_the_scale_factors():
 
 
 def test_position_errors_of_a_navigator_agree_with_hand_numbers():
-    # In 60 s a bias of 1 mg causes an error of 9.80665e-3 * 1800 m; without a limit of time a bias
-    # of 1 ug causes an error of at most 1e-6 Earth diameters.
+    # A bias of 1 mg causes a position error of 9.80665e-3 * 1800 m in 60 s; a bias of 1 ug causes
+    # a position error of at most 1e-6 Earth diameters at any time.
     assert position_error(1e3 * MICRO_G, 60.0) == pytest.approx(17.652, rel=1e-4)
     assert schuler_peak(MICRO_G) == pytest.approx(12.742, rel=1e-4)
 
@@ -76,7 +76,7 @@ def test_position_errors_of_a_navigator_agree_with_hand_numbers():
 def test_the_map_of_the_sphere_preserves_areas():
     assert figures.equal_area((0.0, 0.0, 1.0), 1) == (0.0, 0.0)
     assert figures.equal_area((0.0, 1.0, 0.0), -1) == (0.0, 1.0)
-    # The cap above 45 degrees has 1 - sin 45 of the area of a hemisphere, and of the disc.
+    # The cap above 45 degrees is 1 - sin 45 of the hemisphere, its map 1 - sin 45 of the disc.
     x, y = figures.equal_area((np.sqrt(0.5), 0.0, np.sqrt(0.5)), 1)
     assert x**2 + y**2 == pytest.approx(1.0 - np.sqrt(0.5))
 
@@ -168,7 +168,7 @@ def test_the_figure_of_rates_shows_the_bias_of_the_gyroscope():
         celsius, drawn = np.array(soak.get_data(), dtype=float)
         bias = np.degrees(curve.bias_function.value(celsius - 20.0)) * 1e3
         slope = np.polyfit(celsius, bias, 1)[0]
-        # The figure shows the gyroscope's bias less a line in temperature [mdeg/s].
+        # The figure shows the gyroscope's bias minus its linear fit over temperature [mdeg/s].
         np.testing.assert_allclose(drawn, bias - slope * (celsius - 20.0), atol=1e-9)
         assert f'{slope:+.3g}'.replace('-', '\u2212') in axes.get_title(loc='left')
     names = [figure.name for figure in figures_of(replace(evidence(), calibration=unit))]

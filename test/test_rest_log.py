@@ -103,8 +103,8 @@ def test_logged_windows_are_means_over_10_s_at_rest():
 
 @pytest.mark.parametrize('rate', [1.0, 2.0, 3.3, 5.0, 50.0, 2000.0])
 def test_rests_are_found_at_any_rate_of_samples(rate, rng):
-    # Rests of one minute in two attitudes, with jitter of the stamps. Up to `RATE_HZ` the noise of
-    # a sample is the same at all rates, above `RATE_HZ` the noise density is.
+    # Rests of one minute in two attitudes, with jitter of the stamps. Samples at rates up to
+    # `RATE_HZ` have equal noise, at higher rates an equal noise density.
     n = round(120 * rate)
     cycles = np.arange(n) + 0.1 * rng.uniform(-1.0, 1.0, n)
     stamps = START_NS + np.rint(cycles * SECOND_NS / rate).astype(np.int64)
@@ -147,7 +147,7 @@ def test_motion_and_bad_samples_are_not_logged_as_rests(fault):
 
 
 def test_a_long_rest_is_logged_with_increasing_intervals():
-    # A rest is logged by 60 windows in its first 10 min, one per min up to 1 h, then one in 5 min.
+    # A rest is logged by 60 windows in its first 10 min, 1 per min up to 1 h, then 1 per 5 min.
     kept, searching = 0, finder()
     samples = standing(6 * 60)
     for minute in range(71):
@@ -241,7 +241,7 @@ def test_a_killed_node_damages_at_most_one_line_of_its_rest_log(tmp_path, unit, 
     sent = 0
 
     def until(condition, what):
-        """Send samples of 1 s until a condition holds; those before DDS discovery are lost."""
+        """Send samples of 1 s until a condition holds; samples before DDS discovery are lost."""
         nonlocal sent
         pause = threading.Event()
         for _ in range(len(samples) // RATE_HZ):

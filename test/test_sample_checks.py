@@ -72,7 +72,7 @@ def test_few_equal_samples_are_accepted_at_any_sample_rate(rng):
 )
 @settings(max_examples=300, deadline=None)
 def test_constant_samples_are_found_in_batches_of_any_size(parts, cuts, period):
-    # In each part an axis is constant or changes with each sample; some samples of y are NaN.
+    # In each part of the series an axis is constant or changes with each sample; y has some NaN.
     stands = np.repeat([which >> np.arange(3) & 1 for _, which in parts], [n for n, _ in parts], 0)
     sizes = 1.0 + np.arange(len(stands)) % 4
     samples = 1.0 + np.cumsum((1.0 - stands.reshape(-1, 3)) * sizes[:, np.newaxis], axis=0)
@@ -155,7 +155,7 @@ def test_a_constant_axis_at_rest_is_stuck_if_its_noise_would_show(dead, rng):
         return tuple(counts)
 
     stream(compensator, recording(1000, 100.0, sample))
-    # An axis counts as stuck after the time-out of 2 s, or later, once the others show noise.
+    # An axis counts as stuck after the time-out, 2 s, or later, once the other axes show noise.
     assert 201 <= compensator.counters.n_out <= 260
     assert compensator.counters.n_stuck == 1000 - compensator.counters.n_out
 
@@ -177,7 +177,7 @@ def test_no_sample_of_a_working_sensor_is_stuck_whatever_its_bandwidth(correlati
 
 @pytest.mark.parametrize('step', [1.0, 2.0, 5.0])
 def test_a_sensor_that_is_quieter_than_its_calibration_is_not_stuck(step, rng):
-    # Noise was calibrated in a vibrating chamber; at rest it is far below the converter's step.
+    # The calibrated noise is of a vibrating chamber; at rest noise is far below a converter step.
     compensator = Compensator(noisy_unit(3.0))
     edge = np.array([0.5, 0.0, 0.5])
     centre = step * (np.round(K * GRAVITY * np.array(UP) / step) + edge)
@@ -278,7 +278,7 @@ def test_a_jump_back_in_time_does_not_restore_a_refuted_calibration(rng, is_mend
     stream(compensator, events(0.0 if is_mended else 100.0))
     assert compensator.counters.n_time_jumps == 1
     if is_mended:
-        # The first window of 5 s has no predecessor to compare with; the next two restore output.
+        # Output returns after three 5 s windows: the first has none before it to compare with.
         assert compensator.counters.n_out - n_out == pytest.approx(4500, abs=200)
     else:
         assert compensator.counters.n_out == n_out
@@ -305,7 +305,7 @@ def watch(rng, *, bias=0.0, seconds=60, motion=0.0, rate_hz=100, monitor=None):
 
 def test_the_residual_of_a_good_calibration_is_near_0_and_its_sd_is_right(rng):
     result = watch(rng)
-    # The limit is 5 sd of the mean of 1500 samples; a window has 99 samples.
+    # The residual averages more than 1500 samples; limit: 5 sd of a mean of 1500 samples.
     assert abs(result.residual) < 5 * NOISE_SD / math.sqrt(100 * 15)
     assert result.residual_sd == pytest.approx(math.hypot(BIAS_SD, NOISE_SD / math.sqrt(99)))
     assert result.n_windows == 59  # the first of 60 windows has no predecessor to compare with
@@ -347,8 +347,8 @@ def steps(rng, *, offset, at_s=20.0, ramp_s=0.0, rate_hz=2.5, scatter=0.0):
 @pytest.mark.parametrize('rate_hz', [2.5, 5.0, 10.0])
 @pytest.mark.parametrize('offset', [0.3, -3.0, 15.0])
 def test_a_step_at_rest_refutes_the_calibration_within_a_second(rng, rate_hz, offset):
-    # WHY: the refusal came after five seconds, and its printed mean included samples before the
-    # change.
+    # WHY: a calibration was refused only 5 s after the step, and the printed mean of |f| included
+    # samples before the step.
     after_s, result = steps(rng, offset=offset, rate_hz=rate_hz)
     assert after_s < 1.0
     assert result.residual == pytest.approx(offset, abs=5 * NOISE_SD)
@@ -358,6 +358,20 @@ def test_a_change_by_motion_does_not_refute_the_calibration_at_once(rng):
     # |f| changes by 1 m/s^2 within 0.8 s, as in a lift, and with added noise, as in a shaking car.
     assert steps(rng, offset=1.0, ramp_s=0.8, rate_hz=5.0)[0] > 2.0
     assert steps(rng, offset=1.0, scatter=0.05, rate_hz=5.0)[0] > 2.0
+
+
+def test_a_vibration_of_whole_periods_between_readings_is_no_rest(rng):
+    # WHY: the check uses few samples, at the stamps of the readings, 1 s apart. All of them had
+    # the same phase of a vibration of 20 Hz, and looked like a rest with a wrong |f|.
+    sway = np.sin(2.0 * np.pi * 0.2 * np.arange(5) + 1.0)
+
+    def shaken(k):
+        return at_rest(rng, K * 5.0 * sway[k % 5] if k > 1000 else 0.0)
+
+    compensator = Compensator(calibration())
+    stream(compensator, recording(3000, 100.0, shaken))
+    assert compensator.counters.n_refuted == 0
+    assert compensator.counters.n_out == 3000
 
 
 def test_the_message_states_the_deviation_of_the_latest_windows(rng):

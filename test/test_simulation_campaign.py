@@ -57,7 +57,7 @@ def test_the_true_thermal_model_leaves_only_noise(kind):
         # determine the RMS to a factor of two.
         assert 4.0 < vector < 20.0
     else:
-        # The RMS of 1311 means is uncertain by 2 % (norm) and 1.2 % (vector); limits: 5 sd.
+        # The RMS of 1311 means is uncertain by 2 % (|f|) and 1.2 % (vector); limits: 5 sd.
         assert np.sqrt(np.mean(np.concatenate(norms) ** 2)) == pytest.approx(0.65, abs=0.065)
         assert vector == pytest.approx(1.12, abs=0.07)
 
@@ -90,10 +90,10 @@ def test_a_slipping_joint_has_a_closed_hysteresis_loop():
         quick, _ = effect.change(_history(there_and_back))
         slow, _ = effect.change(_history(np.repeat(there_and_back, 7), 60.0))
         np.testing.assert_array_equal(slow[::7], quick)
-        # The stress is at most 1 K of free strain, so at 2 ug/K the bias is +-2 ug.
+        # The joint slips at the stress of 1 K of free strain, so at 2 ug/K the bias is +-2 ug.
         assert quick[199, 0] == pytest.approx(2.0, rel=0.01)
         assert quick[-1, 0] == pytest.approx(-2.0, rel=0.02)
-        # A second cycle ends with the bias of the first cycle, so the loop is closed.
+        # A second cycle ends with the bias of the first cycle: the hysteresis loop is closed.
         twice, _ = effect.change(_history(np.concatenate([there_and_back] * 2)))
         assert twice[-1, 0] == pytest.approx(quick[-1, 0], rel=0.02)
 
@@ -116,7 +116,7 @@ def test_a_saturated_effect_of_heat_flow_has_two_values():
 
 
 def test_a_switched_load_warms_its_part_by_the_steady_heat_balance():
-    """The warming is zero while the load is off, and that of the heat balance in the end."""
+    """A load that is off warms nothing; a load that stays on warms as in the heat balance."""
     unit = triad('own-lags', 1)
     spell = 30_000.0
     load = SwitchedLoad('board', 0.5, (spell, 1.0001 * spell))
@@ -225,7 +225,7 @@ def test_the_sum_of_counts_of_a_day_at_100_hz_is_exact_to_one_count():
         total += int(counts.sum())
         n_cycles += len(counts)
     exact = n_cycles * Fraction(8935, 3)
-    # The remainder has steps of 2^-40 counts; in 8.8e6 cycles the rounding adds up to 8e-6 counts.
+    # Rounding the charge to 2^-40 counts in each of 8.8e6 cycles adds up to 8e-6 counts.
     assert abs(total - exact) < 1 + 1e-4
 
 

@@ -85,12 +85,12 @@ def test_a_further_error_source_does_not_change_the_random_numbers_of_other_sour
         plain.truth.scale - 1.0
     ) * unit.scale_factor * (plain.truth.specific_force @ np.linalg.inv(unit.M).T)
     difference = np.cumsum(plain.counts - still.counts, axis=0) - np.cumsum(moved, axis=0)
-    # Sums of counts are within one count of the integrals; both runs begin with equal remainders.
+    # Both runs begin with the same rounding remainder, so sums of counts agree within one count.
     assert np.abs(difference).max() < 1.0 + 1e-6
 
 
 def test_the_sum_of_counts_without_noise_is_the_integral_of_the_truth(unit):
-    """The sum of counts is that of ``bias + K scale inverse(M) f`` within one count."""
+    """Summed counts equal the integral of ``bias + K scale inverse(M) f`` within one count."""
     run = simulate(noiseless(unit), DEMO, UP, rate_hz=50.0)
     truth = run.truth
     s = truth.specific_force @ np.linalg.inv(unit.M).T
@@ -101,14 +101,14 @@ def test_the_sum_of_counts_without_noise_is_the_integral_of_the_truth(unit):
 
 
 def test_simulated_white_noise_has_the_stated_density(unit):
-    """The one-sided spectrum is ``2 density^2``; means over 60 s have ``density / sqrt(60)``."""
+    """The one-sided spectrum is ``2 density^2``, the sd of 60 s means ``density / sqrt(60)``."""
     still = replace(unit, drift=())
     run = simulate(still, parse_cyclogram('soak'), UP, rate_hz=50.0, seed=3)
     accel = run.counts / np.array(unit.scale_factor) / MICRO_G
     frequency, power = welch(accel, fs=50.0, nperseg=16384, axis=0)
     # With a carried remainder, rounding noise rises with f^2, to 1 (ug)^2/Hz at f = 0.4 Hz.
     band = (frequency > 0.01) & (frequency < 0.4)
-    # The mean of 128 lines, each a mean over 86 half-overlapping segments, is uncertain by 1 %.
+    # The mean of 128 spectral lines, each from 86 half-overlapping segments, is uncertain by 1 %.
     np.testing.assert_allclose(
         power[band].mean(axis=0), 2.0 * np.array(unit.noise_density) ** 2, rtol=0.05
     )
@@ -186,7 +186,7 @@ def test_two_parts_follow_a_ramp_like_the_closed_solution():
     trace, determinant = -(g0 + g1) / c0 - g1 / c1, g0 * g1 / (c0 * c1)
     root = math.sqrt(trace * trace - 4.0 * determinant)
     modes = np.array([(trace + root) / 2.0, (trace - root) / 2.0])
-    # In a ramp, heat for case and board flows from the air, heat for the board from the case.
+    # In a ramp the air heats the case and, through the case, the board.
     lag = np.array([(c0 + c1) / g0, (c0 + c1) / g0 + c1 / g1])
     shapes = np.array([modes + g1 / c1, [g1 / c1, g1 / c1]])
     amplitude = np.linalg.solve(shapes, lag)

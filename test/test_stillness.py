@@ -140,7 +140,7 @@ def test_the_user_can_set_the_length_of_the_shortest_rest(rng):
 
 
 def test_a_drift_in_a_ramp_is_not_taken_for_a_motion(rng):
-    # A drift of 60 ug per cell (30 s), 60 times its noise, is no motion; a tilt by 0.1 mrad is.
+    # A tilt by 0.1 mrad is a motion, a drift of 60 ug per cell (30 s), 60 times its noise, is not.
     time = np.arange(7200.0)
     stamps = START_NS + np.rint(time * 1e9).astype(np.int64)
     ramp = np.clip(time - 1800.0, 0.0, 2400.0) * 2e-3 * MG

@@ -40,7 +40,7 @@ def unit(**given):
 
 
 def ramp(given, rate, hours, environment=units.CHAMBER):
-    """Integrate a ramp of the air [K/s] from rest; return times [s] and temperatures of nodes."""
+    """Ramp the air at `rate` [K/s] after a soak; return times [s], thermal nodes' temperatures."""
     A, b, h = units.network(given, environment)
     at = np.arange(0.0, 3600.0 * hours, 10.0)
     return at, units.integrate(A, b, h, rate * at, 10.0, np.linalg.solve(A, -h))
@@ -57,7 +57,7 @@ def test_a_node_lags_a_ramp_by_its_time_constant():
 
 
 def test_the_integration_is_exact_at_each_step_of_a_ramp():
-    # The lag of x behind a ramp u from rest is u - x = rate * tau * (1 - exp(-t / tau)).
+    # The lag of x behind a ramp u after a soak is u - x = rate * tau * (1 - exp(-t / tau)).
     A, b, h = np.array([[-1 / 300.0]]), np.array([1 / 300.0]), np.zeros(1)
     at = np.arange(0.0, 1500.0, 5.0)
     states = units.integrate(A, b, h, 0.01 * at, 5.0, np.zeros(1))
@@ -89,7 +89,7 @@ def test_simulated_samples_have_the_stated_noise_bias_scale_and_misalignment():
     n = len(error)
     sd = 5.0 * UG * np.sqrt(0.5)
     assert np.abs(error.mean(axis=0)).max() < 4.0 * sd / np.sqrt(n)
-    # The sd of n errors is uncertain by 1 / sqrt(2 n); gain and M change the noise by 3 %.
+    # The sd of n errors is uncertain by 1 / sqrt(2 n); scale errors change this sd by up to 3 %.
     assert error.std(axis=0) == pytest.approx([sd] * 3, rel=0.03 + 4.0 / np.sqrt(2 * n))
 
 
@@ -109,7 +109,7 @@ def test_a_cold_start_begins_at_the_temperature_of_the_air():
     warm = record(given, cases.FROST, LEVEL, rng_of('cold'))
     for bag, heat in ((cold, 0.0), (warm, 2.0)):
         board, case = bag.temperatures['board'][1][0], bag.temperatures['case'][1][0]
-        # The tolerance allows for the chamber's ripple, 0.03 K, and self-heating within 0.3 s.
+        # Tolerance: chamber's ripple, 0.03 K, and self-heating up to the first reading, at 0.3 s.
         assert board - case == pytest.approx(heat, abs=0.1)
 
 
@@ -131,7 +131,7 @@ def test_flicker_noise_has_a_flat_allan_deviation():
 
 @pytest.fixture
 def recorded(monkeypatch):
-    """Replace `record` by a stub; return a function from a bag to the arguments of its record."""
+    """Replace `record` by a stub; return a function that gives the arguments that made a bag."""
     notes = {}
 
     def note(given, corners, up, rng, *, name='bag', **keys):
@@ -194,7 +194,7 @@ def test_the_cramer_rao_bound_is_proportional_to_noise_over_root_of_the_data():
 
 
 def of_attitudes(given, board):
-    """Return means of a unit in all attitudes of `ATTITUDES` at each board temperature."""
+    """Return noise-free means of samples in all `ATTITUDES` at each board temperature."""
     force = GRAVITY * np.repeat(ATTITUDES, len(board), axis=0)
     at = np.tile(board, len(ATTITUDES))
     parts = np.repeat(at[:, None], 3, axis=1)
@@ -203,7 +203,7 @@ def of_attitudes(given, board):
 
 
 def curved_unit():
-    """Make a unit whose bias is a cubic, and whose scale is a line, in temperature."""
+    """Make a unit whose bias is a cubic and whose scale is a linear function of temperature."""
     rng = rng_of('curved')
     return unit(
         bias=1500.0 * rng.standard_normal(3), gain=0.01 * rng.standard_normal(3),
@@ -289,13 +289,13 @@ def test_the_ratio_is_1_if_errors_have_the_claimed_covariance():
     claim = np.broadcast_to(root @ root.T, (n, 3, 3))
     out = strangers.Corrected(truth + error, claim, np.zeros(3))
     scores = strangers.score([out], [Minutes(truth, np.zeros(n), truth)], is_drift=False)
-    # The RMS of 20000 windows is uncertain by 0.5 %.
+    # The RMS of the errors in 20000 windows is uncertain by 0.5 %.
     assert (scores.ratio, scores.norm_ratio) == pytest.approx((1.0, 1.0), rel=0.02)
     assert scores.claim == pytest.approx(scores.vector, rel=0.02)
 
 
 def test_the_claimed_sd_of_a_minute_is_the_noise_of_its_mean():
-    # This calibration claims white noise and rounding of counts only.
+    # The calibration claims only white noise and rounding of counts.
     samples = np.tile(300.0 * GRAVITY * LEVEL, (30000, 1))
     samples[::2] += 1.0
     samples[1::2] -= 1.0

@@ -116,7 +116,7 @@ def test_a_change_between_steps_of_1_k_determines_the_temperature():
     assert thermometer.var_temperature == pytest.approx(1.0 / 12.0, rel=0.2)
     thermometer.update(600 * SECOND_NS, 21.0)
     assert thermometer.temperature == pytest.approx(20.5, abs=0.03)
-    # The sd at the change is the noise plus the temperature change between two readings.
+    # When the reading changes, the sd is the noise plus the temperature change per reading.
     assert 0.005 < math.sqrt(thermometer.var_temperature) < 0.03
 
 
@@ -219,7 +219,7 @@ def test_readings_that_are_not_finite_or_not_newer_do_not_change_the_state(stamp
 
 
 def test_a_reading_15_sd_from_its_prediction_is_down_weighted():
-    # A reading 6 to 30 sd off gets a noise that makes it 6 sd off; beyond 30 sd it is not used.
+    # A reading 6 to 30 sd off gets a noise with which it is 6 sd off; beyond 30 sd it is not used.
     thermometer = settled()
     assert thermometer.update(600 * SECOND_NS, 20.015)
     assert abs(thermometer.temperature - 20.0) < 0.004
@@ -254,9 +254,9 @@ def test_a_gap_increases_the_variance_and_a_long_gap_restarts_the_estimate():
 
 
 def test_the_noise_is_estimated_if_the_setting_is_too_small():
-    # WHY: sensors on a die have a noise of 0.1 K; with a setting of 5 mK each reading was taken
-    # for an outlier. WHAT: the ratio of noise to setting is estimated to 20 %, as some noise is
-    # taken for changes of the rate; the claimed variance is at least half of the squared error.
+    # WHY: sensors on a die have a noise of 0.1 K; with the noise set to 5 mK all readings were
+    # taken for outliers. WHAT: the ratio of true to set noise is estimated to 20 %, as some noise
+    # is taken for rate changes; the claimed variance is at least half of the squared error.
     thermometer = Thermometer(ThermometerSettings(0.005))
     rng = np.random.default_rng(3)
     out = run(thermometer, np.arange(4000.0), read(np.full(4000, 20.0), 0.125, 0.0, rng))

@@ -62,7 +62,7 @@ def record(path, run):
 
 def fitted(bags):
     sources, _ = fit_sources(bags)
-    # These groups of columns suffice, because the lid's effect has no lag.
+    # Three groups of columns suffice, because the lid's effect has no lag.
     groups = ('curve', 'gradient', 'board')
     return fit(sources, FitOptions(gravity=STANDARD_GRAVITY, groups=groups)).calibration
 

@@ -15,7 +15,7 @@ FACES = np.concatenate((np.eye(3), -np.eye(3)))
 NOISE = 2.5e-3
 #: Lag behind the board of the part that determines the bias of each axis [s].
 LAGS_S = 180.0, 300.0, 120.0
-#: Time from the begin of a turn to that of the next turn, and duration of a turn [s].
+#: Time from the beginning of one turn to that of the next, and duration of a turn [s].
 DWELL_S, TURN_S = 400, 8
 
 
@@ -71,19 +71,19 @@ def test_a_lag_is_corrected_at_twice_the_rates_of_the_fit():
     error = (out.specific_force - force)[is_used]
     error = error[: len(error) // 60 * 60].reshape(-1, 60, 3).mean(axis=1)
     # The fit must correct three quarters of the effect of the lag; a fit with products of the lag,
-    # but without the lag itself, has a larger error than this effect.
+    # but without the lag itself, has an error above the whole effect of the lag.
     assert rms(of_lag) > 0.5e-3 * GRAVITY
     assert rms(error) < 0.25 * rms(of_lag)
 
 
 def test_the_claimed_sd_of_a_mems_with_a_single_turn_on_is_0_3_to_1_5_mg():
     # WHY: one recording does not show how much the bias changes at a turn-on. The claimed sd was
-    # too small: a MEMS that changes by 0.6 mg erred by 5 times its claimed sd after a turn-on.
+    # too small: a bias change of 0.6 mg at a turn-on of a MEMS was 5 times the claimed sd.
     rng = np.random.default_rng(3)
     bag, *_ = turned(rng, ((0.0, 20.0), (9000.0, 20.0)), 'one')
     unit = tc.fit([bag], gravity=GRAVITY, input='m/s^2')
-    # The bias of a MEMS of this noise changes by 0.1 to 1 mg at a turn-on. The claimed sd must be
-    # at least the geometric mean of 0.1 and 1 mg, 0.3 mg, and at most 1.5 mg.
+    # The bias of a MEMS of noise `NOISE` changes by 0.1 to 1 mg (geometric mean 0.3 mg) at a
+    # turn-on. The claimed sd must be 0.3 to 1.5 mg.
     assert 0.3 * 1e-3 * GRAVITY < unit.static.x.residual_sd_m_s2 < 1.5e-3 * GRAVITY
 
 
@@ -99,7 +99,7 @@ def test_an_update_after_a_new_turn_on_gives_the_mean_of_both_turn_ons():
     first = tc.fit(bags[:1], **options)
     for both in (tc.fit(bags[1:], prior=first, **options), tc.fit(bags, **options)):
         share = (bias_of(both) - bias_of(first)) / change
-        # By noise (13 rests of 400 s per recording) this share of the change has an sd of 2 %.
+        # The noise of 13 rests of 400 s gives `share`, a ratio of two bias changes, an sd of 2 %.
         assert np.abs(share - 0.5).max() < 0.05
 
 

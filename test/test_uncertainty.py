@@ -30,9 +30,9 @@ from thermo_comp.unit.prediction import SlowUncertainty, ramp_states, sd_of_stat
 
 
 def test_the_claimed_sd_covers_a_start_in_a_ramp():
-    # WHY: after a restart in a ramp the claimed sd was a third of the error. At the start the lag
-    # of a part is unknown: it is 1 K (rate times time constant) in this ramp, and has an sd of 0.4
-    # K at rest. The claimed sd must not change if the ramp ends 40 s after the start.
+    # WHY: after a restart in a ramp the claimed sd was a third of the error. At the start
+    # the lag of a part is unknown: 1 K in a ramp of 1 K/min (tau = 60 s), its sd 0.4 K in a soak.
+    # The claimed sd must not change if the ramp ends 40 s after the start.
     unit = calibration(response=(term('board', (30.0, 0.0, 0.0), tau_s=60.0),))
     sd = {}
     for rate, end in ((0.0, 60), (1.0 / 60.0, 60), (1.0 / 60.0, 40)):
@@ -53,7 +53,7 @@ def test_the_claimed_sd_covers_a_start_in_a_ramp():
 
 
 def test_if_the_case_sensor_is_lost_the_gradient_is_its_last_value_at_rest():
-    # WHY: the board is 1 K warmer than the case, but after a loss of the case 0 K was assumed.
+    # WHY: the board is 1 K warmer than the case; without case readings 0 K was assumed.
     unit = calibration(response=(term('gradient', (30.0, 0.0, 0.0)),))
     compensator = Compensator(unit, UNCHECKED)
     corrected = []
@@ -82,8 +82,8 @@ def test_if_the_case_sensor_never_reads_the_gradient_is_that_of_the_fit_at_rest(
 
 
 def test_beyond_1_g_the_covariance_includes_an_unknown_k2():
-    # Rests do not determine K2, the error proportional to the square of the force. Its assumed sd
-    # is 100 ug/g^2, for forces above 1.01 g.
+    # Rests do not determine K2, the error proportional to the square of the force. Above 1.01 g
+    # the claimed error grows by K2 (|f| - 1.01 g)^2, with an sd of K2 of 100 ug/g^2.
     compensator = Compensator(calibration(), UNCHECKED)
     warm(compensator, start_s=1000, until_s=1001)
     at_1_g, at_4_g = (
@@ -98,7 +98,7 @@ def test_beyond_1_g_the_covariance_includes_an_unknown_k2():
 @pytest.mark.parametrize('fault', ['both stand still', 'swapped topics'])
 def test_the_claimed_sd_covers_thermometer_errors_for_parts_that_lag_the_board(fault):
     # WHY: the claimed sd lacked the effect of lasting errors of the board temperature. The bias
-    # depends on a part that lags the board by 10 min, so a short error hardly changes the output.
+    # depends on a part that lags the board by 10 min, so only lasting errors of T_board matter.
     per_kelvin, axis = 30.0, axis_set((0.0, 30.0))
     part = term('board', (-per_kelvin, 0.0, 0.0), tau_s=600.0)
     parts = regime_set(x=axis, rate_range_k_min=(-5.0, 5.0))
@@ -151,7 +151,7 @@ def test_a_state_beyond_the_edge_of_a_column_is_limited_and_increases_the_sd():
     edge, beyond = (correction.line(s, s, np.zeros(N_ROWS), 0.0) for s in (inside, outside))
     assert beyond[:12].tolist() == edge[:12].tolist()
     assert math.sqrt(beyond[12] - edge[12]) == pytest.approx(30.0 / 300.0 * 2.0)
-    of_y = [27, 29, 32]  # coefficients of 1, y and y^2 in the covariance yy
+    of_y = [27, 29, 32]  # coefficients of 1, y and y^2 in the variance of y
     assert beyond[of_y].tolist() == edge[of_y].tolist()
     excess = correction.excess(outside, is_dynamic=False)
     assert excess.relative == pytest.approx(2.0)
@@ -159,7 +159,7 @@ def test_a_state_beyond_the_edge_of_a_column_is_limited_and_increases_the_sd():
 
 
 def sd_at(unit, board, behind=0.0, force=0.0):
-    """Return the claimed sd of x in a soak, without noise; `behind`: lag of parts [K]."""
+    """Return the x axis' claimed sd in a soak, without noise; `behind`: lag of parts [K]."""
     correction = Correction(unit)
     layout = StateLayout(correction.memory)
     state = [0.0] * layout.width
@@ -172,8 +172,8 @@ def sd_at(unit, board, behind=0.0, force=0.0):
 
 
 def test_beyond_the_range_curve_and_lag_do_not_cancel_in_the_claimed_sd():
-    # Inside the range the slopes of curve and lag over board temperature cancel; outside of it
-    # their sum is not known, and the claimed sd is that of the curve.
+    # Inside the range the slopes of curve and lag over board temperature cancel. Outside of the
+    # range the sum of both slopes is unknown, so the claimed sd is that of the curve alone.
     bias = axis_set((0.0, 0.5), residual_sd_m_s2=1e-6)
     unit = calibration(
         static=regime_set(bias), dynamic=regime_set(bias),
@@ -186,8 +186,8 @@ def test_beyond_the_range_curve_and_lag_do_not_cancel_in_the_claimed_sd():
 
 
 def test_beyond_the_range_bias_and_scale_slopes_do_not_cancel_in_the_claimed_sd():
-    # At the upper edge the bias slope is 0.8 counts/K, which the scale slope cancels at a force of
-    # 10 m/s^2.
+    # At 35 degC, the end of the range, the bias slope is 0.8 counts/K; at a force of 10 m/s^2 the
+    # scale slope cancels the bias slope.
     bent = axis_set((0.0, 0.5, 0.01), (1.0, -0.8 / 3000.0), residual_sd_m_s2=1e-6)
     unit = calibration(static=regime_set(bent), dynamic=regime_set(bent))
     # The bias slope changes by 0.02 counts/K^2: over 30 K its sd is 0.02 * 30 / sqrt(12) counts/K.
@@ -230,7 +230,7 @@ def test_outside_its_range_a_set_follows_the_curve_of_the_other_set():
     )
     celsius = [-20.0, -7.5, -3.0, 0.0, 5.0, 30.0, 35.0, 38.0, 42.5, 60.0]
     static, dynamic = curves_at(unit, celsius)[:, 0]
-    # Outside the common range, 5 to 30 degC, both sets differ by as much as at its edge.
+    # Outside the common range, 5 to 30 degC, both curves differ by as much as at its nearer end.
     np.testing.assert_allclose((dynamic - static)[:5], dynamic[4] - static[4], rtol=1e-12)
     np.testing.assert_allclose((dynamic - static)[5:], dynamic[5] - static[5], rtol=1e-12)
     wavy, bent = np.polynomial.Polynomial(WAVY), np.polynomial.Polynomial(BENT)
@@ -240,8 +240,8 @@ def test_outside_its_range_a_set_follows_the_curve_of_the_other_set():
 
 
 def test_the_sd_beyond_the_range_includes_every_parameter_of_the_tangents(rng):
-    # A change of the parameters must change bias and scale by the regressors times this change.
-    # The ranges are 5 to 35 degC (static) and 0 to 30 degC (dynamic).
+    # A change of the parameters times the regressors must equal the change of bias and scale. The
+    # calibrated ranges are 5 to 35 degC (static set) and 0 to 30 degC (dynamic set).
     spline = CubicSpline((-15.0, 0.0, 15.0), (-4.0, 0.0, 6.0))
     exponential = Exponential(-1.0, (1.0,), (18.0,))
     splined = AxisSet(spline, Polynomial((1.0, 1e-4)))
@@ -284,14 +284,14 @@ def test_the_claimed_sd_grows_with_the_distance_from_the_range():
             line = correction.line(state, state, slow.at(state, nobody), 0.0)
             variances.append(line[list(VARIANCES), 0])
         assert (np.diff(variances, axis=0) > 0.0).all()
-        # If the true curve is constant beyond the edge, the error is within the claimed sd.
+        # If the true curve is constant outside the range, the error is within the claimed sd.
         slopes = np.abs(correction.curves.slopes(np.array([35.0]))[0, :3, 0]) / correction.K[:, 0]
         assert (np.sqrt(variances[3]) > 3.0 * np.abs(slopes)).all()
 
 
 def test_with_lags_the_sd_in_a_ramp_does_not_depend_on_the_calibrated_rates():
-    # WHY: after bags of soaks, with rates below 0.1 K/min, the variance in a ramp was multiplied
-    # by several hundred, although it already contained the variance of the lag in the ramp.
+    # WHY: for a unit fitted to soaks (rates below 0.1 K/min) the claimed variance in a ramp was
+    # multiplied by several hundred, although it already contained the variance of the lag.
     axis = axis_set(residual_sd_m_s2=1e-5)
     soaks = regime_set(axis, rate_range_k_min=(-0.1, 0.1))
     sds = []
@@ -301,14 +301,14 @@ def test_with_lags_the_sd_in_a_ramp_does_not_depend_on_the_calibrated_rates():
         state[BOARD], state[RATE] = 20.0, 2.0 / 60.0
         line = correction.line(state, state, np.zeros(N_ROWS), 0.0)
         sds.append(math.sqrt(line[VARIANCES[0]] - correction.noise[0]))
-    # The ramp is 19 half ranges beyond the calibrated rates, which adds variance to the output of
-    # the unit without lags only.
+    # The rate, 2 K/min, exceeds the largest calibrated rate, 0.1 K/min, by 19 times 0.1 K/min:
+    # only the unit without lags gets additional variance.
     assert sds == pytest.approx([1e-5 * math.hypot(1.0, 19.0), 1e-5], rel=1e-6)
 
 
 def test_the_distance_of_a_squared_column_from_its_range_is_that_of_its_quantity():
-    # WHY: after bags with lags up to 0.1 K, a lag of 10 K is 100 times its range, its square 10000
-    # times. The claimed sd was that of 10000 ranges, 0.1 g.
+    # WHY: a lag of 10 K is 100 times the range of the bags, 0.1 K; the square of the lag is 10000
+    # times its range. For a lag counted as 10000 times its range the claimed sd was 0.1 g.
     unit = calibration(response=(term('square', (1.0, 0.0, 0.0), tau_s=600.0, range=(0.0, 0.01)),))
     correction = Correction(unit)
     state = np.zeros(StateLayout(correction.memory).width)

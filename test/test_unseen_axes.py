@@ -33,7 +33,7 @@ KINK = np.array([0.0, 1e-5, -1e-5])
 
 
 def fit_of(temperature, up, position, slope=1e-5, gravity=10.0):
-    """Make the parts of a fit that `thermal_ranges` reads, with one slope of all scale factors."""
+    """Make what `thermal_ranges` reads of a fit; `slope`: slope of each scale factor [1/K]."""
     windows = SimpleNamespace(
         temperature=np.asarray(temperature, dtype=float),
         data=SimpleNamespace(
@@ -104,7 +104,7 @@ def kinked(bag, unit):
 @pytest.mark.parametrize('number', [1, 2])
 @pytest.mark.parametrize('is_prior', [False, True])
 def test_after_one_cold_bag_the_claimed_sd_covers_the_scale_errors_of_all_axes(number, is_prior):
-    # WHY: after a cold bag of one position the force error was 138 ug, its claimed sd 14 ug.
+    # WHY: with one position in the cold the force error there was 138 ug, its claimed sd 14 ug.
     rng = rng_of('unseen axes', number)
     unit = navigation(rng)
     warm = positions(unit, WARM, spread(12, rng), rng)
@@ -134,7 +134,7 @@ def test_rests_in_one_pose_at_four_temperatures_determine_the_drift_of_level_axe
     drift = force - strangers.minutes(held).force
     drift -= np.nanmean(drift, axis=0)
     # Attitude errors of 0.2 mrad RMS in the rests cause errors of about 0.2 mg in the bias curve
-    # of a level axis. Tolerance: 0.4 mg, two sd.
+    # of a level axis. The tolerance is 0.4 mg, twice the error of the bias curve.
     assert np.sqrt(np.nanmean(drift**2)) < 2.0 * 2e-4 * GRAVITY
 
 
@@ -174,10 +174,10 @@ def test_rests_in_one_pose_use_the_mounting_sd_that_the_user_stated():
     ],
 )
 def test_the_claimed_sd_is_right_if_one_ramp_cannot_separate_bias_and_scale(draw, unit, is_cold):
-    # WHY: noise of the thermometer in rests at constant temperature was taken for temperature
-    # changes that do not change the bias, so the drift in the only ramp was attributed to scale
-    # factors: 470 ppm/K instead of -36. In warm-ups of a cold unit the effect of a lag was
-    # attributed to the scale factor alone.
+    # WHY: thermometer noise in rests at constant temperature was taken for temperature changes
+    # without effect on the bias. The drift in the only ramp was attributed to scale factors: 470
+    # ppm/K instead of -36 ppm/K. In warm-ups of a cold unit the effect of a lag was attributed to
+    # the scale factor alone.
     rng = rng_of('bench beside a ramp', unit)
     imu = draw(rng)
     bench = program(22.0, 5.0)
@@ -195,6 +195,6 @@ def test_the_claimed_sd_is_right_if_one_ramp_cannot_separate_bias_and_scale(draw
     study = Study('', tuple(bags[:15]), one_test(held), options)
     tests = {'': [strangers.minutes(bag) for bag in held]}
     score = strangers.scored(study, strangers.fitted(study), tests)['']
-    # A ramp in one attitude does not determine the slopes of the three scale factors. If their
-    # claimed sd is right, the RMS of error / claimed sd exceeds 1.9 for 1 % of all units.
+    # A ramp in one attitude does not determine the slopes of the three scale factors. If claimed
+    # sd are right, the RMS of error / claimed sd exceeds 1.9 for 1 % of all units.
     assert score.ratio < 1.9

@@ -14,7 +14,7 @@ BOARD_LAG_S = 600.0
 
 
 def lagged(t, corners, lag):
-    """Return a temperature that lags a chamber, whose rate [K/min] changes at `corners` [s]."""
+    """Return a temperature lagging a chamber; corners: (time [s], new chamber rate [K/min])."""
     out = np.zeros(len(t))
     before = 0.0
     for at, rate in corners:

@@ -264,7 +264,7 @@ def fit(
 def _block(
     time_s: npt.ArrayLike, counts: npt.ArrayLike, given: Mapping[str, Temperature], start_ns: int
 ) -> Block:
-    """Make a block of arrays; a reading comes before the first sample not earlier than it."""
+    """Make a block of arrays; a reading applies from the first sample at its time or later."""
     stamps = _stamps('time_s', time_s)
     samples = _numbers('counts', counts)
     if samples.shape != (len(stamps), 3):

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the exceptions for errors that a user can cause and correct; the message is one line.
+Owns the exceptions for errors that a user can cause and correct, with one-line messages.
 
 The exceptions are raised for files and bags that cannot be used, and for data that do not suffice
 for a fit. A wrong argument of a numeric function is a plain `ValueError`. The command line prints

@@ -66,7 +66,7 @@ BAG = Kind('rosbag2 directory', rb'\A(metadata\.yaml|.+\.(mcap|db3)(\.zstd)?)\Z'
 
 
 def bag_kind(path: str | Path, others: str = '') -> Kind:
-    """Return the kind of an output bag by its suffix; errors also list the endings `others`."""
+    """Return the kind of an output bag by its suffix; `others`: endings to name in an error."""
     suffix = Path(path).suffix
     if suffix == '.mcap':
         return MCAP

@@ -33,12 +33,13 @@ from .recording.reader import RecordingReader, open_recording
 from .recording.serialized import Messages
 from .recording.topics import Topics
 from .recording.writer import TABLES, BagWriter, WriteRows, table_writer
+from .thermal.thermometer import COLDEST, HOTTEST
 from .topics import FLAGS, IMU_OUT, OUTPUTS, TEMPERATURE, thermometer
 from .typing import Ints
 from .unit.calibration import Calibration
 
-# Quantiles of the board readings that are compared with the calibrated range, so that single
-# wrong readings do not count; excess over the range [K] that thermometer noise can explain.
+# Quantiles of the board readings that are compared with the calibrated range, because single
+# readings may be wrong; largest excess over the range [K] that counts as thermometer noise.
 _BULK, _NOISE_K = (0.01, 0.99), 0.1
 _REGIMES = np.array(['unknown', 'static', 'dynamic'])
 
@@ -158,7 +159,8 @@ def _beyond(calibration: Calibration, block: Block) -> float:
     ranges = [regime_set.temperature_range_c for regime_set in calibration.regime_sets()]
     lower, upper = min(bounds[0] for bounds in ranges), max(bounds[1] for bounds in ranges)
     celsius = block.temperatures['board'].celsius
-    bulk = np.nanquantile(celsius, _BULK) if np.isfinite(celsius).any() else np.array([lower])
+    celsius = celsius[(celsius >= COLDEST) & (celsius <= HOTTEST)]
+    bulk = np.quantile(celsius, _BULK) if len(celsius) else np.array([lower])
     excess = float(max(bulk - np.clip(bulk, lower, upper), key=abs))
     return excess if calibration.needs_temperature and abs(excess) > _NOISE_K else 0.0
 
@@ -246,7 +248,7 @@ def _rows_of(table: AbstractContextManager[WriteRows]) -> Iterator[WriteBlock]:
 
 
 def _imu_of(block: Block, corrected: CompensatedBlock) -> ImuColumns | None:
-    """Return the Imu fields except force; covariance[0] = -1: no angular rate to correct."""
+    """Return the Imu fields except force; a rate with the covariance[0] -1 stays uncorrected."""
     if block.imu is None:
         return None
     imu = block.imu.take(corrected.index)

@@ -3,8 +3,8 @@
 """
 Owns the table of the node's ROS topics: name, type, QoS, serialization of the regime flags.
 
-Node, replay, recorders, player, bag writer and docs/ros_interface.md use this table. A message is
-packed in little-endian CDR: 4 bytes of encapsulation, then the fields.
+Node, replay, recorders, player, bag writer and docs/ros_interface.md use the topics' table. A
+message is packed in little-endian CDR: 4 bytes of encapsulation, then the fields.
 """
 
 from collections.abc import Callable
@@ -43,7 +43,7 @@ def _bool_flag(_stamp_ns: int, is_dynamic: bool, _serial: str) -> bytes:
 
 
 def _stamped_flag(stamp_ns: int, is_dynamic: bool, serial: str) -> bytes:
-    """Serialize the regime as a DiagnosticArray with the stamp of the deciding reading."""
+    """Serialize the regime as a DiagnosticArray with the stamp of the reading that decided it."""
     status = b''
     for text in ('regime', 'dynamic' if is_dynamic else 'static', serial):
         # In CDR the level of a status is one byte; the length of a text is aligned to 4 bytes.
@@ -97,7 +97,7 @@ STAMPED = NodeTopic(
 )
 STATUS = NodeTopic('/diagnostics', DIAGNOSTICS, '1 Hz; hardware_id = serial of the unit', 10)
 
-#: Topics of the samples by the value of the parameter `input`; all inputs by names in `Topics`.
+#: Sample topics by the value of the parameter `input`; all input topics by their keys in `Topics`.
 SAMPLES = {'counts': COUNTS, 'imu': IMU_IN}
 INPUTS = {**SAMPLES, 'board': BOARD, 'case': CASE}
 #: Topics of the regime flags with their serializers; all topics that `replay` writes.

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the access to recordings that other people made, for `test/test_real_data.py`.
+Finds recordings that other people made, for `test/test_real_data.py`.
 
 The recordings are not part of the project: they are read from the folder THERMO_COMP_DATA, or else
 from a folder beside the project, and converted to bags in a temporary directory.

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the conversion to bags of recordings that other people made."""
+"""Converts recordings that other people made to bags."""
 
 from __future__ import annotations
 

@@ -23,11 +23,11 @@ from ..unit.gravity import STANDARD_GRAVITY
 
 # Minimum length of a rest [s], unless the wanted soak is shorter.
 _REST_S = 10.0
-# Minimum length of a cell of averaged samples [s]; samples that first determine the sample rate.
+# Shortest cell of averaged samples [s]; number of first samples that set the length of a cell.
 _CELL_S, _SAMPLES_TO_BEGIN = 0.5, 30
 # Number of earlier cells that each search for rests includes, besides the new cells.
 _LOOKED_BACK = 200
-# Sd of the mean force in a position due to hysteresis, mounting and drift, however long the rest.
+# Sd of a position's mean force due to hysteresis, mounting and drift, even in a long rest [g].
 _FLOOR_SD = 2e-5
 # A position is 'restless' if its noise is above `_RESTLESS` times the median of all positions. A
 # later still interval is a rest if its noise is below `_LOUDEST` times the noise of the rests.
@@ -61,8 +61,8 @@ class Account:
     State of a test, and the missing data.
     The last of `positions` is unfinished. `worst_sd_g` is the sd of the corrected force in the
     attitude with the largest sd, `constants_sd` the sds of bias [g], scale and misalignment [rad].
-    `next_up` is the direction recommended for the next position, at an angle of `next_deg` to
-    `now`, the direction of the newest sample (NaN without samples); `farthest_up` is the direction
+    `now` is the direction of the newest sample, NaN without samples. `next_up` is the direction
+    recommended for the next position, `next_deg` away from `now`. `farthest_up` is the direction
     farthest (by `farthest_deg`) from all positions. `findings` are texts about missing data.
     """
 
@@ -94,7 +94,7 @@ class _Rest:
 
 
 class Acquisition:
-    """A running test; `soak_s`: wanted duration of a rest [s], `offset`: reading at 0 g."""
+    """A running test; `soak_s`: wanted time at rest per position [s], `offset`: reading at 0 g."""
 
     def __init__(self, n_positions: int, soak_s: float, offset: float = 0.0) -> None:
         self._n_wanted, self._soak_s, self._offset = n_positions, soak_s, offset
@@ -112,8 +112,8 @@ class Acquisition:
         #: Earliest stamp at which the next position can begin [ns].
         self.settled_ns = self._newest_ns = self._begin_ns = _FIRST_NS
         self._n_looked = 0
-        # Mean sample of the first rest of the position. A later search may miss the first rest,
-        # because the largest variance at rest is computed from the quietest tenth of the cells.
+        # Mean sample of the first rest of the position. A search after more samples may miss this
+        # rest: its variance limit follows from the quietest tenth of the cells.
         self._first: Floats | None = None
 
     def add(self, block: Block) -> list[int]:
@@ -289,7 +289,7 @@ class Acquisition:
             return np.full(3, np.nan), False
         cells = cells.part(slice(-_LOOKED_BACK, None))
         ranges = still_intervals(cells, 0.0)
-        # The last cell may have few samples: take rest and direction from the cell before it.
+        # The last cell may be incomplete: judge rest and direction by the cell before the last.
         is_still = bool(ranges) and ranges[-1][1] >= len(cells.count) - 1
         last = cells.mean[-2:-1] if len(cells.count) > 1 else cells.mean
         return self._directions(last)[0], is_still

@@ -88,7 +88,7 @@ def run(arguments: list[str]) -> int:
     except _UsageMistake as mistake:
         context = getattr(mistake, 'ctx', None)
         command = 'thermo_comp' if context is None else context.command_path
-        if message := mistake.format_message():  # if it is empty, typer has printed the help
+        if message := mistake.format_message():  # '' if typer has printed the help instead
             output.error(f'{_plain(message, arguments)} (see: {command} --help)')
         return int(mistake.exit_code)
     except typer.Abort:
@@ -129,7 +129,7 @@ def _plain(message: str, arguments: list[str]) -> str:
 
 
 def split_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:
-    """Return the command's arguments, and those for ROS (from ``--ros-args`` up to ``--``)."""
+    """Return the command's arguments, and ROS arguments (from ``--ros-args`` up to ``--``)."""
     for_command: list[str] = []
     for_ros: list[str] = []
     target = for_command

@@ -180,19 +180,19 @@ def replay(
     serial: str | None = options.SERIAL,
     frame_id: str = option('frame_id of the output messages; default: frame_id of the input.', ''),
     transition_time: float = option(
-        'Time in s over which the two sets are blended after a switch of the regime, like the '
-        "node's parameter; 0: no blending.",
+        'Time in s over which the coefficients are blended after a switch of the regime '
+        '(parameter transition_time of the node); 0: no blending.',
         CompensatorConfig.transition_time_s,
         min=0.0,
     ),
     temperature_timeout: float = option(
-        'Largest age of the board temperature, in s, at which samples are corrected, like the '
-        "node's parameter.",
+        'Largest age of the board temperature, in s, at which samples are corrected (parameter '
+        'temperature_timeout of the node).',
         CompensatorConfig.temperature_timeout_s,
     ),
     case_timeout: float = option(
         'Age of the case temperature, in s, above which the regime follows from the board '
-        "temperature alone, like the node's parameter.",
+        'temperature alone (parameter case_timeout of the node).',
         CompensatorConfig.case_timeout_s,
     ),
     topics: Any = options.reading,

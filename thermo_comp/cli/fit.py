@@ -39,12 +39,12 @@ def fit(
     output: Path = options.NEW_CALIBRATION,
     settings: dict[str, Any] = options.fitting,
     static_curve: Curve | None = option(
-        'Curve of bias and scale over temperature in the static set: linear, quadratic, cubic, '
-        'spline or exponential; default: cubic, or linear for --model golovach.',
+        'Curve of bias and scale over temperature in a soak: linear, quadratic, cubic, spline '
+        'or exponential; default: cubic, or linear for --model golovach.',
         metavar='CURVE',
     ),
     dynamic_curve: Curve | None = option(
-        'Curve of bias and scale over temperature in the dynamic set; default: the static curve '
+        'Curve of bias and scale over temperature in ramps; default: the curve in a soak '
         'plus a quadratic; for --model golovach: quadratic.',
         metavar='CURVE',
     ),
@@ -240,12 +240,12 @@ def _print_fit(
 
 
 def _behind_s(parts: Sequence['Part']) -> list[float]:
-    """Return how far each part's temperature lags its surroundings in a steady ramp [s]."""
+    """Return the time by which each part's temperature lags its surroundings in a ramp [s]."""
     return [part.tau_s + part.second_tau_s for part in parts]
 
 
 def _text_of(parts: Sequence['Part']) -> str:
-    """Describe the lag of each axis' part of the unit, and the temperature that the part lags."""
+    """Describe, for each axis, the lag of the part that determines bias and scale."""
     lags = ', '.join(f'{behind_s:.0f}' for behind_s in _behind_s(parts))
     text = f'lags the board by {lags} s (x, y, z)'
     if any(part.sensor_share for part in parts):
@@ -332,9 +332,9 @@ def _print_rates(out: Output, result: 'FitResult', gyroscope: 'Gyroscope') -> No
 def _print_models(out: Output, trials: Sequence['Trial']) -> None:
     """Print a table of the error of each model on data left out of the fit, and its legend."""
     columns = {
-        'positions': 'drift of an axis in a position left out',
-        'sections': 'drift of an axis in a section of the program left out',
-        'norm': '|f| - g in a position left out',
+        'positions': 'drift of an axis in a left-out position',
+        'sections': 'drift of an axis in a left-out section of the temperature program',
+        'norm': '|f| - g in a left-out position',
     }
     left = [[micro_g(folds.rms) for folds in trial.score.kinds] for trial in trials]
     kept = [k for k in range(len(columns)) if any(row[k] for row in left)]
@@ -384,7 +384,7 @@ def _of_axes(values: Iterable[float], shown: Callable[[float], str | None]) -> s
 def _steps(
     rows: Iterable[Any], steps: Iterable[str], shown: Callable[[float], str | None], axes: int = 1
 ) -> list[tuple[Cell, ...]]:
-    """Return a row per section: number of windows (`axes` values each), RMS residual per step."""
+    """Return a table row per section: number of windows, RMS residual of each of `steps`."""
     return [
         (row.section, row.fitted.n // axes, *(shown(getattr(row, x).rms) for x in steps))
         for row in rows

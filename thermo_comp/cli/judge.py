@@ -256,7 +256,7 @@ def update(
         'Days of ageing after the last rest that the claimed sd covers.', 1.0, min=0.0, max=3650.0
     ),
     allow: list[str] | None = option(
-        'gravity: take local gravity as exact; unit: accept |f| as wrong as of another unit.'
+        'gravity: take local gravity as exact; unit: accept a |f| like that of another unit.'
     ),
     force: bool = options.FORCE,
     out: Output = options.out,
@@ -264,11 +264,11 @@ def update(
     """
     Update a calibration in the field, by rests that the node has logged.
 
-    The calibration is the prior; the ageing since the fit is estimated from
-    the rests, which may be in any attitude. Old and new calibration are
-    compared on days left out of the update. The new calibration is written only
-    if the rests determine an axis and lower the mean square of |f| - g by more than
-    its standard error; else the exit code is 3, and the sds with ageing are printed.
+    The calibration is the prior; the ageing since the fit is estimated from the
+    rests, which may be in any attitude. Old and new calibration are compared on
+    days left out of the update. The new calibration is written only if the rests
+    determine an axis and the mean decrease of (|f| - g)^2 on left-out days exceeds
+    its standard error; else the exit code is 3, and sds with ageing are printed.
 
     Example:
       thermo_comp update unit42.yaml rests -o unit42_new.yaml
@@ -331,7 +331,7 @@ def _show_axis_changes(result: 'Update', out: Output) -> None:
             for axis in result.axis_changes
         ],
         title=f'changes shown by {len(result.series)} rests in {result.series.start.max() + 1} '
-        'starts of the node (at rest: change of the reading at the mean force; sds: at rest / +-)',
+        'starts of the node (at rest: change at the mean force; sds: that change / its sd)',
     )
 
 

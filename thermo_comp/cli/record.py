@@ -122,7 +122,7 @@ def _read_earlier(
 def _accounts(
     out: Output, news: Iterable['News | None'], test: 'Acquisition', bags: 'PositionBags'
 ) -> Iterator['Account']:
-    """Write blocks until test or bag ends; yield the test's state at each None in `news`."""
+    """Write blocks until test or bag ends; each None in `news` yields the state of the test."""
     chosen: str | None = None
     for new in news:
         if new is not None:
@@ -199,14 +199,14 @@ def _duration(text: str) -> float:
 def _print_account(
     out: Output, account: 'Account', problems: Sequence[str], last: dict[str, str]
 ) -> None:
-    """Print the texts of the account that changed since they were printed (`last`, by name)."""
+    """Print the texts on the test that have changed; `last`: texts printed last, by name."""
     news = {'problem': ', '.join(problems)} if problems else {}
     if not problems:
         last.pop('problem', None)
     for number, position in enumerate(account.positions, 1):
         if position.n_rests:
             news[f'position {number}'] = f'{position.reason or "good"}; {_reading(position.up)}'
-    # The direction, after the semicolon, changes with the noise, so the direction is not compared.
+    # Noise changes the direction that follows the semicolon: compare the text before it.
     new = {name: text for name, text in news.items() if last.get(name) != text.partition(';')[0]}
     for name, text in new.items():
         last[name] = text.partition(';')[0]

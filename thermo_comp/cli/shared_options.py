@@ -58,8 +58,8 @@ usage = typer.BadParameter  # error in the command line, exit code 2
 
 def option(text: str, default: Any = None, *flags: str, **rules: Any) -> Any:
     """
-    Return a typer option; `rules`: for typer. `flags`: names; the name ``--parameter`` is added
-    if `flags` contain no long name.
+    Return a typer option; `rules`: further settings of typer. `flags`: names of the option; if
+    none begins with two dashes, the parameter's name is added.
     """
     return typer.Option(default, *flags, help=text, **rules)
 
@@ -295,12 +295,14 @@ def force(
 def fitting(
     where: dict[str, float] = site,
     model: Literal['response', 'golovach'] = option(
-        'response: two sets of coefficients and thermal response; golovach: the two sets alone.',
+        'response: coefficients for soaks and ramps, and thermal response; golovach: no response.',
         'response',
         metavar='MODEL',
     ),
     full_scale: float | None = option(
-        'Magnitude of a saturated sample, in the unit of the input.', metavar='VALUE'
+        'Magnitude of a saturated sample, in the unit of the input; default: 32767 counts, or the '
+        'smallest usual range above all samples, from 2 g.',
+        metavar='VALUE',
     ),
     reference_temperature: float = option(
         'Temperature at which bias and scale are stated, in degC.', 20.0, metavar='DEGC'
@@ -327,7 +329,7 @@ def fitting(
         'or if some rests are not at 1 g, else no nonlinearity.',
         min=1e-6,
     ),
-    allow: list[str] | None = option('Refusal to override, by the name in its message.'),
+    allow: list[str] | None = option('Name of a refusal to override, as in the error message.'),
 ) -> dict[str, Any]:
     """Return keywords of `FitOptions`."""
     given = locals() | where

@@ -182,7 +182,7 @@ def _write_rate(writer: 'BagWriter', spin: 'Spin', duration_s: float) -> None:
 def _write(
     writer: 'BagWriter', runs: Iterator['SimulatedRun'], unit: 'UnitModel', is_imu: bool
 ) -> Iterator[dict[str, int]]:
-    """Write a run block by block; yield the number of messages written with each block."""
+    """Write the blocks of a simulated bag; yield the numbers of messages of each block."""
     import numpy as np
 
     from ..recording.blocks import ImuColumns
@@ -202,7 +202,7 @@ def _write(
         writer.write_temperature(topics.case, run.case_stamp_ns, run.case)
         stamp_ns, counts = run.accel_stamp_ns[keep], run.counts[keep]
         if is_imu:
-            # Scale the counts by the nominal scale factor, as a driver does.
+            # Divide the counts by the nominal scale factor, as a driver does.
             force, rate = counts / np.mean(unit.scale_factor), run.angular_rate
             rest = None if rate is None else ImuColumns.of_rate(rate[keep])
             writer.write_imu(topics.imu, stamp_ns, force, np.zeros(9), 'imu_link', rest)

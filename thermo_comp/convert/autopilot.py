@@ -48,7 +48,7 @@ class _Correction(NamedTuple):
     """A parameter that is 1 while the autopilot corrects thermal drift."""
 
     parameter: str
-    course: Sequence[tuple[int, float]]  # times since boot [ns], and the parameter from then on
+    course: Sequence[tuple[int, float]]  # (time since boot [ns], new value of the parameter)
     advice: str
 
 

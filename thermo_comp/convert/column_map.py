@@ -4,10 +4,10 @@
 Owns column maps of tables: the content and unit of each column, and the message that it becomes.
 
 A map is a small YAML file; config/columns/ has examples. Without a map the columns are recognised
-by their headings (see `headings`). The map of a table without headings, ``[t] ax ay az [wx wy
-wz]`` as for imu_tk, is guessed: the times must rise in most rows, and the unit of acceleration
-is that in which the norm of samples at rest is gravity. An angular rate is taken to be in deg/s if
-its numbers, as rad/s, would be faster than a turn by hand.
+by their headings (see `headings`). A table without headings must have the columns ``[t] ax ay az
+[wx wy wz]``, as for imu_tk. Times of unstated unit must rise in most rows. An unstated unit of
+acceleration is the unit in which the norm of samples at rest is gravity; an unstated unit of
+angular rate is deg/s if the numbers, as rad/s, would be faster than a turn by hand.
 """
 
 from collections.abc import Sequence
@@ -32,18 +32,18 @@ from .table import STAMP_EXPONENTS, Format, Stamp, Table, TimeUnit, read_parquet
 _CELSIUS = {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}
 #: Range of plausible intervals between samples [s], which decides the unit of the times.
 _STEPS_S = (5e-5, 0.5)
-#: A turn by over `_TURN` rad within two blocks of `_BLOCK` samples, between still blocks (sd below
-#: `_QUIET` g), would be too fast with times in ms: then intervals up to `_SLOW_S` s are plausible.
+#: An interval up to `_SLOW_S` [s] is plausible if the unit turns by over `_TURN` [rad] between
+#: still blocks (`_BLOCK` samples, sd below `_QUIET` [g]): in ms, no hand turns a unit so fast.
 _SLOW_S, _BLOCK, _TURN, _QUIET = 2.0, 12, 0.5, 0.02
 _FASTEST_RAD_S = 20.0  # largest angular rate of a unit that is turned by hand [rad/s]
-#: Stamps of the years 2000 to 2038, and their largest interval [s]. A count of us since power-up,
-#: taken as seconds, may be in this range, but its steps are larger than this interval.
+#: Stamps of the years 2000 to 2038, and their largest interval [s]. A time since power-up in us,
+#: read as seconds, may look like a date up to 2038, but rises by over 60 s from row to row.
 _SINCE_1970_S, _SINCE_1970_STEP_S = (946_684_800.0, 2_147_483_648.0), 60.0
 #: Largest ratio of the range of temperatures in a log to the duration of the log [K/s]; a hair
 #: dryer warms a board by some 0.1 K/s.
 _FASTEST_K_S = 0.5
 # Largest share of rows in which a temperature in whole degrees changes. A column of the numbers of
-# boards or sensors alternates from row to row, so it changes in a larger share of rows.
+# boards or sensors alternates from row to row, so it changes in nearly all rows.
 _FEW_CHANGES = 0.1
 _RISING = 0.7  # smallest share of rows whose time is later than the time of the row before
 #: A step from the uppermost to the lowest tenth of the range of a 32-bit counter of time, such as
@@ -198,7 +198,7 @@ def table_log(path: Path, columns: ColumnMap) -> ForeignLog:
 
 
 def _without_wraps(table: Table, unit: TimeUnit | None) -> tuple[Ints, tuple[int, ...]]:
-    """Continue 32-bit times after an overflow; return stamps, and lines just after overflows."""
+    """Continue 32-bit times beyond overflows; return stamps, numbers of lines after overflows."""
     stamp_ns, rows = table.stamp_ns.copy(), np.flatnonzero(table.stamp_ns != NO_STAMP)
     if unit not in ('ms', 'us') or not len(rows):
         return stamp_ns, ()
@@ -311,7 +311,7 @@ def _span(values: Floats) -> float:
 def _stamp(
     named: Headings, times: Floats | None, rate_hz: float | None, accel: Floats, span: float
 ) -> Stamp:
-    """Guess the unit of times by heading, or size and interval; `span`: temperature range [K]."""
+    """Guess the unit of times by heading or values; `span`: range of temperatures [K]."""
     if times is None:
         return Stamp(rate_hz=rate_hz)
     column = f'its column {named.time!r}'
@@ -353,7 +353,7 @@ def _stamp(
 
 
 def _turns_at_once(accel: Floats) -> bool:
-    """Whether the unit would turn between still blocks faster than by hand if times were in ms."""
+    """Whether, with times in ms, a turn between still blocks would be too fast for a hand."""
     blocks = accel[: len(accel) // _BLOCK * _BLOCK].reshape(-1, _BLOCK, 3)
     mean = blocks.mean(axis=1)
     size = np.linalg.norm(mean, axis=1, keepdims=True)

@@ -3,9 +3,9 @@
 """
 Owns the export of calibrations to the files of other tools, and the import of such files.
 
-All tools correct a reading N to a specific force ``a = A (N - b)``. In autopilots b depends on
-temperature and A is 1; in tools for tumble tests b and A are constant. The notes of an export
-name the parts of a calibration that the file cannot hold, most with the resulting error.
+All tools correct a reading N to a specific force ``a = A (N - b)``. In autopilots the bias b
+depends on temperature and the matrix A is the identity; in tools for tumble tests b and A are
+constant. An export's notes name the lost parts of the calibration, most with the resulting error.
 """
 
 from dataclasses import replace
@@ -184,9 +184,9 @@ def _losses(calibration: Calibration) -> list[str]:
         for regime in calibration.regime_sets()
     )
     if static != dynamic:
-        notes.append('the dynamic set is lost: the static set is used in ramps, too')
+        notes.append('the dynamic coefficients are lost: the static ones are used in ramps, too')
     if calibration.nonlinearity is not None and calibration.nonlinearity.terms:
-        notes.append('the nonlinear terms over specific force are lost')
+        notes.append('the terms nonlinear in specific force are lost')
     return notes
 
 
@@ -202,7 +202,7 @@ def import_calibration(
 ) -> Calibration:
     """
     Read the file of one of `TOOLS`, recognised by its content; both regimes get the same curves.
-    `number` chooses a parameter set or IMU, None the only set in use; `full_scale` is in m/s^2.
+    `number` chooses a parameter set or IMU (None: the only one in use); `full_scale` is in m/s^2.
     """
     readings = (tool.read(text, number) for tool in TOOLS.values())
     content = next((reading for reading in readings if reading is not None), None)
@@ -225,7 +225,7 @@ def import_calibration(
         )
     (_, _, _), (yx, _, _), (zx, zy, _) = (matrix * K).tolist()
     if not is_si:
-        # Counts around an offset, such as 32768, reach the offset plus the full scale.
+        # With an offset, such as 32768 counts, readings reach the offset plus the full scale.
         full_scale = full_scale * float(K.max()) + float(np.abs(content.bias[:, 0]).max())
     unity = Polynomial((1.0,))
     x_set, y_set, z_set = (unit.AxisSet(curve, unity) for curve in _curves(content.bias))

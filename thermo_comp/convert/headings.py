@@ -45,8 +45,8 @@ _OUTSIDE = re.compile('case|air|amb|baro|bmp|aht|room|hous|env')
 # Unit of a temperature at the end of a heading; words in headings that are not of a temperature.
 _DEGREES_END = re.compile('(^|_)(deg_?[cfk]|kelvin|fahrenheit)$')
 _NO_READING = re.compile('(^|_)(raw|adc|counts?|lsb|id|rev|status|valid|voltage|volts?|mv)(_|$)')
-# A heading that ends in a letter for the unit, or only names a place, is taken for the heading of
-# a thermometer only if the values in the column can be temperatures.
+# A heading like `magnet_c` (ends in the unit's letter) or `board` (a place alone) is that of a
+# thermometer only if the values in its column can be temperatures.
 _LETTER = re.compile('_[ck]$|^(board|case|imu|die|chip)_f$')
 _PLACE = re.compile('board|case|imu|die|chip')
 # Units as written in the brackets of a heading or, with underscores, at the end of a heading.
@@ -79,7 +79,7 @@ class Headings:
     accel_unit: str
     gyro: Triple | None
     gyro_unit: str
-    thermometers: dict[str, tuple[str, str]]  # column and unit by thermometer
+    thermometers: dict[str, tuple[str, str]]  # by thermometer: its column and unit
 
 
 def read_headings(
@@ -113,8 +113,8 @@ def _thermometers(
     headings: Sequence[str], names: Container[str], is_plausible: Callable[[str, str], bool]
 ) -> dict[str, tuple[str, str]]:
     """
-    Return column and unit by thermometer. A column whose heading only names a place, like `board`,
-    is used only if no other column is this thermometer. `names`: all headings, after `_plain`.
+    Return each thermometer's column and unit. A column whose heading is a place, like `board`, is
+    used only if its thermometer has no other column. `names`: `_plain` of all headings.
     """
     units = {heading: _stated(heading, _DEGREES) or 'degC' for heading in headings}
     warm, places = [], []
@@ -146,7 +146,7 @@ def map_lines(columns: Any) -> list[str]:
 
 
 def _given(value: Any) -> Any:
-    """Turn a dataclass into a mapping, without the defaults of keys other than `unit`."""
+    """Turn a dataclass into a mapping; leave out default values, except that of `unit`."""
     if is_dataclass(value):
         pairs = ((field, getattr(value, field.name)) for field in fields(value))
         return {f.name: _given(x) for f, x in pairs if x != f.default or f.name == 'unit'}

@@ -32,8 +32,8 @@ from ..unit.gravity import STANDARD_GRAVITY
 
 Unit = Literal['m/s^2', 'g', 'mg', 'counts']
 
-# |a| at rest in each unit, and its relative tolerance, which exceeds the errors of bias and scale
-# of cheap sensors, even in a chamber, and is far below the ratios of m/s^2, g and mg.
+# |a| at rest in each unit, and the relative tolerance of |a|: above the errors of bias and scale
+# of cheap sensors, even in a chamber, and far below the ratios of m/s^2, g and mg.
 PER_G: dict[Unit, float] = {'g': 1.0, 'm/s^2': STANDARD_GRAVITY, 'mg': 1000.0}
 _TOLERANCE = 0.2
 # Usual sensitivities of 16-bit sensors with ranges from +-16 g to +-2 g [counts/g].
@@ -231,7 +231,7 @@ def _refuse_wrong_units(log: ForeignLog, stillness: Stillness) -> None:
 def _log_times(stamp_ns: Ints, shifts: Ints | None = None) -> tuple[Ints, Ints]:
     """
     Return log times that never decrease, and the shift added after each restart of the clock [ns].
-    For a thermometer, give the `shifts` of the samples, so that readings get the same shifts.
+    Stamps of readings get the shifts of the samples' stamps, which the caller gives as `shifts`.
     """
     is_restart = np.diff(stamp_ns, prepend=stamp_ns[:1]) < -_RESTART_NS
     if shifts is None or len(shifts) != is_restart.sum():
@@ -293,8 +293,8 @@ def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:
     if not full.any():
         return Stillness(float('nan'), float('nan'), 0.0, ())
     sd = np.sqrt(cells.variance[full].mean(axis=1))
-    # The quiet level is the lower quartile of the cells' sd, since a unit may be handled for most
-    # of a log, and at least a quantum, since noise below the quantum is not visible.
+    # The quiet level is the lower quartile of the cells' sd, as a unit may be handled for most of
+    # a log. The quiet level is at least a quantum, as smaller noise is not visible.
     is_quiet = sd <= _MOVING_RATIO * max(np.quantile(sd, 0.25), cells.quantum.max())
     cell_ns = round(cells.cell_s * 1e9)
     moving: list[tuple[int, int]] = []

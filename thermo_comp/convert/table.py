@@ -130,7 +130,7 @@ def layout(head: str, delimiter: str | None = None) -> tuple[str, int]:
     for sign in (';', '\t', '|', ',', ' ') if delimiter is None else (delimiter,):
         rows = [row for _, row in _rows(lines, sign)]
         width, n_rows = _most_frequent([_n_cells(row) for row in rows[-_LAYOUT_ROWS:]])
-        # Often most rows lack the last cell, of a slow thermometer: use the full rows' width.
+        # If a slow thermometer in the last column leaves most rows short, full rows set the width.
         whole, _ = _most_frequent([len(row) for row in rows[-_LAYOUT_ROWS:]])
         is_whole = any(len(row) == whole and row[-1].strip() for row in rows)
         candidates.append((n_rows if width > 1 else 0, sign, whole if is_whole else width))
@@ -167,7 +167,7 @@ def _rows(file: Iterable[str], delimiter: str) -> _Rows:
 def _begin(rows: _Rows, width: int, has_header: bool | None) -> tuple[list[str], _Rows]:
     """
     Skip the preamble; return the headings, if any, and the rows of a table. A row has `width`
-    cells, of which the last may be blank. Rows of this width directly before the first row of
+    cells, of which the last may be blank. Rows of `width` cells directly before the first row of
     numbers belong to the table, and the first of these rows has the headings.
     """
     first = list(islice(rows, _PREAMBLE_ROWS))

@@ -8,11 +8,11 @@ Owns the ageing model of a unit: a Gaussian model of ``|f| - g`` at rest, fitted
 with the calibration's covariance; b and s are random walks of bias and scale since the
 calibration, o_k is the bias offset of start k, l_k are the unknown lag states at start k, lack is
 the lack of fit of the calibration, e_i is independent noise. The matrices H_i, B_i, S_i and L_i
-are derivatives of ``|f|``. The slopes of the bias over temperature are random walks of a fixed sd
-per root day. Jumps of the levels (bias and scale of each axis) or of gravity, and a change of the
-slope of the bias over temperature, are added one at a time, up to four, while the log Bayes factor
-of the next change is at least 5. The variances of random walks, offsets, lag states and scatter
-maximise the marginal likelihood times wide priors.
+are derivatives of ``|f|`` by parameters, bias, scale and lag states. The slopes of the bias over
+temperature are random walks of a fixed sd per root day. Jumps of the levels (bias and scale of
+each axis) or of gravity, and a change of the slope of the bias over temperature, are added one at
+a time, up to four, while the log Bayes factor of the next change is at least 5. The variances of
+random walks, offsets, lag states and scatter maximise the marginal likelihood times wide priors.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ from ..unit.calibration import Calibration
 from ..unit.gravity import MICRO_G
 from .series import RestSeries
 
-#: Prior medians, divided by that of the turn-on offset's sd: sd of the random walks of bias and of
-#: scale times g, per root day; sd of the scatter of rests. Prior sd of the natural logarithm of
-#: each sd in `Ageing` (1 sd is a factor of 5).
+#: Prior medians relative to the prior median of the turn-on offset's sd: sd of the random walks of
+#: bias and of scale times g, per root day; sd of the scatter of rests. Prior sd of the natural
+#: logarithm of each sd in `Ageing` (1 sd is a factor of 5).
 _WALK_SHARE, _SCATTER_SHARE, _LOG_SD = 0.5, 0.3, 1.6
 #: Smallest prior median of the turn-on offset's sd [m/s^2].
 _LEAST_TURN_ON = 5.0 * MICRO_G
-#: Prior standard deviations tried for a jump of the levels, or of gravity [m/s^2].
+#: Prior sds tried for a jump of biases and scales (times g), or of gravity [m/s^2].
 _JUMPS = (50.0 * MICRO_G, 500.0 * MICRO_G, 5000.0 * MICRO_G)
 #: Prior sd of a jump in the three biases, and in the three scales times g, relative to `_JUMPS`: a
 #: shock changes a scale times g less than a bias.
 _JUMP_SHARES = np.repeat([1.0, 0.1], 3)
 #: Smallest log Bayes factor at which a change is added to the model (odds 150:1), and smallest log
-#: Bayes factor of a jump of gravity against a jump of the levels (odds 20:1).
+#: Bayes factor of a jump of gravity against any other change (odds 20:1).
 _LEAST_GAIN, _LEAST_LEAD = 5.0, 3.0
 #: Prior standard deviations tried for a change of a curve's slope [m/s^2 per K].
 _BENDS = (1.0 * MICRO_G, 10.0 * MICRO_G)
@@ -93,7 +93,7 @@ class Change:
     may_be_gravity: bool = False
 
     def columns(self, rows: Rows) -> Floats:
-        """Return derivatives of rows by levels (n, 6), gravity (n, 1) or bias slopes (n, 3)."""
+        """Return derivatives of `rows.y`: by levels (n, 6), gravity (n, 1) or slopes (n, 3)."""
         if self.time is None:
             return rows.by_slope
         of_jump = rows.by_jump[:, 6:] if self.kind == 'gravity' else rows.by_jump[:, :6]
@@ -104,7 +104,7 @@ class Change:
 class Rows:
     """
     Equations of the rests in the order of the node's starts, at most `_ROWS` per start: orthogonal
-    combinations of the rests of a start, with all information of the rests about the six levels.
+    combinations of the rests of a start, with all information of the rests about bias and scale.
 
     y, `by_...`, lack: combinations of ``|f| - g`` [m/s^2] and of the fields of `RestSeries`
     noise, scatter: variance of the noise of a row, and factor of the scatter variance in a row
@@ -127,12 +127,12 @@ class Rows:
 
     @property
     def by_slope(self) -> Floats:
-        """Derivatives by the slopes of the bias over temperature, (n, 3)."""
+        """Derivatives of `y` by the slopes of the bias over temperature, (n, 3)."""
         return np.asarray(self.by_level[:, :3] * self.warmth[:, np.newaxis])
 
     @property
     def by_jump(self) -> Floats:
-        """Derivatives by a jump of levels, times `_JUMP_SHARES`, and of gravity, (n, 7)."""
+        """Derivatives of `y` by jumps: levels (times `_JUMP_SHARES`) and gravity, (n, 7)."""
         return np.column_stack((self.by_level * _JUMP_SHARES, self.by_gravity))
 
     def at(self, chosen: Bools) -> Rows:
@@ -150,7 +150,7 @@ def rows_of(series: RestSeries, scatter: float) -> Rows:
         Q = np.eye(len(at))
         if len(at) > _ROWS:
             Q = np.linalg.svd(series.by_level[at] * weight[:, np.newaxis], full_matrices=False)[0]
-        # The columns of Q are orthonormal: a row made of n equal rests is sqrt(n) times one rest.
+        # The columns of Q are orthonormal: n equal rests become sqrt(n) times the equation of one.
         Q = Q * weight[:, np.newaxis]
         n, warmth = Q.shape[1], series.temperature[at].mean() - series.reference_temperature
         # A change of gravity changes |f| by the same value in all attitudes.
@@ -163,12 +163,12 @@ def rows_of(series: RestSeries, scatter: float) -> Rows:
     searched = rows.start[rows.rank < _SEARCH_ROWS]
     if len(searched) <= _MOST_ROWS:
         return rows
-    # The oldest starts are left out: they have little information about the levels of today.
+    # The oldest node starts are left out: they tell little about the present bias and scale.
     return rows.at(rows.start > searched[-_MOST_ROWS])
 
 
 class Model:
-    """Covariance of rows as a function of `Ageing`; random walks begin at the day `since`."""
+    """Covariance of `rows.y` as a function of `Ageing`; random walks begin at day `since`."""
 
     def __init__(
         self, rows: Rows, calibration: Calibration, since: float, changes: Sequence[Change] = ()
@@ -207,7 +207,7 @@ class Model:
         return result
 
     def fitted(self, centre: Ageing) -> tuple[Ageing, Floats]:
-        """Return the sds of the largest posterior density, and the inverse covariance of rows."""
+        """Return the sds of largest posterior density, and the inverse covariance of `rows.y`."""
         middle = np.log(list(vars(centre).values()))
 
         def loss(logs: Floats) -> tuple[float, Floats]:
@@ -253,7 +253,7 @@ class Model:
 
 
 def usual(calibration: Calibration) -> Ageing:
-    """Return prior medians of `Ageing` from the fit's residual sd, or else the noise in 1 Hz."""
+    """Return prior medians of `Ageing` from the fit's residual sd, else from the noise."""
     residual = max(axis.residual_sd_m_s2 for axis in calibration.static.axes())
     turn_on = max(residual or max(calibration.noise_density_m_s2_sqrt_hz), _LEAST_TURN_ON)
     walk = _WALK_SHARE * turn_on
@@ -266,8 +266,8 @@ def learn(
     """
     Estimate the ageing model by evidence, without starts that contradict all other starts.
 
-    At most four changes are added, each with a log Bayes factor of at least `_LEAST_GAIN`. A start
-    of the node is left out if an equation of its rests (a row) is more than 5 sd from the
+    At most four `Change`s are added, each with a log Bayes factor of at least `_LEAST_GAIN`. A
+    start of the node is left out if an equation of its rests (a row) is more than 5 sd from the
     prediction by all other rows. Returns the sds, the model of the used rests, and these rests.
     """
     centre = usual(calibration)
@@ -299,8 +299,8 @@ def learn(
 
 def _best(candidates: Iterable[Change], is_gravity_certain: bool) -> Change | None:
     """
-    Return the most probable change, or None if no log Bayes factor reaches `_LEAST_GAIN`. The
-    log Bayes factor of a gravity jump must also exceed those of other kinds by `_LEAST_LEAD`.
+    Return the most probable `Change`, or None if no log Bayes factor reaches `_LEAST_GAIN`. The
+    log Bayes factor of a gravity jump must exceed that of any other change by `_LEAST_LEAD`.
     """
     every = list(candidates)
     of_gravity = [change for change in every if change.kind == 'gravity']
@@ -319,7 +319,7 @@ def _gain(change: Change | None) -> float:
 
 
 def _candidates(model: Model, inverse: Floats) -> Iterator[Change]:
-    """Yield jumps before each start and a change of the bias slopes, with log Bayes factors."""
+    """Yield jumps before each node start, and a change of bias slopes, with log Bayes factors."""
     rows = model.rows
     alpha, by_jump = inverse @ rows.y, rows.by_jump
     _, first = np.unique(rows.start, return_index=True)
@@ -330,7 +330,7 @@ def _candidates(model: Model, inverse: Floats) -> Iterator[Change]:
         for i in range(width):
             precision[:, :, i, j] = np.add.reduceat(by_jump[:, [i]] * half, first, axis=0)
     gradient = np.add.reduceat(by_jump * alpha[:, np.newaxis], first, axis=0)
-    # A jump before a start shifts |f| at this start and at all later starts.
+    # A jump before a node start shifts |f| at this start and at all later starts.
     after = np.cumsum(np.cumsum(precision[::-1, ::-1], axis=0), axis=1)[::-1, ::-1]
     gradient = np.cumsum(gradient[::-1], axis=0)[::-1]
     known = {(change.kind, change.time) for change in model.changes}
@@ -375,7 +375,7 @@ class Solution:
     gravity: tuple[tuple[Change, float, float], ...] = ()
 
     def before(self, row: int) -> Floats:
-        """Return the shift due to the equations before `row`."""
+        """Return the shift of the file parameters due to the equations before number `row`."""
         return np.asarray(self.gains[:row].T @ self.innovations[:row])
 
 
@@ -398,7 +398,7 @@ def solve(model: Model, ageing: Ageing, to_file: Floats, bend: Floats, ahead: fl
     gravity = []
     for change in model.changes:
         columns = change.columns(rows)
-        if change.kind == 'gravity':  # the calibration file has no parameter for a jump of gravity
+        if change.kind == 'gravity':  # a jump of local gravity changes no calibration parameter
             gain = change.sd**2 * solve_triangular(lower, columns[:, 0], lower=True)
             variance = max(float(change.sd**2 - gain @ gain), 0.0)
             gravity.append((change, float(gain @ innovations), float(np.sqrt(variance))))

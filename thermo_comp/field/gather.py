@@ -5,8 +5,8 @@ Owns the detection of rests in a stream of samples: windows of 10 s without moti
 
 Samples are summed by whole seconds of their stamps. A cell is the smallest number of seconds with
 at least five samples, which is one second at 5 Hz or more. A cell is still if its standard
-deviation is above 0 and below `SCATTER_FACTOR` times that of the noise, and its mean agrees with
-those of the preceding cell and of the first cell of the window. Successive still cells that span
+deviation is above 0 and below `SCATTER_FACTOR` times the sd of the noise, and its mean agrees with
+the means of the preceding cell and of the window's first cell. Successive still cells that span
 10 s form a window. In a long rest all windows of the first ten minutes are kept, then one window
 per minute up to an hour, then one per five minutes.
 """
@@ -32,13 +32,13 @@ _SPACING = ((360, 30), (60, 6), (0, 1))
 
 #: Thermal state, and remaining fractions of the unknown initial lag states.
 _State = tuple[Sequence[float], Sequence[float]]
-#: A function that returns the present state, or None before the first temperature reading.
+#: Returns the present thermal state, or None before the first temperature reading.
 StateNow = Callable[[], _State | None]
 
 
 @dataclass
 class _Cell:
-    """Sums of samples, less the first sample `origin`, over the seconds `begin` to `last`."""
+    """Sums of the samples less the first sample, `origin`, from second `begin` to `last`."""
 
     begin: int
     last: int
@@ -105,7 +105,7 @@ class RestFinder:
             if self._n_windows % spacing == 0:
                 rests.append(self._window())
             self._n_windows += 1
-            # The first cell of the next window is compared with the last cell of this window.
+            # The next window's first cell is compared with the finished window's last cell.
             self._run, self._last = [], [cell]
         if not is_followed:
             self._forget()

@@ -28,7 +28,7 @@ _OF_START, _OF_REST = b' {', b' ['
 @dataclass(frozen=True)
 class Start:
     """
-    A start of the node, or a later change of the node's calibration, which keeps `start_ns`.
+    A start of the node; a change of calibration makes a further `Start` of equal `start_ns`.
 
     `start_ns` identifies a start of the node; it is no date, as the clock may be set later.
     """
@@ -62,8 +62,8 @@ class Rest:
 def encode(record: Start | Rest) -> bytes:
     """Return a start or a rest as a line of a rest log."""
     if isinstance(record, Start):
-        # Earlier releases cannot read rates and the newer fields of lags and plays: such fields
-        # are written only if their values differ from the defaults.
+        # Earlier releases cannot read rates and newer fields of lags and play operators: write
+        # such fields only if their values differ from the defaults.
         sensors, lags, plays, rates = vars(record.memory).values()
         memory = [sensors, *([_shortened(each) for each in all_] for all_ in (lags, plays))]
         data: Any = {**vars(record), 'memory': [*memory, rates] if rates else memory}
@@ -78,7 +78,7 @@ def encode(record: Start | Rest) -> bytes:
 
 
 def _shortened(quantity: Lag | Play) -> tuple[Any, ...]:
-    """Return the fields of a lag or play, without trailing fields that have default values."""
+    """Return the fields of a lag or play operator, without default values at the end."""
     values, defaults = tuple(quantity), [*type(quantity)._field_defaults.values()]
     while defaults and values[-1] == defaults.pop():
         values = values[:-1]
@@ -132,7 +132,7 @@ def _rest(data: list[Any], memory: MemorySpec) -> Rest:
 
 
 def _quantity(cls: type[Any], values: Sequence[Any]) -> Any:
-    """Make a lag or a play from the values of its first fields."""
+    """Make a lag or a play operator from the values of its first fields."""
     names = cls._fields[: len(values)]
     pairs = zip(names, values, strict=True)
     return cls(*(str(v) if name in ('input', 'sensor') else _number(v) for name, v in pairs))
@@ -158,8 +158,8 @@ def counted_rests(content: bytes) -> int:
 
 def thinned(content: bytes) -> bytes:
     """
-    Drop every second rest of a log, and lines of neither rests nor node starts; checksums are not
-    verified. The first rest of each start is kept.
+    Keep the node starts of a log and the first, third, fifth ... rest after each start; drop all
+    other lines. Checksums are not verified.
     """
     kept: list[bytes] = []
     n = 0
@@ -178,8 +178,8 @@ def rests_of(
     """
     Decode several files into rests without duplicates, sorted by start, then by stamp.
 
-    The node's starts are sorted by the stamp of their last rest: `start_ns` and their first stamps
-    may be from the time before the computer set its clock.
+    The node's starts are sorted by the stamp of their last rest: `start_ns` and the first stamps
+    of a start may be from the time before the computer set its clock.
     """
     everything: dict[tuple[int, int], tuple[Start, Rest]] = {}
     n_damaged = 0

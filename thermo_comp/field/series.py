@@ -4,10 +4,10 @@
 Owns rests as measurements of the error of a calibration: ``|f| - g`` and its derivatives.
 
 A rest at an unknown attitude measures one number, |f|. Let x be the forces along the axes, f = M
-x, u = f / |f| and v = M^T u. If the bias of axis i in the calibration is too large by d_bias
-[input units] and its scale by d_scale [relative], |f| changes by ``-v_i (d_bias + K_i x_i d_scale)
-/ scale_i``. To first order ``|f| - g`` is the matrix H of derivatives by all parameters times the
-true less the calibrated parameters, plus noise.
+x, u = f / |f| and v = M^T u. A bias of axis i that is too large by d_bias [input units], and a
+scale too large by d_scale [of K_i], change |f| by ``-v_i (d_bias + K_i x_i d_scale) /
+scale_i``, scale_i: scale factor at the rest. To first order ``|f| - g`` is noise plus H times the
+errors of all parameters (true less calibrated); H: derivatives of |f| by these errors.
 """
 
 from __future__ import annotations
@@ -78,12 +78,12 @@ class RestSeries:
 
     @property
     def day(self) -> Ints:
-        """Day on which the node started, for each rest [days since 1970]."""
+        """Day of the first rest after the start of the node, for each rest [days since 1970]."""
         _, first = np.unique(self.start, return_index=True)
         return np.asarray(np.floor(self.time[first])[self.start], dtype=np.int64)
 
     def at(self, chosen: Bools | slice) -> RestSeries:
-        """Return the selected rests; the remaining starts are numbered from 0."""
+        """Return the selected rests, with their starts renumbered from 0."""
         arrays = (item for item in vars(self).items() if isinstance(item[1], np.ndarray))
         parts: dict[str, Any] = {name: value[chosen] for name, value in arrays}
         parts['start'] = np.unique(parts['start'], return_inverse=True)[1]
@@ -105,10 +105,10 @@ def read_rests(
     """
     Read the rest logs of a calibration's unit.
 
-    Returns the rests, the `Source` for the provenance of an update by these rests, in whose name
-    `ahead` is the time of ageing in the covariance [days], and notes. Rests before the date of the
-    calibration are left out, unless all are before this date. Rests of an earlier update are left
-    out if `is_for_update`. Raises RecordingError if no rest remains.
+    Returns the rests, a `Source` for the provenance of an update by these rests, and notes.
+    `ahead`: number of days of ageing that the covariance of the update will include. Rests before
+    the date of the calibration are left out, unless all are before this date. Rests of an earlier
+    update are left out if `is_for_update`. Raises RecordingError if no rest remains.
     """
     files: list[Path] = []
     for path in paths:
@@ -144,7 +144,7 @@ def read_rests(
         found = of_others if others else 'the files contain no rests'
         raise RecordingError(f'no rest of unit {wanted}: {found}', ', '.join(map(str, paths)))
     begin, _, is_update = valid_since(calibration)
-    # The name of an update's source has the time of the last rest rounded down to a second.
+    # An update states the time of its last rest in whole seconds, rounded down.
     first_ns = begin * _DAY_NS + 1e9 * is_update
     later = [(start, rest) for start, rest in rests if rest.stamp_ns > first_ns]
     if is_update and not is_for_update:
@@ -184,8 +184,8 @@ def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
     Return the time at which a calibration was determined, the time up to which its covariance
     includes ageing [both in days since 1970], and whether it is an update.
 
-    The first time is that of the last rest of an update, else the date of the test or of the file,
-    or -inf without a date.
+    An update was determined at its last rest, another calibration at the date of the test or file;
+    without a date, both returned times are -inf.
     """
     every = (source.name for source in calibration.provenance.sources)
     names = [name for name in every if name.startswith(_UNTIL)]
@@ -196,7 +196,7 @@ def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
         ahead = float(aged.removesuffix(' d') or 0.0)
     except ValueError:
         return -np.inf, -np.inf, False
-    # Dates or times of ageing that `update` cannot have written, such as a century, are ignored.
+    # Ignore times of ageing that `update` cannot have written: below 0, a century or more.
     if np.isnat(moment) or not 0.0 <= ahead < 36525.0:
         return -np.inf, -np.inf, False
     begin = int(moment.astype(np.int64)) / _DAY_NS
@@ -207,7 +207,7 @@ def series_of(
     rests: Sequence[tuple[Start, Rest]], calibration: Calibration, gravity: float | None = None
 ) -> RestSeries:
     """
-    Compute ``|f| - g`` and its derivatives at rests, with the logged g or with `gravity`. Raises
+    Compute ``|f| - g`` and its derivatives at rests; `gravity` replaces the logged g. Raises
     RecordingError if the log does not have the lags of the calibration.
     """
     correction = Correction(calibration)
@@ -225,7 +225,7 @@ def series_of(
     averaged = partial(means_by, group)
     of_rests = beginnings[np.searchsorted(group, np.arange(len(sizes)))]
     _, first, start = np.unique(of_rests, return_index=True, return_inverse=True)
-    start = np.argsort(np.argsort(first))[start]  # numbers from 0 in the order of the rests
+    start = np.argsort(np.argsort(first))[start]  # node starts, numbered in the order of rests
     states, mean, shares, local = map(averaged, (states, mean, shares, local))
     bias, scale = (part.T for part in correction.bias_scale(states.T))
     x = (mean - bias) / scale
@@ -264,7 +264,7 @@ def series_of(
 
 
 def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
-    """Return the indices, in `memory`, of the state elements and of the lags of `wanted`."""
+    """Return the indices in `memory` of the state elements, and of the lags, of `wanted`."""
     try:
         logged, target = StateLayout(memory).numbers, StateLayout(wanted).numbers
         places = np.array([logged.index(number) for number in target], np.int64)
@@ -278,12 +278,12 @@ def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
 
 def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
     """
-    Return the number of the group of each window; the at most 60 consecutive windows of a group
+    Return the number of the group of each window; up to 60 consecutive windows form a group, and
     are averaged to one rest.
 
     The windows of a group belong to one start of the node, and differ from the first window of the
-    group by less than 1e-3 in each component of the force's direction and 1 K. If vectors differ
-    by an angle, the relative decrease of the norm of their mean is at most half the squared angle.
+    group by less than 1e-3 in each component of the force's unit vector, and by less than 1 K.
+    The mean of unit vectors at angles of up to a to each other has a norm of 1 - a^2 / 2 or more.
     """
     direction = force / np.sqrt((force**2).sum(axis=1, keepdims=True))
     group = np.zeros(len(start), dtype=np.int64)
@@ -298,7 +298,7 @@ def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
 
 
 class _Geometry(NamedTuple):
-    """Thermal states, remaining shares of lag states, and u, v, x of this module's docstring."""
+    """Thermal states, shares left of initial lag states, u = f / |f|, v = M^T u, forces x."""
 
     states: Floats
     shares: Floats
@@ -321,8 +321,8 @@ def _uncertainty(
     weight, unknown = at.states[:, WEIGHT], at.states[:, UNKNOWN]
     regimes = np.array([1.0 - weight, weight])
     unexplained = correction.curves.unexplained(at.states[:, BOARD])
-    # The ageing model has separate terms for the residual sd and the lack of fit, so both
-    # variances are subtracted here, those of both sets if the regime is unknown.
+    # The ageing model has separate terms for the residual sd and the lack of fit: subtract both
+    # variances from `slow`; in an unknown regime, those of the static and of the dynamic set.
     of_sets = regimes + unknown * regimes[::-1]
     slow -= (at.v.T**2 * (of_sets[:, np.newaxis] * unexplained).sum(axis=0)).sum(axis=0)
     residual = [[a.residual_sd_m_s2**2 for a in part.axes()] for part in calibration.regime_sets()]
@@ -331,7 +331,7 @@ def _uncertainty(
 
 
 def _variance_along(correction: Correction, slow: SlowUncertainty, at: _Geometry) -> Floats:
-    """Return the variance of the error along u without the noise of a sample, (n,)."""
+    """Return the variance of |f|, (n,), due to `slow` and all else but the samples' noise."""
     columns, x = at.states.T, at.x.T
     line = list(correction.line(columns, columns, slow.at(columns, at.shares.T), 0.0))
     if correction.of_force is None:

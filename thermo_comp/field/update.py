@@ -4,8 +4,8 @@
 Owns the update of a calibration from rests in the field, and its score on left-out rests.
 
 A rest determines the error along gravity alone, so rests in few attitudes leave axes undetermined.
-An axis is updated only if the rests reduce the sd of a combination of its bias and scale to at
-most 0.6 times the sd before the update, with ageing. Other axes keep their values; their sd grows.
+An axis is updated only if the rests reduce the sd of a combination of its bias and scale by 40 %
+or more (from the sd that includes ageing). Other axes keep their values with larger sds.
 """
 
 from collections.abc import Sequence
@@ -27,11 +27,11 @@ from ..unit.provenance import Provenance, ResidualSummary, Source
 from .ageing import Ageing, Change, Model, Solution, learn, solve
 from .series import RestSeries, last_rest, valid_since
 
-#: Conclusions that `--allow` excludes: that gravity is not as stated; that the unit is another.
+#: Conclusions that `--allow` excludes: gravity is not as stated; the rests are of another unit.
 OVERRIDES = ('gravity', 'unit')
-#: Limits of the RMS of |f| - g over the rests of a start: relative to gravity (1 mg, as after a
-#: shock), and in claimed sd (30, some milli-g for a poor sensor). An RMS above both limits is
-#: taken for that of another unit.
+#: The rests of a node start are taken for those of another unit if their RMS of |f| - g exceeds
+#: this fraction of gravity (1 mg, as after a shock) and this number of claimed sds (some milli-g
+#: for a poor sensor).
 _LARGEST_PART, _LARGEST_SIGMAS = 1e-3, 30.0
 
 
@@ -138,15 +138,15 @@ def update(
         )
     _, aged, is_update = valid_since(calibration)
     first, last = float(series.time.min()), float(series.time.max())
-    # The random walks begin at the time `aged` up to which the covariance includes ageing; if this
-    # time is unknown or after the first rest (the last, for an updated file), at the first rest.
+    # The covariance includes ageing up to the time `aged`. The random walks begin at `aged` if it
+    # is before the first rest (before the last rest for an updated file), else at the first rest.
     since = aged if -np.inf < aged < (last if is_update else first) else first
     ageing, model, used = learn(series, calibration, since, is_gravity_certain=is_gravity_certain)
     solution = solve(model, ageing, *_derivatives(calibration), ahead)
     determined, by_axis = _axis_changes(used, calibration, model, solution, ageing)
     judged = _judged(used, model, solution, determined)
     shift, kept = solution.shift * determined, solution.shift * ~determined
-    # The estimated shift of parameters that are not updated is an error of their old values.
+    # The shift of a parameter that is not updated remains as an error: add its square.
     covariance = solution.posterior + solution.future + np.outer(kept, kept)
     turn_on = float(np.hypot(ageing.turn_on, ageing.rest))
     new = _shifted(calibration, shift, covariance)
@@ -226,7 +226,7 @@ def _axis_changes(
         ratio = eigh(posterior[:2, :2], prior[:2, :2] + jitter, eigvals_only=True)[0]
         is_determined = bool(ratio <= 0.6**2)
         determined[bias.static : scale.end] = is_determined
-        # The estimated shift is an error of the old calibration.
+        # Mean square error of the old calibration: posterior variance plus the shift squared.
         error = posterior[3, 3] + float(rows[3] @ solution.shift) ** 2
         residual = calibration.static.axes()[axis].residual_sd_m_s2
         scatter = float(np.hypot(ageing.turn_on, ageing.rest))
@@ -242,7 +242,7 @@ def _axis_changes(
 
 
 def _judged(series: RestSeries, model: Model, solution: Solution, determined: Bools) -> Judged:
-    """Score an update by earlier rests on each day (on each node start if under 5 days)."""
+    """Score on each day (under 5 days: each node start) an update by rests of earlier starts."""
     over, labels = 'days', series.day
     if len(np.unique(labels)) < 5:
         over, labels = 'starts', series.start
@@ -275,7 +275,7 @@ def _gravity_part(series: RestSeries, solution: Solution) -> Floats:
 
 
 def refuse_another_unit(result: Update) -> None:
-    """Raise FitError if a start's RMS of |f| - g exceeds 1 mg and 30 claimed sds."""
+    """Raise FitError if the RMS of |f| - g at a node start exceeds 1 mg and 30 claimed sds."""
     series = result.series
     residual = series.residual - _gravity_part(series, result.solution)
     rms, claim = (np.sqrt(means_by(series.start, part**2)) for part in (residual, series.claim))
@@ -304,7 +304,7 @@ def _shifted(calibration: Calibration, shift: Floats, covariance: Floats) -> Cal
 
 
 def _with_residual(part: RegimeSet, turn_on: float, changes: Sequence[AxisChange]) -> RegimeSet:
-    """Set the residual sd to `turn_on` on determined axes, and at least to `turn_on` on others."""
+    """Set each axis' residual sd: `turn_on` if determined, at least `turn_on` if not."""
     axes: dict[str, Any] = {}
     for axis, change in zip(part.axes(), changes, strict=True):
         sd = turn_on if change.is_determined else max(turn_on, axis.residual_sd_m_s2)

@@ -3,11 +3,11 @@
 """
 Owns the drift watch: comparison of ``|f| - g`` in a rest log with the claimed sd, and a forecast.
 
-A unit is within its claim while the RMS of its errors along gravity, over attitudes and starts, is
-at most `LIMIT` times the sd that its calibration claims for these errors. The verdict follows from
-the rests of the last week and from the error at the last rest by the ageing model. The forecast is
-the distribution of the time at which the RMS first exceeds the limit, for random walks of bias and
-scale that begin at the present estimate and have the variances estimated from the log.
+A unit is within its claim while the RMS of its errors along gravity, over attitudes and node
+starts, is at most `LIMIT` times the sd that its calibration claims for them. The verdict follows
+from the rests of the last week and the error at the last rest by the ageing model. The forecast is
+the distribution of the time at which this RMS first exceeds the limit, for random walks of bias
+and scale that begin at the present estimate and have the variances estimated from the log.
 """
 
 from collections.abc import Sequence
@@ -24,8 +24,8 @@ from .update import Update, update
 
 #: Largest RMS error that agrees with the claim, in claimed standard deviations.
 LIMIT = 2.0
-#: Number of days whose RMS decides the verdict: enough to average the scatter of single starts,
-#: and few against the time in which a unit drifts to the limit.
+#: Number of days whose RMS of |f| - g decides the verdict: enough to average the scatter of node
+#: starts, and far less than the time in which a unit drifts to the limit.
 _WINDOW_DAYS = 7
 #: Smallest number of starts of the node whose attitudes the forecast uses.
 _LEAST_STARTS = 10
@@ -49,7 +49,7 @@ class Row:
 
     @property
     def is_within(self) -> bool:
-        """Whether the RMS is at most the limit: the tolerance, or `LIMIT` times the claimed sd."""
+        """Whether the RMS of |f| - g is at most the tolerance, or `LIMIT` times the claimed sd."""
         return self.rms <= self.limit
 
 
@@ -142,9 +142,9 @@ def watch(series: RestSeries, calibration: Calibration, tolerance: float | None 
         ageing = updated.ageing
         forecast, interval = _forecasts(updated, tolerance)
     is_out, is_row_out = recent > 1.0, np.array([not row.is_within for row in days])
-    # The RMS of a week responds late to a change. A unit is therefore outside its claim after one
-    # day above the limit if the error by the ageing model at the last rest is also above it; and
-    # within its claim after two days within the limit if this error is within the limit, too.
+    # The RMS of |f| - g over a week responds late to a change. If the error by the ageing model is
+    # above the limit, a last day above the limit suffices for 'outside its claim'; if the model's
+    # error is within the limit, two last days within the limit suffice for 'within its claim'.
     is_error_out = bool(forecast) and forecast[1] == 0.0
     is_out[-1] &= is_error_out or is_row_out[-2:].any()
     is_out[-1] |= is_error_out and is_row_out[-1]
@@ -156,8 +156,8 @@ def watch(series: RestSeries, calibration: Calibration, tolerance: float | None 
         outside_since = next((row.name for row in window if not row.is_within), window[-1].name)
         forecast = ()
     elif (recent > 1.0).any():
-        # The day after the last day above the limit exists, because the last day is within the
-        # limit if the unit is within its claim.
+        # The last day above the limit is followed by another day, because either a later week or
+        # the last two days are within the limit.
         until = int(np.flatnonzero(recent > 1.0)[-1])
         inside_since = days[int(np.flatnonzero(is_row_out[: until + 1])[-1]) + 1].name
     periods = _rows(series, firsts, ordered[::together].tolist(), tolerance)
@@ -170,7 +170,7 @@ def watch(series: RestSeries, calibration: Calibration, tolerance: float | None 
 
 def _smoothed(day: Ints, ratio: Floats) -> tuple[Ints, Floats]:
     """
-    Return the index of the first day, and the robust RMS, of the week that ends on each day.
+    Return, for the week that ends on each day, the index of its first day and its RMS of `ratio`.
 
     If a week has only one day with rests, the preceding day with rests is added. The largest daily
     RMS of a week, perhaps of a disturbed day, is replaced by the second largest.
@@ -190,27 +190,27 @@ def _forecasts(
     Return the quantiles of the time until the error of the unit exceeds the limit, with the
     present calibration and with an update at the last rest.
 
-    The attitudes are those of the rests of the last week, and of the last ten node starts.
+    Error: RMS of |f| - g in the attitudes of rests of the last week or the last ten node starts.
     """
     used, ageing, solution = updated.series, updated.ageing, updated.solution
     is_recent = used.time > used.time[-1] - _WINDOW_DAYS
     recent = used.at(is_recent | (used.start > used.start[-1] - _LEAST_STARTS))
     share = recent.n_windows / recent.n_windows.sum()
-    # With the errors e of parameters and levels, the norm of `root @ e` is the RMS of |f| - g.
+    # With e the errors of parameters, biases and scales, |root @ e| is the RMS of |f| - g.
     joined = np.hstack((recent.by_parameter, recent.by_level)) * np.sqrt(share)[:, np.newaxis]
     root = np.linalg.qr(joined, mode='r')
     of_parameters, of_levels = np.split(root, [recent.by_parameter.shape[1]], axis=1)
     walk = of_levels * np.repeat([ageing.bias, ageing.scale], 3)
     bias, scale = (float((part**2).sum()) for part in np.split(walk, 2, axis=1))
-    # The offsets of the starts add to the error, so their variance is subtracted from the square
-    # of the limit. The ageing model may overestimate this variance after an earlier disturbance,
-    # so the variance of the recent rests is used if it is smaller.
+    # Bias offsets of node starts add to the error, so their variance is subtracted from the square
+    # of the limit. After a disturbance the ageing model may overestimate the offsets' variance:
+    # use the variance of |f| - g at the recent rests instead, if this variance is smaller.
     scatter = ageing.turn_on**2 * float((of_levels[:, :3] ** 2).sum()) + ageing.rest**2
     left = recent.residual - recent.by_parameter @ solution.shift
     scatter = min(scatter, float(share @ left**2))
     limit = tolerance or LIMIT * float(np.sqrt(share @ recent.claim**2))
     bound = float(np.sqrt(max(limit**2 - scatter, 0.0)))
-    # Sd, by the delta method, of the logarithm of the variance by which the error grows per day.
+    # Sd (by the delta method) of the logarithm of the daily growth of the error's variance.
     slope = 2.0 * np.array([bias, scale]) / (bias + scale)
     of_walks = updated.model.log_covariance(ageing)[:2, :2]
     rate_sd = float(np.sqrt(slope @ of_walks @ slope))
@@ -240,17 +240,17 @@ def passage(
     """
     Return quantiles of the time [days] at which the norm of a random walk first exceeds a bound.
 
-    The initial value has the mean `mean`, (k,), and the covariance `covariance`, (k, k). Its
-    change after d days is sqrt(d) `walk`, (k, m), times m independent normal variables; `rate_sd`
-    is the sd of the logarithm of the variance of the walk. The time is 0 if the initial norm is
-    above the bound, else at least 0.01 days.
+    The walk begins at a random vector of mean `mean`, (k,), and covariance `covariance`, (k, k).
+    In d days the walk changes by sqrt(d) `walk`, (k, m), times m independent normal variables;
+    `rate_sd` is the sd of the logarithm of the variance of the walk. A walk that begins above the
+    bound has the time 0, any other walk at least 0.01 days.
     """
     rng = np.random.default_rng(1)
     # Principal directions with less than a thousandth of the largest error are left out.
     size, vectors = np.linalg.eigh(covariance + np.outer(mean, mean) + walk @ walk.T)
     onto = vectors[:, size > 1e-6 * size[-1]].T
     mean, covariance = onto @ mean, onto @ covariance @ onto.T
-    # Reduce the independent variables to one per direction, without a change of the covariance.
+    # A square factor of the walk's covariance needs only one normal variable per direction.
     walk = np.transpose(np.linalg.qr((onto @ walk).T, mode='r'))
     values, vectors = np.linalg.eigh(covariance)
     initial = vectors * np.sqrt(np.maximum(values, 0.0))
@@ -270,9 +270,9 @@ def passage(
         moved = rng.standard_normal((len(error), walk.shape[1])) @ walk.T
         error = error + (speed * np.sqrt(step))[:, np.newaxis] * moved
         size = np.sqrt(np.einsum('ij,ij->i', error, error))
-        # Between two times a Brownian bridge crosses the bound with the probability exp(-2 a b /
-        # variance): a and b are the distances from the bound at these times, and the variance is
-        # that of the step along the error.
+        # A Brownian bridge with the distances a and b from the bound at two times crosses the
+        # bound between the times with the probability exp(-2 a b / variance), `variance` being
+        # that of the walk's change between the times along the error vector.
         onto_walk = error @ walk
         along = np.einsum('ij,ij->i', onto_walk, onto_walk) * speed**2 * step
         product = left * np.maximum(bound - size, 0.0) * size**2

@@ -43,7 +43,7 @@ def model_of(
         {name for name, readings in bag.temperatures.items() if len(readings.value)}
         for bag in bags
     )
-    # Case thermometer, recorded or not, and all thermometers but the board's that every bag has.
+    # Thermometers of the columns: the case's, even if not recorded, and others that all bags have.
     sensors = 'case', *sorted(set.intersection(*recorded) - {'board', 'case'})
     detector = options.detector or learn_detector(bags)
     columns: tuple[Column, ...] = ()
@@ -64,13 +64,13 @@ def model_of(
 
 
 def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
-    """Fit the windows with alternative lags and regimes; return the best fit and its windows."""
+    """Fit the windows with alternative lags and regime detectors; return the best fit."""
     bags, options = problem.bags, problem.options
     fit = _with_lags(windows, problem)
     has_case = all(len(bag.case.value) for bag in bags)
     has_choice = has_case and options.prior is None and options.detector is None
-    # The regime detector matters if a model with a set of curves per regime is chosen, or is at
-    # most one standard error worse and, on each axis, has under 80 % of the chosen model's noise.
+    # Compare detectors if the chosen model has a curve for each regime, or if another model with a
+    # curve for each regime `is_near` and has under 80 % of the chosen model's noise on each axis.
     trials = fit.selected.trials
     chosen = next(trial for trial in trials if trial.is_chosen)
     limit = 0.8 * chosen.posterior.prior.sigma
@@ -87,7 +87,7 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     closed = replace(model, detector=replace(model.detector, end_condition='case'))
     undisturbed = fit.windows.data.undisturbed
     early = regress(windows_of(bags, closed, options, undisturbed=undisturbed), problem)
-    # Errors of left-out halves of the program limit the columns; they do not compare detectors.
+    # Left-out halves of the program detect superfluous columns, not the better of two detectors.
     return early if is_better(fit.selected.score, early.selected.score, by_halves=False) else fit
 
 
@@ -105,9 +105,9 @@ def windows_of(
 
 def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
     """
-    Fit the windows with one lag per axis (`find_parts`); or with the columns of `windows`, if no
-    lags are found (with a prior, and for Golovach's model, none are sought), or if all lags found
-    leave a left-out drift above `Parts.most_drift` and the fit without these lags is better.
+    Fit the windows with one lag per axis (`find_parts`). If no lags are found, or all lags leave a
+    left-out drift above `Parts.most_drift`, fit the model of `windows`, too, and return the better
+    fit. With a prior calibration, or for Golovach's model, only the model of `windows` is fitted.
     """
     bags, options = problem.bags, problem.options
     is_free = options.prior is None and options.model != 'golovach'

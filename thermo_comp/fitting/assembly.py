@@ -33,6 +33,7 @@ from .claim import Claim
 from .data_checks import Finding
 from .equations import as_vector
 from .evidence import ResidualRow, group_evidence, lack_of_fit
+from .initial_triad import white_noise_of
 from .layout import Layout
 from .reduction import ReducedBag
 from .regression import Regression
@@ -65,6 +66,10 @@ def build_calibration(
     lag_s = known.board_lag_s if known else ranges.usable_board_lag(windows)
     sensors = {*model.sensors[:1], *(column.sensor for column in columns)}
     window_s = windows.typical_count * float(np.median([bag.cycle_s for bag in bags]))
+    # Slow noise that stands for a drift without a column may explain most of the white noise, too:
+    # then differences of windows, in which a drift cancels, give the white noise.
+    sigma, least = prior.sigma, white_noise_of(regression.windows, regression.nominal_scale)
+    sigma = np.where(sigma < 0.7 * least, least, sigma)
     blank = Calibration(
         format_version=FORMAT_VERSION,
         unit=unit,
@@ -73,7 +78,7 @@ def build_calibration(
         axes=Axes(*(AxisReference(float(K), 0.0) for K in regression.nominal_scale)),
         static=static,
         dynamic=dynamic,
-        noise_density_m_s2_sqrt_hz=_triple(np.maximum(prior.sigma * np.sqrt(window_s), 1e-9)),
+        noise_density_m_s2_sqrt_hz=_triple(np.maximum(sigma * np.sqrt(window_s), 1e-9)),
         slow_noise_m_s2_sqrt_h=_triple(prior.sigma * prior.noise.rate * np.sqrt(3600.0)),
         sensors=tuple(name for name in model.sensors if name in sensors),
         response=blank_terms(columns),
@@ -86,7 +91,7 @@ def build_calibration(
         nonlinearity=nonlinearity,
     )
     if known is not None and not (known.needs_temperature or windows.has_temperature):
-        # Without a thermometer the calibration must not depend on temperature by rounding errors.
+        # Without a thermometer, the dependence on temperature is a rounding error: remove it.
         places = parameter_layout(blank)
         for block in (*places.bias, *places.scale):
             level = values[block.static]
@@ -166,7 +171,7 @@ def _provenance(
     residuals: Sequence[ResidualRow],
     findings: Sequence[Finding],
 ) -> Provenance:
-    # The left-out RMS of ``|f| - g`` is stated only if left-out fits determine |f| everywhere.
+    # State the left-out RMS of ``|f| - g`` only if left-out |f| is scored in all positions.
     is_norm = bool(np.isfinite(fit.selected.score.norms.square).all())
     now = datetime.now(timezone.utc)
     end_s = 1e-9 * max(bag.end_ns for bag in bags)
@@ -204,7 +209,7 @@ def blank_terms(columns: Iterable[Column]) -> tuple[ResponseTerm, ...]:
 
 
 def parameters_of(calibration: Calibration) -> Floats:
-    """Return the parameters in the order of the file's posterior, 0 for constant scale errors."""
+    """Return the parameters in the posterior's order; constant errors of scale factors are 0."""
     values: list[float] = []
     pairs = zip(calibration.static.axes(), calibration.dynamic.axes(), strict=True)
     for axis, (reference, sets) in enumerate(zip(calibration.axes, pairs, strict=True)):
@@ -228,7 +233,7 @@ def with_parameters(
     """
     Replace the scale factors and the parameters of a calibration.
 
-    `values`: parameters in the order of the posterior; constant scale errors are not used
+    `values`: parameters in the order of the posterior; constant errors of scale factors: unused
     """
     layout = parameter_layout(calibration)
     levels = values[[bias.static for bias in layout.bias]]

@@ -6,9 +6,9 @@ not determine, and for effects that the model lacks.
 
 The standard deviation of mounting and turn-on offsets, unless the user states it, is marginalised:
 the covariance is that of a mixture of fits on a grid of this standard deviation. The weight of a
-fit is the fit's evidence, limited by the evidence of |f| in the positions, times a prior of the
-offset sd (half-Student [1]_ without a prior calibration). An error of local gravity, included in
-the covariance, changes all scale factors by the same ratio.
+fit in the mixture is its evidence, limited by the evidence of |f| in the positions, times the
+prior density of the offset sd (half-Student [1]_ without a prior calibration). An error of local
+gravity, included in the covariance, changes all scale factors by the same ratio.
 
 If the model lacks an effect, the best weights differ between sections of the chamber program, and
 the error in another program is as large as these differences: a jackknife [2]_ estimates them.
@@ -89,8 +89,8 @@ def claim_of(fit: Fit, gravity_sd: float = 0.0, known_offset_sd: float = 0.0) ->
         by_offset = np.array([point.by_offset(axis) for axis in range(3)])
         covariance = covariance + turn_on_variance * (by_offset.T @ by_offset)
     if fit.typical is not None:
-        # `_widened` computes the covariance for the sd of mounting offsets at the mode, so the
-        # variance that mixtures, jackknife and turn-ons have added is added to its result.
+        # `_widened` computes the covariance at the most likely sd of mounting offsets: add the
+        # variance of the mixtures, of the jackknife and of the turn-ons to this covariance.
         excess = covariance - posterior.covariance
         layout, covariance = _widened(regression, posterior, fit.typical, fit.of_means)
         at = _places(posterior.layout, layout)
@@ -106,19 +106,19 @@ def _over_offsets(
     regression: Regression, posterior: PosteriorMode, offset_sd: float, known_sd: float
 ) -> tuple[Floats, float, float]:
     """
-    Return the covariance of the unit's unknowns by the mixtures over the sd of the offsets of
-    mountings and turn-ons, the sd of the offset of a new mounting after a new turn-on [m/s^2], and
-    the variance to add for the bias offset of a turn-on that all bags share, else 0: the
-    regression has no unknown for this offset.
+    Return three results: the covariance of the unit's unknowns, by mixtures over the sds of
+    offsets; the sd of the bias offset of a new mounting after a new turn-on [m/s^2]; and the
+    variance of the bias offset that all bags share if they have one turn-on (the regression has no
+    unknown for this offset), or 0 if they have several turn-ons.
 
-    `offset_sd`: sd of a mounting's offset; `known_sd`: offset sd of a prior calibration [m/s^2]
+    `offset_sd`: sd of mounting offsets in the fit; `known_sd`: in a prior calibration [m/s^2]
     """
     windows, scale = regression.windows, posterior.prior.offset_scale
     n_mountings = int(windows.mounting[-1]) + 1
     is_single = windows.n_turn_ons == 1 < n_mountings
     if scale <= 0.0:
-        # A stated offset sd also holds for a turn-on. The mean of the regression's m mounting
-        # offsets has 1 / m of the variance; the remaining 1 - 1 / m of the variance is added.
+        # An sd stated by the user is that of mounting and turn-on offsets. In the regression the
+        # mean of m mounting offsets has the variance sd^2 / m: add the other (1 - 1 / m) sd^2.
         variance = offset_sd**2 * (1.0 - 1.0 / n_mountings) if is_single else 0.0
         return posterior.covariance, offset_sd, variance
     kind = 'mounting' if is_single or windows.has_turn_ons else 'both'
@@ -147,20 +147,20 @@ def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Fl
     log prior density of the logarithm of this sd at these values.
 
     `scale`: `Prior.offset_scale` [m/s^2]; `known_sd`: offset sd by a prior calibration [m/s^2],
-    0 without a prior calibration; `kind`: kind of the offsets, see `largest`
+    0 without a prior calibration; `kind`: 'mounting', 'turn-on' or 'both', see `largest`
     """
     if known_sd:
         # A test of 12 positions determines the sd of mounting offsets within a factor of 1.5.
         ratio = 10.0 ** np.arange(-1.5, 1.51, 0.125)
         return known_sd * ratio, log_student(np.log(ratio) / np.log(1.5))
-    # `least`: smallest usual sd, relative to `scale`. By data sheets, the bias of navigation-grade
-    # triads repeats to 10 ug between turn-ons at best, better between mountings in one turn-on.
+    # `least`: smallest usual offset sd / `scale`. By data sheets, the bias of navigation-grade
+    # triads repeats to 10 ug at best between turn-ons, better between mountings of a turn-on.
     least = 0.01 if kind == 'mounting' else min(1e-4 / scale, 1.0)
-    # Largest usual sd, relative to `scale`: of mountings within a turn-on, of a single turn-on,
-    # and ('both') of several turn-ons, or of mountings that each begin with a turn-on. By data
-    # sheets, the bias repeats to 0.3 .. 1 mg over turn-ons of tactical triads and to some mg over
-    # those of MEMS, 10 to 20 times `scale`. The values for turn-ons are a compromise between data
-    # sheets and units whose bias repeats perfectly.
+    # `largest`: largest usual offset sd / `scale`, for mountings within a turn-on, for a single
+    # turn-on, and ('both') for several turn-ons or mountings that each begin with a turn-on. By
+    # data sheets, the bias repeats to 0.3 .. 1 mg over turn-ons of tactical triads and to some mg
+    # over turn-ons of MEMS, 10 to 20 times `scale`. The values of `largest` for turn-ons are
+    # between those of data sheets and of units whose bias repeats perfectly.
     largest = {'mounting': 1.0, 'turn-on': 2.0, 'both': 5.0}[kind]
     # The log evidence is smooth over the grid's step, a third of a decade of the sd.
     ratio = 10.0 ** np.linspace(-3.45, 2.25, 19)
@@ -180,20 +180,20 @@ def _places(layout: Layout, widened: Layout) -> Ints:
 def _widened(
     regression: Regression, posterior: PosteriorMode, candidates: Floats, of_means: State | None
 ) -> tuple[Layout, Floats]:
-    """Return layout and covariance with the columns that the data do not determine."""
+    """Return layout and covariance, extended by the columns that the data do not determine."""
     prior, state = _with_unseen(regression, posterior, candidates), posterior.state
     if of_means is None:
         with_unseen = regression.solve(state, prior, n_steps=0)
         return with_unseen.layout, with_unseen.covariance.copy()
-    # The chosen curve follows from drifts of warm-ups within the positions. A warm-up heats the
-    # board in another way than a chamber does, so the curve of the positions' means is an
-    # alternative: half of the squared difference of the two curves is added to the variance.
-    # Columns that change more within the positions than between them keep their weights.
+    # The drifts of warm-ups within the positions determine the chosen curve. A warm-up heats the
+    # board in another way than a chamber does, so the curve fitted to the positions' means is an
+    # alternative: half of the squared difference of the curves is added to the covariance. Columns
+    # that change more within the positions than between them keep the weights of the chosen fit.
     within = within_positions(regression.columns, regression.windows.position)
     is_of_means = np.mean(within**2, axis=0) < np.mean((regression.columns - within) ** 2, axis=0)
     weights = np.where(is_of_means, of_means.weights, state.weights)
     other = replace(of_means, weights=weights)
-    # Columns active only in the fit to the means need rows in the covariance: set a tiny sd.
+    # Columns active only in `of_means` get a tiny prior sd, so that the covariance has their rows.
     is_used = other.weights.any(axis=1) & (prior.column_sd == 0.0)
     prior = replace(prior, column_sd=np.where(is_used, 1e-9, prior.column_sd))
     with_unseen = regression.solve(state, prior, n_steps=0)
@@ -204,19 +204,19 @@ def _widened(
 
 def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floats) -> Prior:
     """
-    Add columns that the data do not determine to the prior, so that their variance is not 0.
+    Add to the prior the columns that the data do not determine, so that their variance is not 0.
 
     The weight of an inactive column is consistent with 0, but the data bound it only to ``1 /
-    sqrt(S)``, S being the information about the weight given the active columns. A column whose
-    bound exceeds two sd of a window's noise enters the covariance with zero weight, and with
-    the bound, or its prior sd if smaller, as sd. In this comparison the bound of a nearly constant
-    column is scaled to the RMS of the board temperature t [K].
+    sqrt(S)``, S being the information about the weight given the active columns. The column gets
+    weight 0 and, as sd, the smaller of this bound and the prior sd, if this sd exceeds two sd of a
+    window's noise. For the comparison with the noise, the sd of a nearly constant column is scaled
+    to the RMS of the board temperature t [K].
     """
     groups, prior = np.array(regression.windows.groups), posterior.prior
     kelvins = regression.windows.kelvins
     active = groups[prior.column_sd.any(axis=0)]
-    # The columns considered are lags, curves (few temperatures do not determine all powers), and
-    # columns active in bias or scale (one attitude does not separate drifts of bias and scale).
+    # Columns to add are those of lags and curves (few temperatures do not determine all powers),
+    # and those active in only one of bias and scale (one attitude does not separate their drifts).
     curves = [PART if PART in active else CURVE]
     may = np.isin(groups, [*LAGS, *curves]) | prior.column_sd.any(axis=0)
     inactive = regression.inactive(posterior, may & typical.any(axis=0))
@@ -226,25 +226,25 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
     sd[inactive.part, inactive.column] = 1.0 / np.sqrt(np.maximum(information, 1e-300))
     is_of_lags = np.isin(groups, LAGS)
     if not regression.windows.has_drifts:
-        # At constant temperatures only thermometer errors change lags, and do not bound weights.
+        # At constant temperatures only thermometer errors change lags: do not bound their weights.
         sd = np.where((sd > 0.0) & (regression.windows.lag >= 0), np.inf, sd)
     sd = np.where(is_of_lags, sd, np.minimum(sd, typical))
     if CURVE in active:
-        # A lag delays the curve, so the prior sd of a lag's weight is at most the slope of the
-        # curve (RMS of the axes), including the bounds of columns that the data do not exclude.
+        # A lag only delays the curve: the prior sd of a lag's weight is at most the curve's slope
+        # (RMS of the axes), including the slopes that inactive curve columns may add.
         is_curve = (groups == CURVE) & (kelvins > 0.0)
         square = np.mean(posterior.state.weights**2, axis=1) + sd**2
         slopes = np.sqrt(np.sum(square[:, is_curve] / kelvins[is_curve] ** 2, axis=1))
         of_curve = np.outer(slopes, kelvins)
         typical = np.minimum(typical, of_curve)
-        # A curve column that the data do not determine changes the curve's slope by up to a half.
+        # A curve column that the data do not determine may change the curve's slope by 50 %.
         sd = np.where(groups == CURVE, np.minimum(sd, 0.5 * of_curve), sd)
-    # The variance of n lags is limited to that of one lag, so each lag gets 1 / n of the variance.
+    # n lags must not have more prior variance than one: each weight gets 1 / n of the variance.
     is_lag = is_of_lags & (sd > 0.0)
     share = np.sqrt(np.maximum(is_lag.sum(axis=1, keepdims=True), 1))
     sd = np.where(is_lag, np.minimum(sd, typical / share), sd)
     units = np.array([[1.0], [1.0 / (regression.gravity or 1.0)]])
-    # A column is nearly constant if its temperature change (`kelvins`) is below 1 % of t's change.
+    # A column is nearly constant if its `kelvins` are below 1 % of those of column t, the first.
     is_constant = kelvins < 0.01 * float(kelvins[0])
     ratio = np.where(is_constant, float(kelvins[0]) / np.maximum(kelvins, 1e-9), 1.0)
     matters = (sd > 0.0) & (sd * ratio > 2.0 * float(np.mean(prior.sigma)) * units)
@@ -255,8 +255,8 @@ def _over_mountings(
     regression: Regression, posterior: PosteriorMode, tried: Floats, log_prior: Floats
 ) -> tuple[Floats, float]:
     """
-    Return the covariance of the unit's unknowns, and the RMS of the offset sd [m/s^2], by a
-    mixture of fits with the sds `tried` of mounting offsets, (k,), and their log prior density.
+    Return the covariance of the unit's unknowns, and the RMS of the sd of mounting offsets
+    [m/s^2], by a mixture of fits, one per sd `tried`, (k,); `log_prior`: log density of these sds.
     """
     prior, mounting = posterior.prior, regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
@@ -266,8 +266,8 @@ def _over_mountings(
         return _fits(regression, posterior, priors)
 
     fits = fits_with(tried)
-    # With a large sd of mounting offsets attitudes absorb errors of the model, which raises the
-    # log evidence; at most the rise of the log evidence of |f| plus `CLEAR_GAIN` counts.
+    # A large sd of mounting offsets lets attitudes absorb errors of the model, so the log evidence
+    # of a fit rises: limit this rise to that of the log evidence of |f|, plus `CLEAR_GAIN`.
     of_data = np.array([fit.log_evidence for fit in fits])
     of_norms = _norm_evidence(regression, posterior, tried, fits[-1].root)
     nearest = int(np.argmin(np.abs(np.log(tried * n_rests**0.5 / prior.offset_sd))))
@@ -289,7 +289,7 @@ def _fits(
 def _mixture(
     posterior: PosteriorMode, fits: Sequence[PosteriorMode], log_weight: Floats
 ) -> tuple[Floats, Floats]:
-    """Return the unit's covariance by a mixture of fits, about the mode, and the weights."""
+    """Return the unit's covariance about the mode by a mixture of fits, and the fits' weights."""
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
     n = posterior.layout.n_unit
@@ -302,7 +302,7 @@ def _mixture(
 
 
 def _excess(covariance: Floats, other: Floats) -> Floats:
-    """Return ``covariance - other``, with negative eigenvalues, in sds of `other`, set to 0."""
+    """Return ``covariance - other``, with eigenvalues < 0 (scaled by sds of `other`) set to 0."""
     sd = np.sqrt(np.diag(other))
     values, vectors = np.linalg.eigh((covariance - other) / np.outer(sd, sd))
     root = sd[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
@@ -324,7 +324,7 @@ def _norm_evidence(
     weight = np.add.reduceat(regression.weight, first)
     residual = regression.weight[:, None] * regression.residual(state, layout)
     residual = np.add.reduceat(residual, first) / weight[:, None]
-    # Derivatives and errors of |f|, averaged over each mounting; the errors contain its offset.
+    # Average derivatives and errors of |f| over each mounting; the errors include its offset.
     errors = np.sum(point.norm_by_axes * (residual + state.offset), axis=1)
     first = np.flatnonzero(np.diff(regression.windows.mounting, prepend=-1))
     rows = np.column_stack((along, errors, np.ones(len(along))))
@@ -332,7 +332,7 @@ def _norm_evidence(
     weight = rows[:, -1]
     along, errors = rows[:, :-2] / weight[:, None], rows[:, -2] / weight
     if prior.informative is None:
-        # The prior of the constants is so wide that its mean may be replaced by the state.
+        # The constants have so wide a prior that its mean may be replaced by their fitted values.
         weights = layout.axis[:, 2:].ravel()
         constants = np.setdiff1d(np.arange(layout.n_unit), weights)
         of_prior = np.hstack((
@@ -367,7 +367,7 @@ def _jackknifed(regression: Regression, posterior: PosteriorMode) -> Floats:
         changes.append(other[:n] - step[:n])
         ratios.append(_ratios_to_noise(factor.T @ changes[-1], remaining.T @ posterior.root))
     ratio, without = np.concatenate(ratios), np.array(changes)
-    # Under noise alone each ratio of a squared change to its variance has mean 1 and variance 2.
+    # Under noise alone each ratio (of squared change to variance) has mean 1 and variance 2.
     if ratio.sum() - len(ratio) < 2.0 * np.sqrt(2.0 * len(ratio)):
         return np.zeros((n, n))
     return np.asarray(last / (last + 1) * without.T @ without)
@@ -383,7 +383,7 @@ def _ratios_to_noise(change: Floats, remaining: Floats) -> Floats:
     covariance of the fit of all windows is the unit matrix
     """
     shares, directions = np.linalg.eigh(remaining.T @ remaining)
-    # Use combinations about which the left-out windows have more than 1e-6 of the information.
+    # Use combinations of unknowns about which left-out windows have over 1e-6 of the information.
     is_measured = shares < 1.0 - 1e-6
     shares = np.maximum(shares[is_measured], 1e-12)
     return np.asarray((change @ directions[:, is_measured]) ** 2 * shares / (1.0 - shares))

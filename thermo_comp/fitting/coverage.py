@@ -61,9 +61,9 @@ def next_direction(covariance: Floats, sd: float, positions: Floats) -> Floats:
     Find the direction of a new position, of noise `sd` [g], that most reduces the variance of the
     force, averaged over all attitudes.
 
-    A face of a cube, the easiest to hold, is preferred if it reduces the variance of the force at
-    least half as much as the best direction, then an edge, then a corner. Directions closer than
-    20 degrees to a direction in `positions`, shape (n, 3), are not proposed.
+    The direction to a face of a cube, which is easiest to hold, is returned if it reduces the
+    variance at least half as much as the best direction; else that to an edge, else to a corner.
+    Directions within 20 degrees of a direction in `positions`, shape (n, 3), are not proposed.
     """
     columns = force_columns(_SPHERE)
     weight = np.einsum('nij,nik->jk', columns, columns) / len(columns)
@@ -97,29 +97,29 @@ def distinct_directions(up: Floats) -> Floats:
 
 
 def directions(means: Floats, centre: Floats) -> Floats:
-    """Return unit vectors from a centre to mean readings (n, 3), NaN at the centre."""
+    """Return unit vectors from a centre to mean readings (n, 3); NaN if a reading is there."""
     norms = np.linalg.norm(means - centre, axis=1, keepdims=True)
     return np.asarray((means - centre) / np.where(norms > 0.0, norms, np.nan))
 
 
 def n_directions(means: Floats) -> int:
-    """Return the number of distinct directions of mean readings, (n, 3), from `rough_centre`."""
+    """Return the number of distinct directions of mean readings, (n, 3), about `rough_centre`."""
     return len(distinct_directions(directions(means, rough_centre(means))))
 
 
 def rough_centre(means: Floats) -> Floats:
     """
-    Return the reading at zero force: 0, or the centre of a sphere if the readings' norms differ.
+    Return the reading at zero force: 0, or a sphere's centre if the norms of the readings differ.
 
-    `means`: mean readings, shape (n, 3). The result is 0 for fewer than four readings, readings in
-    a plane or almost one attitude, and an implausible sphere.
+    `means`: mean readings, shape (n, 3). The result is 0, too, for fewer than four readings, for
+    readings in a plane or almost one attitude, and for an implausible sphere.
     """
     zero = np.zeros(3)
     if len(means) < 4:
         return zero
     arms = means - means.mean(axis=0)
     spread = float(np.sqrt(np.mean(np.sum(arms**2, axis=1))))
-    # The origin is the centre if the norms scatter (sd) by less than 30 % of the readings' spread.
+    # The result is 0 if the norms' sd is below 30 % of the readings' RMS distance from their mean.
     if np.std(np.linalg.norm(means, axis=1)) < 0.3 * spread:
         return zero
     values = np.linalg.eigvalsh(arms.T @ arms)
@@ -131,20 +131,20 @@ def rough_centre(means: Floats) -> Floats:
     columns = np.column_stack((2.0 * arms, np.ones(len(arms))))
     centre = np.linalg.lstsq(columns, np.sum(arms**2, axis=1), rcond=None)[0][:3]
     radii = np.linalg.norm(arms - centre, axis=1)
-    # The sphere is accepted if the distances from its centre vary (sd) by less than 10 %, and if
-    # the RMS distance of the readings from their mean is at least half of the radius (it is 1
-    # radius for six faces, and 0.1 radius for readings within 6 degrees).
+    # Accept the sphere if the sd of the distances from its centre is below 10 % of the radius, and
+    # the RMS distance of the readings from their mean exceeds half of the radius (six faces give 1
+    # radius, readings within 6 degrees 0.1 radius).
     is_sphere = np.std(radii) < 0.1 * np.mean(radii) < 0.2 * spread
-    # A sphere exists through any four readings, so the coordinates of the centre must also be
-    # similar: the outputs at zero force of the axes of an analog sensor are within 20 % of their
-    # mean (ADXL335 data sheet, 1.2 to 1.8 V).
+    # A sphere exists through any four readings, so the coordinates of its centre must agree: the
+    # three zero-g outputs of an analog triad are within 20 % of their mean (ADXL335 data sheet,
+    # 1.2 to 1.8 V).
     centre = means.mean(axis=0) + centre
     is_common = np.ptp(centre) < 0.4 * abs(centre.mean())
     return np.asarray(centre) if is_sphere and is_common else zero
 
 
 def geometry(up: Floats, with_misalignment: bool) -> float:
-    """Return the largest sd of a constant over the noise sd of |f|, inf if not determined."""
+    """Return the largest ratio of a constant's sd to the noise of |f|; inf if not determined."""
     jacobian = norm_columns(up)[:, : 9 if with_misalignment else 6]
     values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
     if values[0] < 1e-9 * values[-1]:
@@ -154,12 +154,12 @@ def geometry(up: Floats, with_misalignment: bool) -> float:
 
 def best_rests(candidates: list[Floats]) -> int:
     """
-    Return the index of the best set of rests; each set has mean readings of shape (n, 3).
+    Return the index of the best candidate: a set of n rests, given by mean readings, (n, 3).
 
-    The sd of the constants follows from the directions of the rests of a set and from the
-    residuals of |f|. The best set is the first whose sd is within 2 % of the smallest sd: the
-    first sets have the longest, quietest rests. If no set has six attitudes, the first set is
-    returned.
+    The largest sd of a calibration constant follows from the directions of a set's rests and the
+    residuals of |f|. The best set is the first whose largest sd is within 2 % of the smallest of
+    all sets, as earlier sets have longer, quieter rests. The index is 0 if no set has rests in six
+    attitudes.
     """
     counts = [n_directions(means) for means in candidates]
     costs = np.array([
@@ -204,7 +204,7 @@ class LeastKnown:
 
 
 def least_known(calibration: Calibration, up: Floats) -> LeastKnown | None:
-    """Find the attitude of largest sd of |f|; None without covariance; `up`: of the positions."""
+    """Find the attitude of largest sd of |f|, None without covariance; `up`: positions, (n, 3)."""
     if calibration.posterior is None:
         return None
     layout = parameter_layout(calibration)

@@ -151,7 +151,7 @@ def _has_drift(windows: ThermalWindows) -> bool:
 
 
 def _ramp_rates(windows: ThermalWindows) -> Floats:
-    """Return the rate of T_board [K/min], (n,); 0 if over twice the slope between windows."""
+    """Return `windows.rate` [K/min], (n,); 0 where T_board's slope is less than half this rate."""
     rate, edges = windows.rate * 60.0, windows.data.edges
     for rows in map(slice, edges[:-1], edges[1:]):
         if rows.stop - rows.start > 1:
@@ -171,7 +171,7 @@ def _judge_ramps(windows: ThermalWindows) -> Iterator[Finding]:
             'unknown; record ramps between the soaks',
         )
         steps = np.diff(np.sort(windows.temperature))
-        # Temperatures of two soaks differ by more than 1 K and more than a tenth of the span.
+        # Two soaks differ if their temperatures differ by over 1 K and over a tenth of the span.
         is_gap = steps > max(1.0, 0.1 * steps.sum())
         n = 1 + int(is_gap.sum())
         # If the temperature drifts slowly through its range, there are no soaks to count.
@@ -241,7 +241,7 @@ def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator
     Report the sd of mounting and turn-on offsets if the fit had to assume this sd.
 
     `offset_sd`: published sd of the bias offset of a mounting [m/s^2]. Nine constants explain |f|
-    in nine positions, whatever the offsets; drifts due to scale factors show only large offsets.
+    in nine positions with any mounting offsets, and drifts show large mounting offsets only.
     """
     prior = fit.posterior.prior
     n, n_turn_ons = int(fit.windows.data.mounting[-1]) + 1, fit.windows.data.n_turn_ons
@@ -359,8 +359,8 @@ def judge_result(
     else:
         yield Finding('residual', 'good', text)
     alone = overall.two_sets.rms
-    # A bias offset of up to 2 sd (2 `slow`) after a new turn-on does not contradict the prior, nor
-    # does a residual that the initial lag states explain, which leaves `sigma` near the noise.
+    # Two residuals do not contradict the prior: those by bias shifts of up to 2 sd (2 `slow`), and
+    # those by initial lag states, which the fit estimates, so that its noise `sigma` stays small.
     contradiction, sigma = '', float(np.mean(prior.sigma))
     is_above = overall.fitted.rms > np.hypot(1.5 * alone, 2.0 * slow) and sigma > 1.5 * alone
     if options.prior is not None and is_above:

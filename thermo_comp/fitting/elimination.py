@@ -27,7 +27,7 @@ def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
     errors, shape (..., n, n).
 
     Each matrix is scaled to a unit diagonal, or by the root of a given `diagonal`, shape (..., n).
-    Jitters are then added to the scaled diagonal, one after the other, until a factor exists.
+    Jitters of rising size are added to the scaled diagonal until a Cholesky factor exists.
     """
     square = np.einsum('...ii->...i', matrix) if diagonal is None else diagonal
     root = np.sqrt(square)
@@ -55,9 +55,9 @@ def factored_with_prior(information: Floats, precision: Floats) -> Floats:
     """
     Return the lower Cholesky factor of an information matrix plus the precision of a prior, (n,).
 
-    The information matrix is a difference of larger matrices, so its smallest eigenvalues are
-    rounding errors. If no Cholesky factor exists for this reason, the matrix is scaled to a unit
-    diagonal, and its eigenvalues up to ten times the size of the most negative one are set to 0.
+    The smallest eigenvalues of the information, a difference of larger matrices, are rounding
+    errors. If information plus precision has no Cholesky factor, it is scaled to a unit diagonal,
+    and eigenvalues of the information up to ten times the size of the most negative one become 0.
     """
     places = np.diag_indices(len(information))
     hessian = information.copy()
@@ -153,7 +153,7 @@ class Reduced:
         return sum(block.log_determinant for block in blocks if block is not None)
 
     def with_prior_of_sum(self, total: Floats, variance: float) -> Reduced:
-        """Add a prior (mean 0, `variance`) on the bags' sum of lag states, at present `total`."""
+        """Add a prior (mean 0, `variance`) of `total`, the sum of initial lag states over bags."""
         r = len(total)
         cross = self.bags.solved[:, :r].sum(axis=0, keepdims=True)
         cross[..., -1] += total
@@ -186,7 +186,7 @@ class Reduced:
         return positions, starts
 
     def without(self, places: Ints, normal: Normal) -> Floats:
-        """Return `matrix` without the positions `places`, whose equations are `normal`."""
+        """Return `matrix` without positions `places`, whose normal equations are `normal`."""
         bag, r = self.layout.bag, len(self.bags.root[0])
         at = np.unique(bag[places])
         others = (bag == at[:, None]) & ~np.isin(np.arange(len(bag)), places)
@@ -200,11 +200,11 @@ class Reduced:
         """
         Eliminate the unknowns of positions and bags from the equations of m new unknowns per axis.
 
-        `rows`: products of the derivatives by the new unknowns with those by the unknowns of the
-        fit and with the residual, shape (n_positions, 3, m, k + 1). Returns the reduction of the
-        Hessian of the new unknowns by the elimination, shape (3 m, 3 m), and, after the
-        elimination, the off-diagonal block of the new unknowns with the unknowns of the unit and
-        the gradient of the new unknowns, shape (n + 1, 3 m).
+        `rows`: products of the derivatives w.r.t. the new unknowns with the derivatives w.r.t. the
+        fit's unknowns and with the residual, shape (n_positions, 3, m, k + 1). Returns what the
+        elimination subtracts from the Hessian of the new unknowns, shape (3 m, 3 m); and, after
+        the elimination, the products of the new unknowns with the unit's unknowns and with the
+        residual (the gradient), shape (n + 1, 3 m).
         """
         layout, whitened = self.layout, self.positions.whitened
         n_positions, n_own, _ = whitened.shape

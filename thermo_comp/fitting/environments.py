@@ -5,10 +5,10 @@ Owns the exclusion of bags that were recorded in another thermal environment (su
 than most bags or a prior, and the error that the calibration states for these bags.
 
 In still air the board temperature responds to the case temperature in another way than in a
-chamber with a fan. No thermometer is at the axes, so their bias as a function of the thermometers
-differs, too, and no set of coefficients describes two environments: a bag of still air would
-increase the error in a chamber with a fan. The error of the correction in an excluded bag is
-published as a lack of fit.
+chamber with a fan. No thermometer is at the axes, so the bias is another function of the measured
+temperatures in another environment. A bag of still air would increase the error of a calibration
+in a chamber with a fan. The error of the correction in an excluded bag is published as a lack of
+fit.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from .windows import ThermalWindows, thermal_windows
 
 
 def _is_far_above(square: Floats | float, usual: float) -> Bools:
-    """Whether an RMS error exceeds five times a usual one; both arguments are mean squares."""
+    """Whether the mean square error `square` exceeds 5^2 times the mean square error `usual`."""
     return np.asarray(square > 5.0**2 * usual)
 
 
@@ -81,9 +81,9 @@ def contradiction(
 ) -> tuple[list[int], bool]:
     """
     Return the indices of the bags whose drift the calibration `known` of their unit does not
-    explain with any lag states at start, or of all bags if these are more than half of the bags;
-    and whether the bags can update `known`: ``|f| - g`` far exceeds the drift and the published sd
-    of |f|, so that bias or scale has changed, too, or the bags have the six attitudes that
+    explain with any initial lag states; all bags if these are more than half of the bags. Also
+    return whether the bags can update `known`: ``|f| - g`` shows a change of bias or scale (it far
+    exceeds the drift and the published sd of |f|), or the bags have the six attitudes that
     determine bias and scale.
     """
     data = replace(windows.data, tilt=windows.data.tilt[:, :0])
@@ -97,7 +97,7 @@ def contradiction(
         # Only drifts are compared: bias offsets of 1 mg, by turn-ons or ageing, are allowed.
         offset_sd=1e-2,
         sigma=np.maximum(sigma, 1e-9),
-        # The factor 1e4 keeps the parameters practically at their values in the calibration.
+        # Prior sds divided by 1e4 keep the parameters practically at the calibration's values.
         informative=replace(first, root=1e4 * first.root),
     )
     fitted = regression.solve(state, prior, n_steps=4)
@@ -114,7 +114,7 @@ def contradiction(
     may_update = bool(_is_far_above(float(np.mean(norm**2)), usual))
     is_far = _is_far_above(mean, 1.0)
     if np.mean(is_far) > 0.5:
-        # If most bags are far, all are of one environment: its effect is small in some attitudes.
+        # Another environment has little effect in some attitudes: if most bags deviate, all count.
         is_far[:] = True
     may_update |= len(distinct_directions(state.up)) >= POSITIONS_NEEDED
     return np.flatnonzero(is_far).tolist(), may_update
@@ -144,7 +144,7 @@ def with_excluded_error(
     Add to the lack of fit of both regimes the drift, and the error of |f|, that remain in `bags`
     after the correction.
 
-    `others`: text that names what these bags contradict, other bags or the prior; `is_updated`:
+    `others`: text that names what `bags` contradict, other bags or the prior; `is_updated`:
     whether `bags` were used in the fit
     """
     windows = thermal_windows(bags, prior_model(calibration))

@@ -6,14 +6,14 @@ Owns the measurement equation of the windows, and its linearisation.
 Equation [m/s^2] of the mean reading N of window w, position p, axis i; K0: nominal scale::
 
     N / K0 = kappa a (1 + S s) + b + B beta + o_p + o_b + kappa (A l_p)_i g + noise,
-    a = (A u_p)_i g,  A = M^-1,  kappa: scale factor / K0,  b: bias,  u_p: attitude,
-    l_p, perpendicular to u_p: tilt of the support,
+    a = (A u_p)_i g,  A = M^-1,  M: misalignment,  kappa: scale factor / K0,  b: bias,
+    u_p: attitude,  l_p, perpendicular to u_p: tilt of the support,
     o_p, o_b: bias offsets of the position and of the turn-on (bag)
 
 B and S are columns of the table in `unit.columns`, each divided by its RMS, with the weights beta
-and s. For an angular rate g is 0, and the terms b, B beta and o_p remain. If |f| differs between
-positions, |f| replaces g, and the nonlinear terms ``kappa sum_j (k_j + k'_j t) n_j(a)`` are added
-(`forces`). All terms are linear combinations of the base series (`series`).
+and s. For an angular rate g is 0, which leaves bias b, columns B beta and offsets o_p. If |f|
+differs between positions, |f| replaces g, and the nonlinear terms ``kappa sum_j (k_j + k'_j t)
+n_j(a)`` are added (`forces`). All terms are linear combinations of the base series (`series`).
 """
 
 from __future__ import annotations
@@ -97,10 +97,10 @@ class Equations(Series):
 
     def _effects(self, state: State) -> tuple[Floats, Floats, Floats, Floats, Floats]:
         """
-        Return the force `along` the axes; and, at the reference temperature: the derivative of the
+        Return, at the reference temperature, the force `along` the axes; the derivative of the
         reading by a rotation of the attitude, (n_positions, 3, 2); the reading without the bias,
-        (n_positions, 3); the sum of the nonlinear terms, and of their changes per kelvin, shape
-        (2, n_positions, 3); and the derivatives of these two sums by the force.
+        (n_positions, 3); the sum of the nonlinear terms and the sum of their changes per kelvin,
+        (2, n_positions, 3); and the derivatives of both sums by the force.
         """
         force = self.along(state)
         along_axes = np.einsum('ij,pjt->pit', state.inverse, state.tangents)
@@ -151,7 +151,7 @@ class Equations(Series):
 
     def _combined(self, state: State, base: Base, n_starts: int) -> Floats:
         """
-        Return the combinations of the base series that `Tangent` uses: 1 + S s; the derivatives
+        Return the combinations of base series in `Tangent`: the scale's 1 + S s; the derivatives
         w.r.t. kappa, the force along the axis and the initial lag states; and the residual.
         """
         force, _, without_bias, (bend, bend_by_t), (slope, slope_by_t) = self._effects(state)
@@ -173,10 +173,10 @@ class Equations(Series):
         self, state: State, layout: Layout, base: Base, scaled: int
     ) -> tuple[Ints, Floats | float]:
         """
-        Return index and factor (as in `Tangent`) of each active nonlinear coefficient's series.
+        Return place and factor, see `Tangent`, of each active nonlinear coefficient.
 
-        The factor 1 + S s of the scale multiplies the terms at the reference temperature. In the
-        terms' change per kelvin the factor of the scale is left out, as its effect is negligible.
+        The factor 1 + S s of the scale multiplies the nonlinear terms at the reference
+        temperature, but not their changes per kelvin, where its effect is negligible.
         """
         active = np.flatnonzero(layout.nonlinear[0] >= 0)
         if self.forces is None or not len(active):
@@ -187,7 +187,7 @@ class Equations(Series):
         return place, state.kappa[:, None] * value[..., active % k]
 
     def _by_misalignment(self, state: State) -> Floats:
-        """Return the derivatives of kappa times the force along the axes by M^-1, (n, 3, 3)."""
+        """Return the derivatives of kappa times the force by the elements of M^-1, (n, 3, 3)."""
         result = np.zeros((len(state.up), 3, 3))
         # Rows and columns of the three elements below the diagonal of the inverse of M.
         rows, columns = [1, 2, 2], [0, 0, 1]
@@ -251,8 +251,8 @@ class Equations(Series):
         result[layout.tilt] = prior.tilt_sd**-2
         result[layout.start] = 1.0 / prior.start_variance_ratio
         result[layout.turn_on] = prior.turn_on_sd**-2
-        # The prior of attitudes is flat: a precision of 0. An angular rate does not depend on the
-        # attitude, so a precision of 1 prevents singular equations.
+        # The prior of attitudes is flat: a precision of 0. Angular rates depend on no attitude: in
+        # a fit of rates a precision of 1 of each attitude prevents singular equations.
         result[layout.up] = 0.0 if self.gravity else 1.0
         result[layout.posed] = prior.pose_sd**-2
         # The prior of a pose is almost flat: its sd is 1 rad.

@@ -10,9 +10,9 @@ without this position, which estimates the error in a new attitude.
 
 The lack of fit in a regime, near a temperature, is the mean square of the left-out drift less the
 noise and the published variance of this drift. The lack of fit covers effects that no column
-describes, such as a kink of the curve, a tilt of the support or a drift of the bias. For models
-whose score is at most one standard error worse than that of the chosen model, half of the largest
-squared difference of such a model's drift from the chosen model's is added to the lack of fit.
+describes, such as a kink of the curve, a tilt of the support or a drift of the bias. The lack of
+fit includes half of the largest squared difference in drift between the chosen model and any other
+model whose score is at most one standard error worse.
 """
 
 from __future__ import annotations
@@ -105,10 +105,10 @@ def residual_rows(fit: Fit) -> tuple[tuple[ResidualRow, ...], Floats, Floats]:
 
 
 def _with_only(regression: Regression, chosen: PosteriorMode, groups: tuple[str, ...]) -> State:
-    """Repeat the fit with the given groups only, under an almost flat prior of their weights."""
+    """Fit only the columns of the given groups, under an almost flat prior of their weights."""
     only = np.isin(regression.windows.groups, groups)
-    # The residuals of a model with few groups are mostly model error, which slow noise or mounting
-    # offsets would absorb: the fit has white noise only and no offsets.
+    # Residuals of a model of few columns are mostly model error, which slow noise or mounting
+    # offsets would absorb: this fit has white noise only and no offsets.
     prior = replace(
         chosen.prior,
         column_sd=only * regression.windows.parts * [[0.05], [0.005]],
@@ -141,9 +141,9 @@ def position_reports(fit: Fit, residual: Floats, left_out: Floats) -> tuple[Posi
 
 def group_evidence(regression: Regression, posterior: PosteriorMode) -> tuple[GroupEvidence, ...]:
     """
-    Return RMS contribution, effective parameters and log Bayes factor of each active group.
+    Return contribution (RMS), effective parameters and log Bayes factor of groups of columns.
 
-    The Bayes factor compares the fit with a fit without the group or, if the prior is a
+    The Bayes factor compares the fit with a fit without a group or, if the prior is a
     calibration, with a fit in which the group keeps the weights of this calibration.
     """
     names = np.array(regression.windows.groups)
@@ -169,7 +169,7 @@ def group_evidence(regression: Regression, posterior: PosteriorMode) -> tuple[Gr
             if of_prior is None:
                 weight_sd = regression.weight_sd(prior)[k][:, used].ravel()
             else:
-                # The geometric mean of the principal sds of the weights in the prior.
+                # One sd for all weights: the geometric mean of their prior's principal sds.
                 root = of_prior[places]
                 mean_sd = np.exp(np.linalg.slogdet(root @ root.T)[1] / (2.0 * len(root)))
                 weight_sd = np.full(len(places), mean_sd)
@@ -221,7 +221,7 @@ def drift_variance(
 def _points(
     temperature: Floats, excess: Floats, model_error: Floats, rows: Bools
 ) -> tuple[LackOfFit, ...]:
-    """Average the excess of squared drifts in up to 5 temperature bins of 10 windows or more."""
+    """Return the lack of fit in up to 5 temperature bins, each with 10 windows or more."""
     n_bins = min(5, int(rows.sum()) // 10)
     if not n_bins:
         return ()
@@ -229,8 +229,8 @@ def _points(
     order = np.argsort(temperature, kind='stable')
     for part in np.array_split(order[rows[order]], n_bins):
         mean = excess[part].mean(axis=0)
-        # Errors of neighbouring windows are correlated: ten windows count as one observation. An
-        # excess below two standard errors is set to 0.
+        # Errors of neighbouring windows are correlated: ten windows count as one observation. The
+        # mean excess of the squared drift is set to 0 if it is below two standard errors.
         error = excess[part].std(axis=0) / np.sqrt(max(len(part) / 10.0, 1.0))
         mean = np.where(mean > 2.0 * error, mean, 0.0)
         x, y, z = np.sqrt(mean + model_error[part].mean(axis=0)).tolist()

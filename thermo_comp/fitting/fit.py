@@ -17,7 +17,6 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from ..errors import FitError, UndeterminedError
-from ..recording.stillness import widened
 from ..text import valid_serial
 from ..typing import Floats
 from ..unit.calibration import Axes, AxisReference, Calibration, Unit
@@ -66,7 +65,7 @@ def fit(
     """
     Fit a calibration to bags of a thermal test.
 
-    Raises FitError if the data do not allow a fit, as if a recording has no still interval.
+    Raises FitError if the data do not allow a fit, such as a recording without still interval.
     """
     check_serial(sources, options)
     if not sources:
@@ -349,7 +348,7 @@ def _judged(
 
 def _unusable(error: ValueError, up: Floats) -> FitError:
     if 'misalignment' in str(error):
-        # If the positions determine the misalignment, these samples are not those of a triad.
+        # An angle of 60 degrees between axes is a data error if the positions determine M.
         kind = FitError if data_checks.determines_misalignment(up) else UndeterminedError
         return kind(
             'in the fit the angle between two of the axes is some 60 degrees or less, which no '
@@ -377,13 +376,6 @@ def check_serial(sources: Sequence[FitSource], options: FitOptions) -> str:
 
 def _unit(bags: Sequence[ReducedBag], options: FitOptions) -> Unit:
     serial = check_serial([bag.source for bag in bags], options)
-    full_scale = options.saturated_at
-    largest = max(bag.max_abs for bag in bags)
-    if full_scale == COUNTS_FULL_SCALE:
-        full_scale = widened(full_scale, np.array([[largest]]))
-    if full_scale is None:
-        # The smallest usual full scale 10 % above the largest sample, else twice this sample.
-        ranges = (STANDARD_GRAVITY * g for g in (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0))
-        full_scale = next((top for top in ranges if top > 1.1 * largest), 2.0 * largest)
+    full_scale = raw_checks.full_scale_of(bags, options)
     cycle = float(np.median([bag.cycle_s for bag in bags]))
     return Unit(serial, options.input, full_scale, cycle)

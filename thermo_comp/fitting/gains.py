@@ -20,7 +20,7 @@ import numpy as np
 
 from ..typing import Bools, Floats, Ints
 
-# Squares of factors of the prior sd of new columns; the factor with the largest gain is used.
+# Squares of factors to try on the prior sd of new columns; that with the largest gain is used.
 _SQUARED_FACTORS = (10.0 ** np.arange(-4.0, 1.01, 0.25))[:, None] ** 2
 
 
@@ -58,7 +58,7 @@ class Inactive:
     Q: Floats
 
     def _in_prior_sd(self, column_sd: Floats, wanted: Bools) -> tuple[Floats, Floats, Ints]:
-        """Return S and Q of `wanted` columns' weights, in prior sds; and each weight's column."""
+        """Return S, Q and column of each weight of `wanted` columns; S and Q are in prior sds."""
         sd = np.repeat(column_sd[self.part, self.column] * wanted[self.column], 3)
         at = np.flatnonzero(sd > 0.0)
         S = self.S[np.ix_(at, at)] * np.outer(sd[at], sd[at])
@@ -66,9 +66,9 @@ class Inactive:
 
     def gain(self, column_sd: Floats, wanted: Bools) -> float:
         """
-        Return the gain in log evidence if the columns in the mask `wanted`, (m,), are added:
-        ``(q (1 + S)^-1 q - log det(1 + S)) / 2``, at least 0, with S and q in units of the prior
-        sd, which is `column_sd`, (2, m), times the root of the best of `_SQUARED_FACTORS`.
+        Return the gain in log evidence, at least 0, if the columns in the mask `wanted`, (m,), are
+        added: ``(q (1 + S)^-1 q - log det(1 + S)) / 2``. S and q are for weights in units of prior
+        sds: `column_sd`, (2, m), times the root of the `_SQUARED_FACTORS` element of largest gain.
         """
         S, Q, _ = self._in_prior_sd(column_sd, wanted)
         S, along = np.linalg.eigh(S)

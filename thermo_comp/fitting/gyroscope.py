@@ -50,8 +50,8 @@ def add_gyroscope(
     options: FitOptions,
 ) -> tuple[Calibration, tuple[RateRow, ...]]:
     """
-    Add a gyroscope to a calibration: that of the prior calibration or, without a prior, a
-    gyroscope fitted to the bags, if the bags have angular rates and temperatures.
+    Add to a calibration the gyroscope of the prior calibration or, without a prior, a gyroscope
+    fitted to the bags, if the bags have angular rates and temperatures.
     """
     if options.prior is not None:
         known = options.prior.gyroscope
@@ -84,7 +84,7 @@ def add_gyroscope(
     # The positions determine the sd of the offsets well: `claim_of` need not marginalise this sd.
     chosen = replace(fit.posterior, prior=replace(fit.posterior.prior, offset_scale=0.0))
     claim = claim_of(fit._replace(selected=replace(fit.selected, posterior=chosen)))
-    # The offsets contain the Earth's rate, no error of the gyroscope: subtract its variance.
+    # The variance of the offsets includes that of the Earth's rate, which is no error.
     claim = replace(claim, offset_sd=math.sqrt(max(claim.offset_sd**2 - earth_sd**2, 0.0)))
     triad = build_calibration(fit, claim, bags, calibration.unit)
     needed = {*calibration.sensors, *triad.sensors}

@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the estimation of prior sd and noises, and the removal of columns of small log Bayes factor.
+Owns the estimation of prior sds and noises, and the removal of columns of small log Bayes factor.
 
 Each column has one prior standard deviation of its weights in the bias of all axes and one in the
-scale. If not fixed, both follow from MacKay's fixed point [1]_ with a log-normal hyperprior of the
-sd, of centre sd0 and variance tau^2 of log sd. The mode of log evidence plus log hyperprior
+scale. Newton's steps move each sd that is not fixed to the mode of log evidence [1]_ plus the log
+of a hyperprior, which is log-normal with centre sd0 and variance tau^2 of log sd. This mode
 satisfies ``effective parameters + log(sd / sd0) / tau^2 = sum w^2 / sd^2``, w being the weights of
-the column on the three axes. If the data do not inform about a column, the sd stays at sd0.
+the column on the three axes. Without information about a column its prior sd stays at sd0.
 
 References
 ----------
@@ -65,7 +65,7 @@ class Candidates:
 def settle(
     regression: Regression, state: State, prior: Prior, candidates: Candidates, rounds: int = 25
 ) -> PosteriorMode:
-    """Iterate prior sd and noises up to `rounds` times, until `_updated` gives a change < 0.05."""
+    """Update prior sds and noises up to `rounds` times, until none changes by over about 5 %."""
     posterior = regression.solve(state, prior, n_steps=3)
     for _ in range(rounds):
         prior, change = _updated(regression, posterior, candidates)
@@ -78,7 +78,7 @@ def settle(
 def _updated(
     regression: Regression, posterior: PosteriorMode, candidates: Candidates
 ) -> tuple[Prior, float]:
-    """Move prior sds and noises towards their modes; return also the largest log ratio."""
+    """Move prior sds and noises towards their modes; return also the largest |log(new / old)|."""
     prior, layout, determined = posterior.prior, posterior.layout, posterior.determined
     sd, power = prior.column_sd, np.sum(posterior.state.weights**2, axis=1)
     moves = (sd > 0.0) & ~candidates.fixed
@@ -110,10 +110,10 @@ def _updated(
 
     return moved, max(
         change('column_sd', moves & (effective > 0.3)),
-        # A change of the sd of offsets that the data do not determine does not count.
+        # A change of the sd of offsets counts only if the data determine more than one offset.
         change('offset_sd') * bool(determined[layout.offset].sum() > 1.0),
         change('turn_on_sd') * bool(determined[layout.turn_on].sum() > 1.0),
-        # An error of 15 % of the sd of tilts hardly changes the fit.
+        # A change of the sd of tilts by 15 % hardly changes the fit.
         change('tilt_sd') / 3.0,
         change('pose_sd'),
         change('start_variance_ratio') / 4.0,
@@ -122,7 +122,7 @@ def _updated(
 
 
 def _misalignment_sd(posterior: PosteriorMode) -> float:
-    """Move the sd of the elements of M to the mode if the data determine more than one element."""
+    """Move the prior sd of the misalignment to its mode if more than one element is determined."""
     prior, misalignment = posterior.prior, posterior.state.misalignment
     if prior.informative is not None or prior.unseen_misalignment_sd:
         return prior.misalignment_sd
@@ -136,12 +136,12 @@ def _misalignment_sd(posterior: PosteriorMode) -> float:
 
 
 def _start_variance_ratio(posterior: PosteriorMode) -> float:
-    """Move the variance ratio of the initial lag states to the mode."""
+    """Move the prior variance ratio of the initial lag states to its mode."""
     start, places = posterior.state.start, posterior.layout.start
     if not places.size:
         return posterior.prior.start_variance_ratio
-    # A lag state with the variance of the node's prior (a ratio of 1) is added to the data, so
-    # that the lag states of a single bag cannot make `start_variance_ratio` very small.
+    # The node's prior (a variance ratio of 1) counts as one more lag state, so that the lag states
+    # of a single bag cannot make `start_variance_ratio` very small.
     gamma = float(posterior.determined[places].sum())
     if gamma <= -1.0:
         raise np.linalg.LinAlgError('rounding errors exceed the information about lag states')
@@ -149,12 +149,12 @@ def _start_variance_ratio(posterior: PosteriorMode) -> float:
 
 
 def _tilt_sd(posterior: PosteriorMode, kelvins: float) -> float:
-    """Move the sd of tilts towards the mode; `kelvins`: RMS of the board temperature [K]."""
+    """Move the prior sd of tilts towards its mode; `kelvins`: RMS of T_board - T_reference [K]."""
     sd, tilt = posterior.prior.tilt_sd, posterior.state.tilt
     if not tilt.size:
         return sd
     # The scale of the half-normal prior of the tilts' sd is 15 urad/K, for unevenly heated
-    # aluminium of 23 ppm/K, times the RMS temperature, or times 1 K if this is larger.
+    # aluminium of 23 ppm/K, times the larger of `kelvins` and 1 K.
     square = (sd / (1.5e-5 * max(kelvins, 1.0))) ** 2
     effective = posterior.determined[posterior.layout.tilt].sum()
     step = _toward(effective, np.sum(tilt**2), sd, square - 1.0, 2.0 * square)
@@ -162,7 +162,7 @@ def _tilt_sd(posterior: PosteriorMode, kelvins: float) -> float:
 
 
 def _pose_sd(posterior: PosteriorMode) -> float:
-    """Move the sd of attitudes about poses towards the mode."""
+    """Move the prior sd of attitudes about their poses towards its mode."""
     sd, layout = posterior.prior.pose_sd, posterior.layout
     if not layout.pose.size:
         return sd
@@ -179,7 +179,7 @@ def _toward(
     slope: Floats | float,
     bend: Floats | float,
 ) -> Floats:
-    """Return Newton's step of log sd towards ``power / sd^2 = effective + slope``, at most +-2."""
+    """Return Newton's step of log sd, within +-2, for ``power / sd^2 = effective + slope``."""
     ratio = power / (sd * sd)
     gradient = ratio - effective - slope
     curvature = 2.0 * np.minimum(ratio, 2.0 * effective + 1.0) + 0.5 * effective + bend
@@ -187,7 +187,7 @@ def _toward(
 
 
 def _offset_sd(posterior: PosteriorMode, sd: float, places: Ints) -> float:
-    """Move the sd of the offsets at `places` towards the mode under a half-Student prior."""
+    """Move the sd of offsets (unknowns `places`) towards the mode under a half-Student prior."""
     scale = posterior.prior.offset_scale
     if scale <= 0.0 or not places.size:
         return sd
@@ -234,8 +234,8 @@ def white_noise(regression: Regression, posterior: PosteriorMode) -> Floats:
     # hundredth of the noise of the noisiest axis.
     least = np.full(3, max(posterior.prior.least_sigma, 0.01 * float(sigma.max())))
     if not regression.windows.has_drifts:
-        # If no column changes within a position, slow noise may explain the whole residual. The
-        # white noise is then at least that of differences of windows, in which a drift cancels.
+        # If no column changes within a position, slow noise may explain the whole residual: the
+        # white noise is at least the noise of differences of windows, which contain no drift.
         least = np.maximum(least, white_noise_of(regression.windows, regression.nominal_scale))
     return np.asarray(np.maximum(sigma, least))
 
@@ -330,9 +330,9 @@ def _pruned(regression: Regression, posterior: PosteriorMode, candidates: Candid
 
 def downweigh(regression: Regression, posterior: PosteriorMode) -> None:
     """
-    Reduce the weight of windows whose residual is more than 3 sd from the local median (in a
-    position of up to 6 windows: from 0), so that the weighted distance becomes 3 sd; keep the
-    weights if `windows.undisturbed` is given.
+    If the residual of a window is more than 3 sd from the local median (in a position of up to 6
+    windows: from 0), reduce the window's weight so that the weighted distance becomes 3 sd. Keep
+    all weights if `windows.undisturbed` is given.
     """
     windows = regression.windows
     if windows.undisturbed is None:
@@ -345,7 +345,7 @@ def undisturbed(residual: Floats, weight: Floats, position: Ints) -> Floats:
     size = residual * np.sqrt(weight)[:, None]
     for part in np.split(size, np.flatnonzero(np.diff(position)) + 1):
         if len(part) > 6:
-            # The local level of a window is the median of the seven windows about it.
+            # Subtract from each window's residual the median residual of the seven about it.
             np.subtract(part, median_filter(part, (7, 1), mode='mirror'), out=part)
     size = np.abs(size)
     # The 80 % quantile of |x| is 1.2816 sd of a normal x. The median of |x| can be 0: the window

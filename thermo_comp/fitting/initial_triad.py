@@ -69,12 +69,12 @@ def constant_calibration(
             f'an axis ({axes}) reads the same in all positions: the axis is dead, or the unit was '
             'never turned about another axis'
         )
-    # The largest half range is |f| if two positions are near its axis, else less: try |f| / 1.3.
+    # If no axis was held up and down, the largest half range is below 1 g: try 1.3 times it, too.
     scales = (float(np.max(half)) * spread / gravity for spread in (1.0, 1.3))
     starts = (np.where(half * 4.0 > np.max(half), scale, half / gravity) for scale in scales)
     tried = (_refine(means, gravity, bias, scale, misalignment_sd) for scale in starts)
     calibration, rms = min(tried, key=lambda fitted: fitted[1])
-    # Scattered points may give a very large ellipsoid with a far centre, which is refused.
+    # Readings on no ellipsoid may fit a very large one with a far centre: refuse such a fit.
     is_around = np.all(np.abs(calibration.bias - bias) < 2.0 * np.max(half))
     if not (is_around and rms < largest_rms):
         raise FitError(
@@ -137,8 +137,8 @@ def white_noise_of(windows: Windows, scale: Floats) -> Floats:
     Return the white noise of a window on each axis [m/s^2], shape (3,), from second differences,
     which do not depend on a linear drift; 0 if no position has three windows.
 
-    In fast ramps second differences contain a part of the drift. If fourth or sixth differences
-    then give a noise below 70 % of that by second differences, the smallest value is used.
+    In fast ramps second differences contain a part of the drift. If the noise from fourth or sixth
+    differences is below 70 % of the noise from second ones, the smallest of these noises is used.
     """
     position, noises = windows.position, []
     for order in (2, 4, 6):
@@ -156,7 +156,7 @@ def white_noise_of(windows: Windows, scale: Floats) -> Floats:
 def thermometer_error_of(windows: Windows, scale: Floats, *, beyond_noise: bool = False) -> Floats:
     """
     Return the error of a window on each axis due to the error of the board temperature [m/s^2],
-    (3,): the sd of the temperature times the slope of the samples over temperature in positions.
+    (3,): the sd of the temperature times the slope, within positions, of samples over temperature.
 
     `beyond_noise`: subtract the variance of a reading's noise from that of the temperature; the
     remaining error is due to coarse steps of the readings, or to long intervals between readings
@@ -168,7 +168,7 @@ def thermometer_error_of(windows: Windows, scale: Floats, *, beyond_noise: bool 
     change = within_positions(windows.board[:, :1], windows.position)
     power = np.maximum(np.add.reduceat(change**2, first), 1e-12)
     along = np.add.reduceat(change * drift, first)
-    # Under white noise alone, the mean of `along**2 / power` of a position is the noise variance.
+    # White noise adds its variance to the sum of squares that a position's slope explains.
     square = along**2 / power - white_noise_of(windows, scale) ** 2
     slope = np.sqrt(np.maximum(square.sum(axis=0), 0.0) / power.sum())
     variance = float(windows.board[:, 1].mean()) - beyond_noise * windows.board_noise**2

@@ -68,9 +68,9 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     """
     Fit the windows, with or without a prior calibration.
 
-    Without a prior, if the positions are whole rests, and temperature changes more between than
-    within positions, the curve is fitted to the means of the positions, unless a fit that also
-    uses the drifts is better on left-out data.
+    Without a prior, if the positions are whole rests and temperature changes more between than
+    within positions, two fits are made: of the curve to the means of the positions, and to all
+    windows. The fit to the means is returned unless the other fit is better on left-out data.
     """
     if problem.options.prior is not None:
         return _regress(windows, problem)
@@ -85,7 +85,7 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     # similar amounts, so only the differences of |f| between positions determine the curve.
     everywhere = np.ones(windows.data.n_positions, dtype=bool)
     at_rest = replace(windows, data=rests.constant_in(windows.data, everywhere, everywhere))
-    # Each of the two regressions reports progress from 0.7 to 0.95: map it to half of this range.
+    # Both regressions report progress from 0.7 to 0.95: map each to its half of this range.
     first = replace(problem, progress=lambda part: problem.progress(0.35 + 0.5 * part))
     second = replace(problem, progress=lambda part: problem.progress(0.475 + 0.5 * part))
     fit, of_drifts = _regress(at_rest, first, is_at_rest=True), _regress(windows, second)
@@ -107,9 +107,9 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     if (has_poses or n_directions == 1) and known is None and data.forces is None:
         data = replace(data, pose=rests.poses_of(windows, problem.up))
     if options.model == 'golovach' or is_bench or n_directions == 1 or data.n_poses:
-        # No tilts are fitted: in one attitude a tilt of the support is not separable from a drift
-        # of the unit, in a pose not from a change of the attitude, and in Golovach's model tilts
-        # would absorb errors of the two sets.
+        # No tilts are fitted: a tilt of the support is not separable from a drift of the unit in
+        # one attitude, nor from a change of the attitude in a pose. In Golovach's model tilts
+        # would absorb errors of the static and the dynamic set.
         data = replace(data, tilt=data.tilt[:, :0])
     settled = data.settled if problem.is_by_settled else None
     data = replace(data, has_prior=known is not None, settled=settled)
@@ -117,7 +117,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     state = initial_state(regression, start, problem.up)
     prior = _initial_prior(windows, problem)
     if n_directions >= POSITIONS_NEEDED and not data.has_turn_ons:
-        # Misalignments would explain turn-on offsets, which are no unknowns here: reduce M's sd.
+        # Turn-on offsets are no unknowns here, and M would explain them: reduce the prior sd of M.
         prior = _with_faces(prior, problem.up)
     steepness = _steepness(windows, problem, is_at_rest=is_at_rest)
     candidates = _candidates(windows, problem, steepness, is_bench=is_bench)
@@ -139,7 +139,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     chosen = selected.posterior
     full_prior = replace(chosen.prior, bias_sd=prior.bias_sd, scale_sd=prior.scale_sd)
     selected = replace(selected, posterior=replace(chosen, prior=full_prior))
-    # The covariance has the full prior sd of slopes of the scale, not that halved by `_steepest`.
+    # The covariance has the full prior sd of slopes of the scale, not halved by `_steepest`.
     limits = STEEPEST, _steepest(n_directions)
     full, used = (_typical_slopes(steepness, limit, options.gravity) for limit in limits)
     claimed = candidates.typical * (full / used)[:, np.newaxis]
@@ -172,8 +172,8 @@ def _updating_priors(
         least_sigma=max(least, prior.least_sigma),
     )
     if prior.offset_scale and (known_sd := offset_sd_of(known)):
-        # The prior calibration states the sd of the bias over mountings and turn-ons, to a factor
-        # of two: larger changes of |f| count as ageing of the unit.
+        # The scale of the prior of offset sds is at most twice the offset sd of the prior
+        # calibration, so that larger changes of |f| count as ageing of the unit.
         scale = min(prior.offset_scale, 2.0 * known_sd)
         offset_sd = prior.offset_sd if data.has_turn_ons else known_sd
         prior = replace(prior, offset_sd=offset_sd, turn_on_sd=known_sd, offset_scale=scale)
@@ -181,7 +181,7 @@ def _updating_priors(
 
 
 def initial_state(regression: Regression, start: ConstantCalibration, up: Floats) -> State:
-    """Return the state of a constant calibration."""
+    """Return the state of a calibration without effects of temperature."""
     inverse = np.asarray(np.linalg.inv(start.misalignment), dtype=np.float64)
     misalignment = inverse[[1, 2, 2], [0, 0, 1]]
     return regression.initial_state(start.bias / start.scale, misalignment, up)
@@ -191,7 +191,7 @@ def _initial_prior(windows: ThermalWindows, problem: Problem) -> Prior:
     """Return the prior of the constants and of the noises, without columns."""
     data, start, options = windows.data, problem.start, problem.options
     drift = within_positions(data.mean / start.scale, data.position)
-    # Initial sd of mounting offsets, and smallest initial white noise: 1 ug [m/s^2].
+    # Smallest initial sd of mounting offsets, and of white noise: 1 ug [m/s^2].
     least = 1e-5
     sigma = max(float(np.sqrt(np.mean(drift**2))), least)
     noise = _noise_in_1_hz(windows, start.scale)
@@ -223,11 +223,11 @@ def _initial_prior(windows: ThermalWindows, problem: Problem) -> Prior:
 def _with_faces(prior: Prior, up: Floats) -> Prior:
     """
     Return the prior with a smaller misalignment sd if a noisy sensor is only held on its faces,
-    where misalignments of some degrees would, to second order, explain any errors of |f|. The
-    published covariance keeps the sd of `prior`.
+    where misalignments of some degrees would, to second order, explain any errors of |f|. In
+    the published covariance the misalignment has the sd of `prior`.
     """
     by_element = up[:, [1, 2, 2]] * up[:, [0, 0, 1]]
-    # Smaller sd of an element of M [rad]: the cross-axis sensitivity of good consumer MEMS.
+    # Reduced sd of an element of M [rad]: the cross-axis sensitivity of good consumer MEMS.
     of_faces, sd = 2.5e-3, prior.misalignment_scale
     # The RMS product of two components of `up` is below 0.1 if the vertical is near the axes, and
     # 0.3 if the vertical is between two axes.
@@ -271,10 +271,10 @@ def _noise_in_1_hz(windows: ThermalWindows, scale: Floats) -> float:
 
 def _mounting_scale(noise: float) -> float:
     """Return the prior scale of mounting offsets [m/s^2], from the noise in a 1 Hz bandwidth."""
-    # Bounds of the scale: 30 ug, typical of navigation grade, and 0.5 mg, of consumer MEMS; the
-    # tail of the Student prior allows for larger offsets. With almost no noise the lower bound is
-    # 100 times this noise, because an offset 1e6 times as large as the noise cannot be
-    # estimated in double precision.
+    # The prior scale of offsets is at least 30 ug, typical of navigation grade, and at most 0.5
+    # mg, of consumer MEMS; the tail of the Student prior allows for larger offsets. With almost no
+    # noise the lower bound is 100 times this noise, because an offset 1e6 times as large as the
+    # noise cannot be estimated in double precision.
     least, most = max(min(3e-4, 100.0 * noise), 1e-7), 5e-3
     return float(np.clip(3.0 * noise, least, most))
 
@@ -314,8 +314,8 @@ def _candidates(
 
 def _steepest(n_directions: int) -> Floats:
     """Return the largest prior sd of slopes of bias and scale, given the number of attitudes."""
-    # For two to eight attitudes the prior sd of the scale factor's slope is halved: a drift of a
-    # nearly level axis is more often a tilt of the support than a slope of its scale factor, which
+    # For two to eight attitudes the prior sd of the scale factor's slope is halved. A drift of a
+    # nearly level axis is more often a tilt of the support than a slope of the scale factor, which
     # would have to be several hundred ppm/K.
     is_few = 1 < n_directions < POSITIONS_FOR_MISALIGNMENT
     return STEEPEST * (1.0, 0.5 if is_few else 1.0)
@@ -337,7 +337,7 @@ def _steepness(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool) -
         change = within_positions(windows.temperature[:, None], data.position)
         return drift / (float(np.sqrt(np.mean(change**2))) or 1.0)
     kelvins = float(np.std(windows.temperature)) or 1.0
-    # If only rests differ in temperature, the drift appears in differences of |f| between rests.
+    # If the temperature differs only between rests, the drift appears in differences of |f|.
     force = (position_means(data) - start.bias) / start.scale
     sizes, norms = sizes_of(windows, problem.options), np.linalg.norm(force, axis=1)
     errors = norms - sizes
@@ -346,8 +346,8 @@ def _steepness(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool) -
         powers = np.vander(sizes / sizes.max(), 4)
         errors -= powers @ np.linalg.lstsq(powers, errors, rcond=None)[0]
     if is_at_rest:
-        # Bias and scale explain a part of the differences of |f|. Divide the RMS error of |f| by
-        # the RMS change of |f|, per unit of each slope, that bias and scale do not explain.
+        # Divide the RMS error of |f| by the RMS error of |f| that slopes of bias and scale of size
+        # 1 would cause, both without the part that a constant bias and scale explain.
         constants = norm_columns(force / norms[:, None])[:, :6]
         celsius = windows.temperature[data.edges[:-1]]
         of_slopes = (celsius - celsius.mean())[:, None] * constants
@@ -364,7 +364,7 @@ def sizes_of(windows: ThermalWindows, options: FitOptions) -> Floats:
 
 
 def initial_triad(windows: ThermalWindows, options: FitOptions) -> ConstantCalibration:
-    """Fit constant bias, scale and M; few attitudes give the scale only (1 for m/s^2 input)."""
+    """Fit constant bias, scale and M; in few attitudes only one scale (for m/s^2 input: 1)."""
     means, gravity = position_means(windows.data), sizes_of(windows, options)
     norms = np.linalg.norm(means, axis=1)
     if not norms.all() or (len(means) > 1 and not means.any(axis=0).all()):

@@ -6,7 +6,7 @@ recorded one after the other while the unit is turned to the next attitude.
 
 Between the parts of a recording the unit may have stayed switched on, so the parts count as one
 turn-on: positions of one turn-on do not show how well the bias repeats from turn-on to turn-on.
-The lags do not restart, and a rest at the end of a part may continue in the next part.
+Lags do not restart where a part begins, and a rest may continue from one part to the next.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def joined(bags: Sequence[ReducedBag]) -> list[ReducedBag]:
     for bag in sorted(bags, key=lambda bag: bag.start_ns):
         before = [recording for recording in recordings if _continues(recording[-1], bag)]
         if before:
-            # Simulated recordings may have equal stamps: choose the one with the nearest readings.
+            # Simulated recordings may end at equal stamps: extend the one with nearest readings.
             min(before, key=lambda recording: _step(recording[-1], bag)).append(bag)
         else:
             recordings.append([bag])
@@ -44,10 +44,10 @@ def _continues(part: ReducedBag, bag: ReducedBag) -> bool:
     # A bag with known |f| is not joined, because times of |f| count from the start of the bag.
     is_at_1g = bag.source.force is None and part.source.force is None
     is_of_unit = bag.source.serial == part.source.serial
-    # The overlap is at most 3 s, and at most a tenth of a part: recordings whose stamps all begin
-    # at 0 exceed this. The gap is at most 60 s, to turn the unit and restart the recorder, or two
-    # sample intervals if longer. If the unit is nevertheless switched off and on in the gap, the
-    # offsets of its turn-ons count as those of mountings.
+    # Parts overlap by at most 3 s, and by at most a tenth of a part; recordings whose stamps begin
+    # at 0 overlap more. The gap between parts is at most 60 s, to turn the unit and restart the
+    # recorder, or two sample intervals if longer. If the unit is switched off and on in the gap,
+    # the fit takes the offset of each turn-on for an offset of a mounting.
     overlap_s = min(3.0, 1e-10 * (part.end_ns - part.start_ns))
     is_next = -overlap_s < gap_s < max(60.0, 2.0 * bag.cycle_s)
     return bool(is_next and is_alike and is_at_1g and is_of_unit)
@@ -101,7 +101,7 @@ def _one_recording(parts: Sequence[ReducedBag]) -> ReducedBag:
 
 
 def _readings(parts: Sequence[Readings]) -> Readings:
-    """Join the readings of a thermometer in successive parts; keep those with rising stamps."""
+    """Join a thermometer's readings in successive parts; drop readings without a rising stamp."""
     stamp_ns = np.concatenate([part.stamp_ns for part in parts])
     value = np.concatenate([part.value for part in parts])
     newest = np.maximum.accumulate(stamp_ns)
@@ -116,7 +116,7 @@ def _intervals(parts: Sequence[ReducedBag]) -> tuple[StillInterval, ...]:
         shift_s = 1e-9 * (part.start_ns - parts[0].start_ns)
         is_alike = abs(part.window_s - parts[0].window_s) < 0.01 * parts[0].window_s
         for number, rest in enumerate(part.intervals):
-            # Windows of another length than in the first part, as in a short part, are not whole.
+            # Windows count as whole only if within 1 % as long as windows of the first part.
             n_whole = rest.n_whole if is_alike else 0
             shifted = replace(rest, time=rest.time + shift_s, n_whole=n_whole)
             is_first = bool(result) and number == 0
@@ -129,10 +129,10 @@ def _intervals(parts: Sequence[ReducedBag]) -> tuple[StillInterval, ...]:
 
 def _is_one_rest(before: StillInterval, after: StillInterval, window_s: float) -> bool:
     """
-    Whether a rest continues in the next part: the gap is at most three windows long, and on each
-    axis the step between the parts is at most five times the RMS step between windows, or at most
-    twice the largest such step (most steps may be 0 by rounding), in the 20 windows before the end
-    of a part and after it; at least 10 steps must be known.
+    Whether a rest continues in the next part. The gap between the parts is at most three windows
+    long. On each axis the step over the gap is at most five times the RMS, or twice the largest,
+    of the steps between successive windows of the 20 before and the 20 after the gap (most steps
+    may be 0 by rounding). With fewer than 10 steps between these windows the result is False.
     """
     gap_s = 1e-9 * (after.start_ns - before.end_ns)
     means = before.mean[: before.n_whole][-20:], after.mean[:20]

@@ -65,7 +65,7 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     Two rests are compared if the gap between them is at most 30 s or 250 samples, whichever is
     longer, and their directions differ by less than 10 degrees.
     """
-    # At a low sample rate gaps are long: a rest consists of cells, usually of 30 samples each.
+    # Rests are made of whole cells, usually of 30 samples, so a low sample rate makes long gaps.
     longest_ns = 1e9 * max(30.0, 250.0 * bag.cycle_s)
     margin_s = max(_MARGIN_S, 120.0 * bag.cycle_s)  # at least 120 samples
     means = [np.average(rest.mean, axis=0, weights=rest.count) for rest in bag.intervals]
@@ -104,7 +104,7 @@ def _beside_gaps(
 
 
 def _margin(samples: Floats, quiet_sd: Floats) -> float:
-    """Return the time [s] to use beside a gap: 60 time constants of the noise, 10 to 100 s."""
+    """Return how long [s] to average beside a gap: 60 time constants of the noise, 10 to 100 s."""
     time, accel = samples[:, 0], samples[:, 1:4]
     if len(time) < 2 * _FEWEST_SAMPLES:
         return _MARGIN_S
@@ -116,7 +116,7 @@ def _margin(samples: Floats, quiet_sd: Floats) -> float:
 def _examine(
     samples: Floats, gap: tuple[float, float], sds: tuple[Floats, Floats], bag: ReducedBag
 ) -> Jump | None:
-    """Return the jump around a gap between two rests, or None; `sds`: of noise, of rounding."""
+    """Return the jump in a gap between two rests, or None; `sds`: sd of noise, sd of rounding."""
     quiet_sd, rounding_sd = sds
     time, accel, gyro = samples[:, 0], samples[:, 1:4], samples[:, 4:]
     before, after = time <= gap[0], time >= gap[1]
@@ -125,11 +125,11 @@ def _examine(
     beside = before | after
     at, r = _place_and_colour(time, accel, quiet_sd)
     lasting, relative_sd, residual = _step(time[beside], accel[beside], time[at])
-    # Two levels are rounded, the level before and the level after the step.
+    # The step is the difference of two mean levels, each with an error of rounding.
     by_rounding = 2.0**0.5 * rounding_sd
     lasting_sd = np.hypot(quiet_sd * relative_sd * _correlation(residual, quiet_sd), by_rounding)
     step, relative_sd, residual = _step(time, accel, time[at], r)
-    # If noise is correlated, the scatter within half a second underestimates the noise of means.
+    # The scatter within half a second underestimates the noise of means if noise is correlated.
     sd = np.sqrt(np.mean(residual**2, axis=0)) if r else quiet_sd
     step_sd = np.hypot(sd * relative_sd * _correlation(residual, sd), by_rounding)
     if r:
@@ -164,7 +164,7 @@ def _examine(
 
 
 def _correlation(residual: Floats, sd: Floats) -> Floats:
-    """Return sd of the mean of residuals, divided by that for white noise `sd`, >= 1, (3,)."""
+    """Return the ratio, >= 1, of the sd of a mean residual to that by white noise `sd`, (3,)."""
     # A lag-1 correlation r of the means of 40 pieces multiplies the variance of the mean of all
     # pieces by (1 + r) / (1 - r).
     size = max(len(residual) // 40, 1)
@@ -215,9 +215,9 @@ def _place_of_step(time: Floats, accel: Floats, quiet_sd: Floats, r: float) -> i
     residual = whitened(accel, r)
     residual = residual - trend @ (trend.T @ residual)
     candidates = np.arange(_FEWEST_SAMPLES, n - _FEWEST_SAMPLES + 1)
-    # A unit step at sample k, whitened for the lag-1 correlation r, is 1 at k and 1 - r after k.
-    # The step's product with a residual is a sum over the samples from k on. The square of this
-    # whitened step, after removal of the trend, follows from such sums of the trend.
+    # A unit step at sample k, whitened for the lag-1 correlation r, is 1 at k and 1 - r after k:
+    # its product with a residual is a sum over the residuals from sample k on. Subtraction
+    # of the trend lowers the sum of squares of the step by its squared products with the trend.
     tail = _sums_behind(residual, r)[candidates]
     trend_tail = _sums_behind(trend, r)[candidates]
     square = 1.0 + (1.0 - r) ** 2 * (n - candidates - 1) - (trend_tail**2).sum(axis=1)
@@ -254,7 +254,7 @@ def _trend(time: Floats, r: float) -> Floats:
 
 
 def _turn(time: Floats, gyro: Floats, at: int) -> float:
-    """Return the rotation within 1 s of a step [rad], by the rate less its median on each side."""
+    """Return the rotation within 1 s of a step [rad], by rates less the median of each side."""
     about_level = [side - np.median(side, axis=0) for side in (gyro[:at], gyro[at:])]
     angles = np.concatenate(about_level)[1:] * np.diff(time)[:, None]
     return float(np.linalg.norm(angles[np.abs(time[1:] - time[at]) <= 1.0].sum(axis=0)))

@@ -85,7 +85,7 @@ class Layout:
 
     @cached_property
     def unit(self) -> Ints:
-        """Indices of the unit's unknowns by axis, n_unit for the residual, (3, k)."""
+        """Indices of the unknowns of the unit and, the last, of the residual, by axis, (3, k)."""
         common = np.append(self.shared, self.n_unit)
         return np.hstack((self.axis, np.tile(common, (3, 1))))
 
@@ -101,7 +101,7 @@ class Layout:
 
     @cached_property
     def of_axis(self) -> Ints:
-        """Column indices, in `own`, of a position's unknowns in each axis' equations, (3, k)."""
+        """Columns of `own` with the unknowns that occur in the equations of each axis, (3, k)."""
         first = self.up.shape[1] + self.stretch.shape[1]
         before, after = range(first), range(first + 3, self.own.shape[1])
         return np.array([[*before, first + axis, *after] for axis in range(3)])
@@ -187,7 +187,7 @@ class Normal(NamedTuple):
     unit: Floats
 
     def scaled(self, factor: Floats) -> Normal:
-        """Multiply the normal equations of each axis by a factor, shape (3,)."""
+        """Multiply the normal equations of each axis by its element of `factor`, shape (3,)."""
         return Normal(self.local * factor[:, None, None], self.unit * factor[:, None, None])
 
     @property
@@ -203,11 +203,11 @@ class Tangent:
 
     The derivative of the readings w.r.t. an unknown is a factor times a base series, or times one
     of the combinations `combined` of base series. For axis i, position p and unknown u the
-    derivative is ``factor[p, i, u]`` times the series of index ``place[u]``; combinations are
-    counted after the base series. The unknowns of an axis are those of the position (2 of the
-    attitude, stretch, offset, tilts), then those of the bag (initial lag states, turn-on offset),
-    then those of the unit (kappa, bias, weights, nonlinear coefficients, radius, 3 of the
-    misalignment, 2 of each pose). The last place is for the residual, measured minus predicted.
+    derivative is ``factor[p, i, u]`` times series ``place[u]``: a base series or, from index
+    n_base on, one of `combined`. The unknowns of an axis, in this order, are those of the position
+    (2 of the attitude, stretch, offset, tilts), then those of the bag (initial lag states, turn-on
+    offset), then those of the unit (kappa, bias, weights, nonlinear coefficients, radius, 3 of the
+    misalignment, 2 of each pose). The last element is for the residual, measured minus predicted.
 
     combined: the combinations of base series, shape (n_positions, 3, n_base, n_combined)
     place: index of the series of each unknown, shape (k + 1,)
@@ -227,13 +227,12 @@ class Tangent:
     scale: Floats
 
     def normal(self, products: Floats) -> Normal:
-        """Return the normal equations; products of base series: (n_positions, n_base, n_base)."""
+        """Return normal equations by `products` of base series, (n_positions, n_base, n_base)."""
         first, with_combined = self.n_local, products[:, None] @ self.combined
         place = self.place[first:]
         n, bias = len(place), slice(1, 1 + self.n_bias)
         scale = slice(bias.stop, bias.stop + self.n_scale)
-        # Sums over the positions of the products of the base series, times the powers 0, 1 and 2
-        # of the factor of the scale's weights.
+        # Sums, over the positions, of `products` times the power 0, 1 or 2 of `scale`.
         powers = np.stack([self.scale**k for k in range(3)])
         sums = np.tensordot(powers.transpose(2, 0, 1), products, 1)
         unit = np.empty((3, n, n))
@@ -264,14 +263,14 @@ class Tangent:
         return np.asarray(result)
 
     def at(self, places: Ints) -> Tangent:
-        """Return the equations of the positions `places`."""
+        """Return the linearised equations of the positions with the indices `places`."""
         kept = {name: getattr(self, name)[places] for name in ('combined', 'factor', 'scale')}
         return replace(self, **kept)
 
     def of(self, rows: Floats) -> Floats:
         """
         Return the derivatives of m linear functions of the readings, such as the mean, shape
-        (n_positions, 3, m, k + 1). `rows`: these functions of the base series, shape
+        (n_positions, 3, m, k + 1). `rows`: values of the functions for each base series, shape
         (n_positions, m, n_base)
         """
         combined = rows[:, None] @ self.combined

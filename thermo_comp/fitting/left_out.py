@@ -11,9 +11,9 @@ parameters alone, initial lag states at their prior mean, no mounting offsets an
 support. The errors are the drift (the force along each axis less its mean over the position, which
 does not depend on the attitude) and, if the other positions determine |f|, ``|f| - g``.
 
-Model A is better than B if the error of A is smaller by more than the standard error over the
-folds, both for positions and for sections of the program; `gain` lists exceptions. A model that
-describes only one recording fails for positions, a model of only one program fails for sections.
+Model A is better than B if the error of A is smaller by more than the standard error over folds,
+both for positions and for sections of the program; `gain` lists exceptions. A model that describes
+only one recording fails on left-out positions; a model of only one program, on left-out sections.
 
 References
 ----------
@@ -40,8 +40,8 @@ from .regression import Point, PosteriorMode, Regression
 _FEWEST_WINDOWS = 8
 # Largest log ratio of two mean square errors that count as equal: 5 % of an RMS error.
 _NEGLIGIBLE_LOG_RATIO = 0.1
-# Ratio of an RMS error to the white noise up to which noise explains the error: in a soak, lags of
-# unknown size behind temperature changes of hundredths of a kelvin add to the white noise.
+# Noise explains an RMS error of up to 1.7 times the white noise: in a soak, unknown lags behind
+# temperature changes of hundredths of a kelvin add an error to the white noise.
 _NOISE_RATIO = 1.7
 
 
@@ -59,7 +59,7 @@ class Folds:
 
     @classmethod
     def of(cls, square: Floats, windows: Floats, fold: Ints) -> Folds:
-        """Average mean squares of positions, (p,), over the positions of each fold; skip NaN."""
+        """Average mean square errors of positions, (p,), over each fold's positions; skip NaN."""
         known = np.isfinite(square)
         count = np.bincount(fold, np.where(known, windows, 0.0))
         total = np.bincount(fold, np.where(known, square * windows, 0.0))
@@ -76,13 +76,13 @@ class Folds:
 
     def gain_of(self, other: Folds) -> tuple[float, float] | None:
         """
-        Return the log ratio of the mean square error to that of another model (positive if the
-        other model is better), and the standard error of the log ratio, over the folds that are
-        scored for both models, or None if there are none.
+        Return the log ratio of this model's mean square error to that of the model `other`
+        (positive if `other` is better), and the standard error of the log ratio, over the folds
+        that are scored for both models; None without such folds.
 
-        There are two estimates: the mean over folds of their log ratios, robust to few folds of
-        large errors, and the log ratio of the sums over folds with its jackknife error, robust to
-        folds of small errors. The more significant estimate is returned, or 0 if the signs differ.
+        The result is the more significant of two estimates, or 0 if their signs differ. The mean
+        of the log ratios of the folds is robust to few folds of large errors; the log ratio of the
+        sums of squares over the folds (with a jackknife error), to folds of small errors.
         """
         known = np.isfinite(self.square) & np.isfinite(other.square)
         n = int(known.sum())
@@ -91,7 +91,7 @@ class Folds:
         before, after = ((folds.square * folds.windows)[known] + 1e-300 for folds in (self, other))
         of_sums = float(np.log(before.sum() / after.sum()))
         if n == 1:
-            # The standard error of a single fold is unknown: use the largest negligible log ratio.
+            # One fold gives no standard error: return the largest log ratio that counts as equal.
             return of_sums, _NEGLIGIBLE_LOG_RATIO
         each = np.log(before / after)
         others = (np.maximum(square.sum() - square, 1e-300) for square in (before, after))
@@ -103,7 +103,7 @@ class Folds:
         return max(estimates, key=lambda estimate: abs(estimate[0]) / max(estimate[1], 1e-12))
 
     def is_noise(self, other: Folds, noise: float) -> bool:
-        """Whether white noise explains this model's errors in the folds scored for both models."""
+        """Whether white noise explains the errors in the folds that `self` and `other` score."""
         known = np.isfinite(self.square) & np.isfinite(other.square)
         square = np.average(self.square[known], weights=self.windows[known])
         return bool(square <= (_NOISE_RATIO * noise) ** 2)
@@ -153,7 +153,7 @@ class Score:
 
     @property
     def excess(self) -> float:
-        """RMS of the left-out drift in excess of noise and thermometer [m/s^2]; 0 if unknown."""
+        """RMS left-out drift in excess of noise and thermometer errors [m/s^2]; 0 if unknown."""
         square = self.rms**2 - self.noise**2 - self.by_thermometer**2
         return float(np.sqrt(square)) if square > 0.0 else 0.0
 
@@ -174,11 +174,11 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
 
     The gain is the sum of the log ratios (`Folds.gain_of`) of the drift of positions and of
     sections. If the drifts of both models agree to 5 %, the gain is the log ratio of the errors of
-    left-out |f|, if that exceeds two standard errors. `by_halves`: whether an increased error of
-    left-out halves of the chamber program, a sign of too many columns, excludes a gain. Increased
-    errors of left-out |f| exclude a gain, and so does an increased expected error of the settled
-    bias, unless noise explains the drift. A drift that noise explains need not decrease: left-out
-    bags of soaks contain no effects of ramps.
+    left-out |f|, if this ratio exceeds two standard errors. `by_halves`: whether larger errors of
+    left-out halves of the chamber program, a sign of too many columns, exclude a gain. Larger
+    errors of left-out |f| exclude a gain; so does a larger expected error of the bias at settled
+    temperatures, unless noise explains the drift. A drift that noise explains need not
+    decrease, because the drift of left-out soaks contains no effects of ramps.
     """
     *drifts, norms = _beyond_thermometer(before, after)
     drift = [gain for gain in drifts if gain]
@@ -187,7 +187,7 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
         for gain, first, second in zip(drifts, before.kinds, after.kinds, strict=False)
         if gain and (gain[0] > gain[1] or not second.is_noise(first, after.noise))
     ]
-    # The RMS error of left-out halves may rise by a quarter: it usually scatters by this ratio.
+    # The RMS error of left-out halves may rise by a quarter, which is its usual scatter.
     is_worse_by_halves = by_halves and after.halves.rms > 1.25 * before.halves.rms
     if is_worse_by_norms(before, after) or is_worse_by_halves:
         return 0.0
@@ -210,9 +210,9 @@ def is_worse_by_norms(before: Score, after: Score) -> bool:
 
 def is_undecided(before: Score, after: Score) -> bool:
     """
-    Whether left-out data do not decide between two models, of which `after` is not better: the
-    drifts agree to 5 %, and errors of |f| are not scored for both models, or are smaller in
-    `after` by one to two standard errors.
+    Whether left-out data do not decide between two models, given that `after` is not better: the
+    drifts agree to 5 %, and errors of |f| are smaller in `after` by more than one standard error,
+    or no fold has an error of |f| for both models.
     """
     *drift, norms = _beyond_thermometer(before, after)
     is_equal = all(abs(gain[0]) < _NEGLIGIBLE_LOG_RATIO for gain in drift if gain)
@@ -220,7 +220,7 @@ def is_undecided(before: Score, after: Score) -> bool:
 
 
 def is_near(chosen: Score, other: Score) -> bool:
-    """Whether a model is at most one standard error worse than the chosen model."""
+    """Whether left-out errors of `other` exceed the chosen model's by at most a standard error."""
     gains = [gain for gain in _gains(chosen, other) if gain]
     return bool(gains) and all(gain > -error for gain, error in gains)
 
@@ -228,8 +228,8 @@ def is_near(chosen: Score, other: Score) -> bool:
 def _beyond_thermometer(before: Score, after: Score) -> list[tuple[float, float] | None]:
     """
     Return the log ratios of `Score.kinds` (`Folds.gain_of`), None for a kind whose errors a coarse
-    thermometer explains. Errors of a thermometer repeat in all bags of one chamber program: their
-    model is better on left-out bags, but fails in another program.
+    thermometer explains. Thermometer errors repeat in all bags of one chamber program: a model
+    that fits them is better on left-out bags, but fails in another program.
     """
     is_known = before.norms.rms > _NOISE_RATIO * before.by_thermometer
     keep = (not before.is_by_thermometer, not before.is_by_thermometer, is_known)
@@ -268,10 +268,10 @@ def settled_error(
     Return the expected error of the bias after all lags settled [m/s^2]; inf without bias columns.
 
     In bags that all begin at one temperature the lags change together with the board temperature,
-    so such bags do not determine the bias after the lags have settled: this bias is extrapolated.
-    The error is the root sum of squares of two terms: the posterior sd of this bias; and
-    `excess`, the left-out drift beyond the noise [m/s^2], times the ratio (if above 1) of this sd
-    to that of the bias in the windows. `settled`: columns at settled temperatures, shape (k, m).
+    so the bias after the lags have settled is extrapolated from such bags. The expected error of
+    the settled bias is the root sum of squares of its posterior sd and of ``excess * growth``;
+    `excess`: left-out drift beyond the noise [m/s^2]; growth: ratio of the posterior sd to the sd
+    of the bias in the windows, at least 1. `settled`: columns at settled temperatures, (k, m).
     """
     if not posterior.layout.used[0].any():
         return np.inf
@@ -281,13 +281,13 @@ def settled_error(
         _sd_of_changes(posterior, columns - columns.mean(axis=0))
         for columns in (settled / regression.rms, seen)
     )
-    # `seen_sd`, the sd in the windows, is 0 if all columns are constant in the windows.
+    # `seen_sd`, the sd of the bias in the windows, is 0 if no column changes in the windows.
     growth = max(sd / seen_sd, 1.0) if seen_sd else 1.0
     return float(np.hypot(sd, excess * growth))
 
 
 def _sd_of_changes(posterior: PosteriorMode, columns: Floats) -> float:
-    """Return the RMS, over axes and rows of columns (k, m), of the sd of the bias [m/s^2]."""
+    """Return the sd of the bias, RMS over the axes and the rows of `columns`, (k, m) [m/s^2]."""
     parts = posterior.layout.by_weights(columns, np.zeros(3))
     square = sum(float(np.sum((part @ posterior.root[at]) ** 2)) for part, at in parts)
     return float(np.sqrt(square / (3 * len(columns))))
@@ -296,7 +296,7 @@ def _sd_of_changes(posterior: PosteriorMode, columns: Floats) -> float:
 def _by_positions(
     regression: Regression, posterior: PosteriorMode
 ) -> tuple[Folds, Folds, Floats, Floats]:
-    """Leave out each mounting; return `Folds` of drift and |f|, windows' force and drift."""
+    """Leave out mountings; return errors of drift and of |f|, and force and drift by window."""
     windows, share = regression.windows, regression.weight / regression.windows.weight
     point, edges = regression.at(posterior.state, posterior.prior), windows.edges
     counts = np.diff(edges).astype(np.float64)
@@ -327,8 +327,8 @@ def _is_drift_determined(
     point: Point, posterior: PosteriorMode, root: Floats, rows: slice
 ) -> bool:
     """
-    Whether the variance of the left-out drift in `rows`, by a fit of covariance ``root @ root.T``,
-    is below ten times the sum of this variance by a fit of all positions and of the noise.
+    Whether the fit without a position, of covariance ``root @ root.T``, determines the drift in
+    `rows`: the drift's variance is below 10 times (its variance by all positions + noise).
     """
     regression, sigma = point.regression, point.prior.sigma
     if not point.layout.used[0].any():
@@ -348,8 +348,8 @@ def _is_drift_determined(
 
 def _is_norm_determined(point: Point, posterior: PosteriorMode, root: Floats, p: int) -> bool:
     """
-    Whether the variance of |f| in position `p`, by a fit of covariance ``root @ root.T``, is
-    below ten times the sum of this variance by a fit of all positions and of the offsets.
+    Whether the fit without position `p`, of covariance ``root @ root.T``, determines |f| in `p`:
+    the variance of |f| is below 10 times (its variance by all positions + that of offsets).
     """
     if not point.regression.gravity:
         return False
@@ -369,8 +369,8 @@ def _by_sections(
     is_within: bool = False,
 ) -> tuple[Folds, Floats]:
     """
-    Score the drift of left-out sections, about the mean of those windows of the position that stay
-    in the fit. Each fit without sections is `n_steps` Gauss-Newton steps from the fit of all data.
+    Score the drift of left-out sections about the mean of the position's windows in the fit. Each
+    fit without sections is `n_steps` Gauss-Newton steps from the fit of all data.
 
     `folds`: sections of each fold; `is_within`: score only temperatures that occur in the fit
     """

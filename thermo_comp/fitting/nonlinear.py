@@ -105,7 +105,7 @@ class Forces:
 
 def with_forces(windows: ThermalWindows, options: FitOptions) -> ThermalWindows:
     """
-    Add |f| of the positions and the nonlinear terms to the windows.
+    Add the stated |f| of the positions, and the nonlinear terms to be fitted, to the windows.
 
     The windows stay unchanged if |f| is within 1e-3 of gravity in all positions, and neither the
     options nor the prior have nonlinear terms.
@@ -151,7 +151,7 @@ def prior_sd(kinds: Sequence[Kind], options: FitOptions) -> Floats:
 
 
 def starting_sd(forces: Forces, options: FitOptions) -> Floats:
-    """Return the prior sd of the first fit, with an sd of 0 for the odd square, shape (2 k,)."""
+    """Return the prior sds of the first fit, 0 for the term a |a| (`odd_square`), shape (2 k,)."""
     is_initial = np.array([kind != 'odd_square' for kind in forces.kinds] * 2)
     return np.asarray(prior_sd(forces.kinds, options) * is_initial)
 
@@ -181,7 +181,7 @@ class _TermFits:
         return self.posterior(used).log_evidence - self.posterior(used - dropped).log_evidence
 
     def left_out_gain(self, used: _Active, dropped: _Active) -> tuple[float, float]:
-        """Return the gain (`Folds.gain_of`) in left-out |f| by the coefficients `dropped`."""
+        """Return the log ratio, and its sd, of left-out |f| errors without and with `dropped`."""
         return self.score(used - dropped).norms.gain_of(self.score(used).norms) or (0.0, 0.0)
 
     def is_determined(self, used: _Active, at: int) -> bool:

@@ -6,11 +6,11 @@ Owns the search for the thermal lag of each axis.
 The bias and the scale factor of an axis are modelled as functions of ``x = t - m``, the
 temperature of one part of the unit less the reference temperature. t is the board temperature T
 less the reference temperature, and m = T - L(T + v G) is T less the temperature of the part, with
-L the lag operator and G = T_case - T_board the gradient. The part lags T + v G, a temperature
-between board and case. The lag has one first-order stage or, for a part that is heated through
-another part, two stages in series. Without a case thermometer, the temperature that the part lags
-may lead the board thermometer by a time, the lead. The time constants, the share v of the gradient
-and the lead minimise the RMS residual of a spline of the bias and a cubic of the scale over x.
+L the lag operator and G = T_case - T_board the gradient. The part follows a temperature T + v G
+between board and case with a lag of one first-order stage or, if it is heated through another
+part, of two stages in series. Without a case thermometer, the part may follow a temperature
+that leads T by a time, the lead. The time constants, the share v of the gradient and the lead
+minimise the RMS residual of a spline of the bias and a cubic of the scale over x.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class _Shape(NamedTuple):
 # Ratio of the RMS residual to white noise up to which no other shape or lag is tried.
 _EXPLAINED_RATIO = 1.1
 # Shapes of the curves, in the order of the trials. A spline of 4 nodes determines a lag best, but
-# cannot describe a kink of the bias, so the limit of its RMS residual is low.
+# cannot describe a kink of the bias, so its limit `most_noise` is low.
 _SHAPES = (
     _Shape(4, _EXPLAINED_RATIO),
     _Shape(4, _EXPLAINED_RATIO, has_gradient=True),
@@ -88,9 +88,9 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> list[Part
     Find the lag of each axis, and reduce the weights of windows that deviate from the model.
 
     Returns [] if the model with one lag per axis does not explain the drift of all axes, or if the
-    data do not determine a time constant. If the residual of every shape exceeds the noise, lags
-    of one stage are also fitted, and come first in the list if on every axis they halve the RMS
-    residual without a lag: a second stage may only describe slow noise or a tilt of the support.
+    data do not determine a time constant. If the residual exceeds the noise for all shapes of the
+    curves, a second stage may only describe slow noise or a tilt of the support. The result then
+    begins with lags of one stage, if they at least halve the RMS residual of each axis.
     """
     data, columns = windows.data, windows.model.columns
     if not windows.has_temperature or not any(column.group == 'board' for column in columns):
@@ -107,9 +107,9 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> list[Part
         subset = _PartCurves(windows, start, shape, 3000)
         lags = [subset.refined(lag, axis) for axis, lag in enumerate(searched)]
         parts, ratio = _PartCurves(windows, start, shape, len(data.time)).parts(lags, noise)
-        # A residual above `most_noise` times the white noise has a cause besides white noise and
-        # lags, such as slow noise: the lags are then accepted only if the RMS residual of each
-        # axis is at most a quarter of its RMS residual without a lag.
+        # If the residual is above `most_noise` times the white noise, it has a further cause, such
+        # as slow noise: lags are then accepted only if the RMS residual of each axis is at most a
+        # quarter of its RMS residual without a lag.
         is_explained = ratio <= shape.most_noise
         if not is_explained and min(map(subset.reduction, lags, range(3))) < 4.0:
             continue
@@ -185,15 +185,15 @@ class _PartCurves:
     def _is_of_use(
         self, lag: Part, axis: int, noise: float, most_noise: float = 3.0, reduction: float = 4.0
     ) -> bool:
-        """Whether residual / noise <= `most_noise`, or `self.reduction` is >= `reduction`."""
+        """Whether the residual with `lag` is near the noise, or far below the one without lag."""
         typical = 1.4826 * np.median(np.abs(self._weighted(lag, axis) / self._root_weight[:, 0]))
         return bool(typical <= most_noise * noise or self.reduction(lag, axis) >= reduction)
 
     def _lag(self, axis: int, noise: float) -> Part:
         """
         Return the lag with the smallest RMS residual; 0 s if no lag reduces the residual. If noise
-        does not explain the residual, a second stage or another share of the gradient is tried,
-        and must reduce the RMS residual by more than 5 %.
+        does not explain the residual, a second stage or another share of the gradient, then both,
+        are tried; each must reduce the RMS residual by more than 5 %.
         """
         one_stage = self.one_stage(axis)
         best = self._with_lead(one_stage, axis)
@@ -206,7 +206,7 @@ class _PartCurves:
                 along = [self.one_stage(axis, share) for share in (0.3, 0.6, 0.9)]
                 starts.append(min(along, key=lambda lag: self._square(lag, axis)))
             if not any(self._is_of_use(near, axis, noise, 8.0, 1.5) for near in (best, *starts)):
-                # Neither a second stage nor another share would reduce this residual enough.
+                # The residual is too large for a second stage, or share of the gradient, to help.
                 return best
             lags = [self._searched(axis, _in_two_stages(one_stage), (0.2, 0.4, 0.0, 0.0))]
             if best.lead_s:
@@ -225,11 +225,11 @@ class _PartCurves:
 
     def _with_lead(self, lag: Part, axis: int) -> Part:
         """
-        Add a share of the gradient to a lag or, without a case thermometer, a positive lead time,
-        if the residual then is significantly smaller.
+        Return `lag` plus a share of the gradient or, without a case thermometer, a positive lead
+        time; or `lag` itself if the residual does not become significantly smaller.
 
-        The residual is linearised in time constant and in share or lead. The sum of squared
-        residuals must decrease by a factor that white residuals reach with a probability of 1e-5.
+        The residual is linearised w.r.t. time constant and share of the gradient, or lead. The
+        residual's sum of squares must decrease by more than white noise allows at p = 1e-5.
         """
         tau = lag.tau_s
         if not tau:
@@ -267,9 +267,9 @@ class _PartCurves:
         """
         Return the lag of the smallest RMS residual by the simplex method, from the lag `first`.
 
-        The coordinates are the logarithms of both time constants, the share of the gradient, and
-        the ratio of lead to first time constant. `steps`: first steps in the coordinates; 0 keeps
-        a coordinate constant. `accuracy`: half of the largest extent of the final simplex.
+        The search is over the logarithms of both time constants, the share of the gradient, and
+        lead / first time constant. `steps`: first steps in these four numbers, 0 keeps a number
+        constant; `accuracy`: half of the largest extent of the final simplex.
         """
         tau, second, share, lead = first
         start = np.array([np.log(tau), np.log(second or 1.0), share, lead / tau])
@@ -311,8 +311,8 @@ class _PartCurves:
 
     def _is_determined(self, lag: Part, axis: int) -> bool:
         """
-        Whether time constants longer or shorter by `_TAU_RATIO` (21 s for a lag of 0 s) increase
-        the RMS residual by more than 5 %, and the lag decays to 10 % within the longest bag.
+        Whether time constants `_TAU_RATIO` times as long or short (21 s for a lag of 0 s) increase
+        the RMS residual by over 5 %, and the longest bag lasts at least ln(10) time constants.
         """
         tau, second, share, lead = lag
         if tau > float(self._age.max()) / np.log(10.0):
@@ -331,19 +331,19 @@ class _PartCurves:
         return float(np.sqrt(self._square(Part(0.0), axis) / self._square(lag, axis)))
 
     def parts(self, lags: Sequence[Part], noise: Floats) -> tuple[Parts, float]:
-        """Return the lags with factors of the weights, and the ratio of RMS residual to noise."""
+        """Return lags with factors of windows' weights, and the ratio of RMS residual to noise."""
         weighted = np.column_stack([self._weighted(lag, axis) for axis, lag in enumerate(lags)])
         residual = weighted / self._root_weight
         factors = undisturbed(residual, self._weight, self._position)
         square = np.average(residual**2, axis=0, weights=self._weight * factors)
-        # The unknowns of an axis are the coefficients, and one level per position.
+        # The unknowns of an axis are a coefficient of each regressor, and one level per position.
         n_unknowns = self._series(lags[0], 0).shape[1] + len(self._first)
         square /= max(1.0 - n_unknowns / len(residual), 0.05)
         ratio = float(np.sqrt((square / noise**2).max()))
         x, y, z = (Part(*map(round, lag, (1, 1, 4, 1))) for lag in lags)
-        # Largest left-out drift at which the lags are kept without trial of other models: 10 sd of
-        # the noise if noise explains the residual of a shape without stress (its curves
-        # extrapolate badly to left-out data), else 2 sd.
+        # Other models are tried if the left-out drift is above `most_drift`: 2 sd of the noise, or
+        # 10 sd if noise explains the residual of a shape without stress, because such a shape may
+        # fit all data well but extrapolate badly to left-out data.
         is_curve = ratio <= self._shape.most_noise and not self._shape.has_stress
         most_drift = (10.0 if is_curve else 2.0) * float(noise.mean())
         return Parts((x, y, z), factors, most_drift), ratio
@@ -389,12 +389,12 @@ class _PartCurves:
         if self._shape.has_gradient:
             bias.append(self._case[:, None])
         of_scale = self._force[:, [axis]] * np.hstack(scale)
-        # The lag of the part at the start of each bag is unknown; its effect decays with tau.
+        # The unknown lag of the part at the start of a bag has an effect that decays with tau.
         begin = self._is_of_bag * np.exp(-self._age / max(lag.tau_s, 1.0))
         return self._centred(np.hstack((*bias, of_scale, begin)))
 
     def _centred(self, values: Floats) -> Floats:
-        """Subtract each position's weighted mean from columns; multiply by the root weights."""
+        """Return columns less their weighted mean in each position, times the root weights."""
         level = np.add.reduceat(values * self._share, self._first)
         return np.asarray((values - level[self._position]) * self._root_weight)
 

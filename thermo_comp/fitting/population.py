@@ -106,9 +106,9 @@ def _scatter(deviations: Floats, layout: ParameterLayout, K: Floats) -> Floats:
 
     The correlations of bias, scale and misalignment with each other and with the curves are set to
     0: with chance correlations from few units, one position would determine all constants of a new
-    unit. The correlations between curves are reduced by a ratio estimated from their scatter [1]_,
-    after a dynamic curve is replaced by its difference from the static curve: in most units both
-    curves are equal, and a reduced correlation of equal curves would make the curves differ.
+    unit. The correlations between curves are reduced by a ratio estimated from their scatter [1]_.
+    A dynamic curve is first replaced by its difference from the static curve: in most units both
+    curves are equal, and reduced correlations would make them differ.
     """
     to_differences = np.eye(deviations.shape[1])
     for block in (*layout.bias, *layout.scale):
@@ -160,7 +160,7 @@ def _with_common_scatter(deviations: Floats, layout: ParameterLayout, K: Floats)
 
 
 def _without_range(column: Column) -> Column:
-    """Return a column with constant `range` and `rest_k`, which differ between units of a type."""
+    """Replace `range` and `rest_k` of a column, which differ between units, by fixed values."""
     return replace(column, range=(0.0, 1.0), rest_k=0.0)
 
 
@@ -171,12 +171,12 @@ def _in_one_stage(column: Column, tau_s: float) -> Column:
 
 def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
     """
-    Return columns of the bank of time constants, with factors, whose sum approximates a column.
+    Return columns of the bank of time constants, and factors: their sum approximates `column`.
 
     Parts of two units of a type have different time constants, so a lag is interpolated between
     the lags of the bank, which is common to all units; a lag of 0 s has the value 0. A lag of two
     stages, a lag behind a temperature between board and sensor, and a lag with a lead are sums of
-    first-order lags. A power of such a sum is approximated by the power of one lag of the board
+    first-order lags. A power of a sum of lags is approximated by the power of one lag of the board
     that has the same delay in a long ramp as the sum.
     """
     tau, second, lag = column.tau_s, column.second_tau_s, column.source
@@ -223,7 +223,7 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
 def _relative_to(
     calibration: Calibration, template: Calibration, mean_K: Floats
 ) -> tuple[Floats, Floats]:
-    """Return a unit's parameters and covariance in `template`'s layout; `mean_K`: mean scales."""
+    """Return parameters and covariance in `template`'s layout, for scale factors `mean_K`."""
     if calibration.posterior is None:
         raise FitError(
             f'the calibration of unit {calibration.unit.serial} has no covariance, so it cannot '
@@ -262,7 +262,7 @@ def _shape(calibration: Calibration) -> list[tuple[str, int]]:
 
 
 def _template(calibrations: Sequence[Calibration], columns: Sequence[Column]) -> Calibration:
-    """Return a calibration with the union of the units' ranges, and the columns with weight 0."""
+    """Return a calibration with the union of the units' ranges, and with columns of weight 0."""
     first = calibrations[0]
     slow = [[axis.residual_sd_m_s2 for axis in each.static.axes()] for each in calibrations]
     usual = np.median(slow, axis=0).tolist()

@@ -3,9 +3,9 @@
 """
 Owns the informative prior of a fit, from a calibration of the unit or its type (`population`).
 
-Values and covariance of all parameters of the calibration are mean and covariance of the Gaussian
-prior of the regression, which has the calibration's columns. The covariance is increased by the
-ageing of the unit since the calibration.
+The mean and the covariance of the Gaussian prior of the regression are the parameters of the
+calibration and their covariance, increased by the ageing of the unit since the calibration. The
+regression has the columns of the calibration.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def offset_sd_of(calibration: Calibration) -> float:
 
 
 def with_calibration(calibration: Calibration, regression: Regression, state: State) -> State:
-    """Set bias and weights to those of a calibration with the scale factors `nominal_scale`."""
+    """Set a state to the bias and weights of a calibration of scale factors `nominal_scale`."""
     layout, values = parameter_layout(calibration), parameters_of(calibration)
     if len({(b - a, d - a) for a, b, _, d in (*layout.bias, *layout.scale)}) > 1:
         raise FitError(
@@ -116,11 +116,11 @@ def informative_priors(
             'the prior has no covariance: use a calibration that was fitted to bags; an imported '
             'calibration cannot be a prior'
         )
-    # Pairs to try: the ageing, sd of biases [g] and of scale factors (0: as the user states); and
-    # `share`, the ratio of uncorrelated variances to add to the variances of the prior.
+    # Pairs to try: sd of bias [g] and of scale factor due to ageing (0: as the user states); and
+    # `share`, the ratio of an added uncorrelated variance to each variance of the calibration.
     tried = [(0.0, share) for share in (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)]
-    # The fit begins with the last, widest prior: in a first fit with a narrow prior, the noise
-    # would absorb changes of the unit.
+    # The fit begins with the last, widest prior: in a first fit with a narrow prior, the
+    # estimated noise would absorb changes of the unit.
     if options.ageing_bias or options.ageing_scale:
         tried.append(tried[-1])
     else:
@@ -129,8 +129,8 @@ def informative_priors(
         tried += [(ageing, 0.0) for ageing in (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)]
         # Priors for a unit whose effects of temperature have changed, too: `share` multiplies the
         # sd of the prior by 1.4, 30 and 1000, because the sd of an effect of temperature may be a
-        # thousandth of the effect. The sd is at most the effect itself: a few rests would
-        # otherwise leave the effects at other temperatures unknown.
+        # thousandth of the effect. The added sd is limited to the size of the effect: with a
+        # larger sd, effects at temperatures without rests would be unknown.
         tried += [(ageing, share) for share in (1.0, 1e3, 1e6) for ageing in (3e-5, 3e-4, 3e-3)]
     K, places = constants_of(calibration).scale, parameter_layout(calibration)
     layout = regression.layout(regression.windows.parts)
@@ -148,7 +148,7 @@ def informative_priors(
                 levels = [block.static, block.dynamic]
                 covariance[np.ix_(levels, levels)] += sd * sd
         density = float(log_student(np.array(ageing * options.gravity / usual_ageing)))
-        # Changed effects of temperature are rare: the rests must show them clearly.
+        # The effects of temperature rarely change: log evidence must justify a change.
         density -= CLEAR_GAIN * (share >= 1.0)
         root = _root(covariance, share, sizes, to_file)
         yield InformativePrior(mean, root, density, is_changed=share > 1.0)
@@ -170,9 +170,9 @@ def _root(covariance: Floats, share: float, sizes: Floats, to_file: Floats) -> F
     """
     Return the upper triangular root of the inverse covariance of the unit's unknowns.
 
-    `covariance`: of the file's parameters; `share` times each variance is added to its diagonal,
-    at most the variance or, if larger, the square of the parameter in `sizes`;
-    `to_file`: derivatives of the file's parameters w.r.t. the unknowns
+    `covariance`: of the file's parameters; each variance v is increased by ``min(share * v, max(v,
+    size^2))``, with the parameter's size in `sizes`; `to_file`: derivatives of the file's
+    parameters w.r.t. the unknowns
     """
     diagonal = np.diag(covariance)
     floor = np.where(diagonal > 0.0, diagonal, np.min(diagonal[diagonal > 0.0], initial=1.0))

@@ -11,13 +11,14 @@ import numpy as np
 
 from ..errors import FitError
 from ..recording.overview import KELVINS
+from ..recording.stillness import widened
 from ..text import counted
 from ..typing import Bools
 from ..unit.calibration import POPULATION, Calibration
 from ..unit.gravity import STANDARD_GRAVITY
 from .data_checks import Finding, advice
 from .jumps import Jump, find_jumps
-from .options import FitOptions
+from .options import COUNTS_FULL_SCALE, FitOptions
 from .reduction import ReducedBag, StillInterval
 from .windows import ThermalWindows, Track
 
@@ -34,6 +35,20 @@ def judge_prior(serial: str, prior: Calibration | None) -> Iterator[Finding]:
             f'{serial}: make a prior of the type of units with thermo_comp prior, from the '
             'calibrations of three units or more',
         )
+
+
+def full_scale_of(bags: Sequence[ReducedBag], options: FitOptions) -> float:
+    """Return the stated full scale [input units], else one above all samples of the bags."""
+    full_scale, largest = options.saturated_at, max(bag.max_abs for bag in bags)
+    if full_scale == COUNTS_FULL_SCALE:
+        return widened(full_scale, np.array([[largest]]))
+    if full_scale is None:
+        # Take the smallest usual full scale 10 % above all samples, else twice the largest sample.
+        # The full scale of a prior may have been stated by the user.
+        ranges = (STANDARD_GRAVITY * g for g in (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0))
+        full_scale = next((top for top in ranges if top > 1.1 * largest), 2.0 * largest)
+        full_scale = max(full_scale, options.prior.unit.full_scale if options.prior else 0.0)
+    return full_scale
 
 
 def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Finding]:
@@ -84,6 +99,14 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
         text = '; '.join(f'{axis.bag}: {axis.text}' for axis in dead)
         yield Finding('stuck', 'refusal', f'{text}: {_why_dead(bags, dead)}')
     size = float(np.median(np.linalg.norm(np.concatenate([rest.mean for rest in rests]), axis=1)))
+    full_scale = full_scale_of(bags, options)
+    if full_scale not in (options.full_scale, COUNTS_FULL_SCALE):
+        text = (
+            f'samples of {full_scale:.5g} {options.input} ({full_scale / size:.2g} times gravity) '
+            'or more on an axis will count as saturated, and will not be published: if the sensor '
+            'measures more, state its range with --full-scale'
+        )
+        yield advice('full-scale', text)
     yield from _judge_thermometers(bags, options.prior)
     yield from _judge_units(bags, size, options)
     per_mg = 1e-3 * (STANDARD_GRAVITY if options.input == 'm/s^2' else size)
@@ -169,7 +192,7 @@ def _why_dead(bags: Sequence[ReducedBag], dead: Sequence[_DeadAxis]) -> str:
     ends = {(axis.axis, axis.value > 0.0) for axis in dead}
     if not largest or not is_at_top.all() or len(ends) == 1:
         return 'the axis is dead; leave out each bag with a dead axis'
-    # The advised full scale is just below the clipped reading, which counts as saturated.
+    # Advise a full scale just below the clipped reading, so that this reading is saturated.
     limit = f'--full-scale {largest * (1.0 - 1e-4):.5g}'
     return (
         'the same largest magnitude, with both signs or on several axes, is the full scale: leave '
@@ -261,8 +284,8 @@ def judge_missing(bags: Sequence[ReducedBag], windows: ThermalWindows) -> Iterat
 
 def _missing(bag: ReducedBag, track: Track) -> tuple[float, float, float]:
     """
-    Count a bag's samples at rest: all; those before the estimate of the board temperature is
-    accurate; later samples without a temperature, but between readings of each thermometer.
+    Return numbers of a bag's samples at rest: all; before the board temperature is accurate; and
+    later ones without a known temperature, while all thermometers are recorded.
     """
     read = [readings.stamp_ns for readings in bag.temperatures.values() if len(readings.stamp_ns)]
     begin_s = 1e-9 * (max(stamp_ns[0] for stamp_ns in read) - bag.start_ns)

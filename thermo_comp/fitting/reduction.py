@@ -4,10 +4,10 @@
 Owns the statistics of a bag: still intervals, their windows, temperature readings, counters.
 
 The blocks of a bag are read once, in bounded memory. Samples are averaged to cells of about half a
-second (see `stillness`), and the cells of a still interval to windows of ten seconds. Windows of a
-short interval, and the last window of an interval, may be shorter. Within a window the deviation
-of every thermal regressor from a straight line is far below the noise, so the mean of a window is
-a sufficient statistic. The regression estimates the noise of the means, which for a
+second (see `stillness`), and the cells of a still interval to windows of ten seconds. A short
+interval, and the end of an interval, may have shorter windows. Within a window the deviation of
+every thermal regressor from a straight line is far below the noise, so the mean of a window is a
+sufficient statistic. The regression estimates the noise of these means, which for a
 charge-balancing converter is less than the scatter of the samples implies.
 """
 
@@ -196,10 +196,10 @@ def reduce_source(
 
     `still_sd` is the largest sd of samples at rest [g]. Without `min_rest_s` a rest lasts at least
     3 s, or at least 1 or 2 s if these shorter rests determine bias and scale better. The largest
-    variance of a rest is also chosen so that the rests determine bias and scale best. If the
-    user or the bag states |f|, the variance is not chosen, and a rest lasts 3 s or more. At a low
-    sample rate a cell of the usual number of samples is so long that a drift within it looks like
-    a motion, and that short rests are lost: cells of 10 or 5 samples are then tried.
+    variance allowed in a rest is chosen so that rests determine bias and scale best. If the user
+    or the bag states |f|, the limit of the variance is fixed, and `min_rest_s` is by default 3 s.
+    At a low sample rate, cells of the usual number of samples are so long that drifts look like
+    motions and short rests are lost: cells of 10 or 5 samples are tried.
     """
 
     def reduced(least: int) -> tuple[ReducedBag, float]:
@@ -238,7 +238,7 @@ def _reduced(
     if source.force is None:
         ranges = _rests(cells, min_rest_s, still_sd)
     else:
-        # |f| at rest is not gravity, so thresholds cannot be chosen by the norms of rests.
+        # If |f| is stated, it is not gravity: the norms of rests cannot decide on thresholds.
         cells = stillness.without_rotation(cells)
         ranges = stillness.still_intervals(cells, min_rest_s or 3.0, still_sd)
     restless = reading.causes.cause(cells, still_sd)
@@ -289,8 +289,8 @@ def _cycle_s(cells: Cells) -> float:
     """Return the typical interval between samples [s]; NaN without samples."""
     if not len(cells.count):
         return np.nan
-    # Complete cells have the median number of samples, or one more or less. If most cells deviate
-    # more, as with bursts of samples, cells with more than half of the median number are used.
+    # A cell is complete if its number of samples is within 1 of the median. If most cells are not
+    # complete, as with bursts of samples, cells with over half of the median number are used.
     median = float(np.median(cells.count))
     use = np.abs(cells.count - median) <= 1.0
     if np.mean(use) < 0.5:
@@ -306,7 +306,7 @@ def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
     use &= stamp_ns > np.maximum.accumulate(before[: len(stamp_ns)])
     stamp_ns, value = stamp_ns[use], value[use]
     span_s = np.ptp(stamp_ns) * 1e-9 if len(stamp_ns) else 0.0
-    # No thermometer responds within 0.2 s, and the tracker's loop over readings is slow in Python.
+    # Average readings over 0.2 s: no thermometer is faster, and the tracker's Python loop is slow.
     size = int(0.2 * (len(stamp_ns) - 1) / span_s) if span_s else 1
     n = len(stamp_ns) // size * size if size > 1 else 0
     if n:
@@ -317,16 +317,17 @@ def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
     return Readings(stamp_ns, value)
 
 
+@np.errstate(invalid='ignore')
 def is_spike(value: Floats) -> Bools:
     """Return which readings are over 10 K from the median of five readings about them, (n,)."""
-    # A thermometer with a loose contact reads -127 or 85 degC for a moment. Thermometer noise is
-    # estimated without such spikes, so that the tracker rejects them as outliers.
+    # A thermometer with a loose contact reads -127 or 85 degC for a moment. The sd of its noise is
+    # estimated without such spikes, so that the tracker rejects the spikes as outliers.
     far = np.zeros(len(value), dtype=bool)
     if len(value) > 4:
         middle = np.median(sliding_window_view(value, 5), axis=1)
         far[2:-2] = np.abs(value[2:-2] - middle) > 10.0
-        # The first reading, and the last, has neighbours on one side only. A large step at
-        # an end of the readings belongs to a ramp if the following step is similar.
+        # The first and the last reading have neighbours on one side only. A large step to the
+        # nearest reading belongs to a ramp if the next step in this direction is similar.
         for place, nearest in ((0, value[:3]), (-1, value[:-4:-1])):
             step, after = np.abs(np.diff(nearest)).tolist()
             far[place] = step > 10.0 and after < CONTINUED_SHARE * step
@@ -334,7 +335,7 @@ def is_spike(value: Floats) -> Bools:
 
 
 def _max_abs(cells: Cells) -> float:
-    """Return the 99 % quantile, over the cells, of a cell's largest absolute mean plus 3 sd."""
+    """Return the 99 % quantile, over cells, of the largest |mean| + 3 sd of the three axes."""
     if not len(cells.count):
         return 0.0
     sizes = np.max(np.abs(cells.mean) + 3.0 * np.sqrt(cells.variance), axis=1)
@@ -344,7 +345,7 @@ def _max_abs(cells: Cells) -> float:
 def _rests(cells: Cells, min_rest_s: float | None, still_sd: float) -> list[tuple[int, int]]:
     """Find the rests, with the thresholds whose rests determine bias and scale best."""
     candidates: list[list[tuple[int, int]]] = []
-    # Values to try for the largest variance of a rest, relative to that of the quietest cells.
+    # Limits to try for the variance in a rest, divided by the variance in the quietest cells.
     ratios = tuple(stillness.VARIANCE_RATIO * 2.0**power for power in range(6))
     of_ratios = stillness.still_runs(cells, still_sd, ratios)
     for shortest_s in (3.0, 2.0, 1.0) if min_rest_s is None else (min_rest_s,):
@@ -426,7 +427,7 @@ def rounding_sd(variance: Floats, drift: Floats, quantum: Floats) -> Floats:
 
     `variance`: median variance of the rounded samples in a cell; above 0, the noise of the
     samples averages the rounding error to 0.
-    `drift`: range of the means; a drift over n steps averages the rounding errors of n + 1 steps.
+    `drift`: range of the means; a range of n steps divides the sd of the rounding error by n + 1.
     """
     steps = np.divide(drift, quantum, where=quantum > 0.0, out=np.zeros(3))
     return np.asarray(np.where(variance > 0.0, 0.0, quantum / 12.0**0.5 / (1.0 + steps)))

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns two checks of a chosen model, after which a fit is repeated: whether its bias at settled
-temperatures is less certain than that of a smaller model, and whether supports tilted slowly.
+Owns two checks after which a fit is repeated: whether at settled temperatures the bias by the
+chosen model is less certain than by a smaller model, and whether supports tilted slowly.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ _FEWEST_NORMS = 6
 
 def extrapolates(fit: Fit) -> bool:
     """
-    Whether the left-out drift of the chosen model exceeds noise, and its bias at settled
-    temperatures is expected to be less accurate than that of a smaller model (`settled_error`).
+    Whether the left-out drift of the chosen model exceeds the noise, and its bias at settled
+    temperatures has a larger expected error (`settled_error`) than that of a smaller model.
     """
     settled, trials = fit.windows.data.settled, fit.selected.trials
     chosen = next(trial for trial in trials if trial.is_chosen)
@@ -49,9 +49,9 @@ def extrapolates(fit: Fit) -> bool:
 
 def may_have_slow_tilts(fit: Fit) -> bool:
     """
-    Whether the hourly mean drifts of left-out positions exceed 6 times their noise and a tenth of
-    the error of left-out |f|, known in `_FEWEST_NORMS` positions or more. Slow tilts change the
-    readings of axes across gravity, but hardly |f|.
+    Whether the hourly mean drift (RMS) of left-out positions exceeds 6 times its noise and a tenth
+    of the error of left-out |f|, which must be known in `_FEWEST_NORMS` positions. Slow tilts
+    change the readings of axes across gravity, but hardly |f|.
     """
     score, data = fit.selected.score, fit.windows.data
     if np.isfinite(score.norms.square).sum() < _FEWEST_NORMS:
@@ -77,7 +77,7 @@ def _slow_drift(data: Windows, drift: Floats) -> tuple[float, float]:
 
 
 def is_better_with_tilts(fit: Fit, tilted: Fit) -> bool:
-    """Whether errors of left-out |f| decrease if the supports may tilt from hour to hour."""
+    """Whether errors of |f| in left-out positions fall if supports may tilt from hour to hour."""
     before, after = fit.selected.score.norms, tilted.selected.score.norms
     n_common = np.sum(np.isfinite(before.square) & np.isfinite(after.square))
     gain = before.gain_of(after)
@@ -113,12 +113,12 @@ def _pieces(rest: StillInterval, window_s: float) -> Iterator[StillInterval]:
 def of_whole_rests(
     pieces: Sequence[PositionReport], bags: Sequence[ReducedBag]
 ) -> tuple[PositionReport, ...]:
-    """Make one report per rest from those of its pieces: mean attitude, and RMS residuals."""
+    """Make one report per rest from the reports of its pieces: mean attitude, RMS residuals."""
     result, left = [], iter(pieces)
     for bag in bags:
         for rest in bag.intervals:
             parts = [next(left) for _ in _pieces(rest, bag.window_s)]
-            # A rest of one sample has a duration of 0, so its weight is the length of a window.
+            # Weight of a piece: its duration, or a window's length if longer (one sample: 0 s).
             share = np.array([max(part.duration_s, bag.window_s) for part in parts])
             up = share @ np.array([part.up for part in parts])
             x, y, z = (up / np.linalg.norm(up)).tolist()

@@ -58,7 +58,7 @@ class PosteriorMode:
 
     @property
     def effective_parameters(self) -> Floats:
-        """Effective parameters of each column, sum over the axes, shape (2, m)."""
+        """Effective parameters of each column's weights, summed over the axes, shape (2, m)."""
         padded = np.append(self.determined, 0.0)
         return np.asarray(padded[self.layout.weights].sum(axis=1))
 
@@ -111,7 +111,7 @@ class Point:
         of_data = float((each + self.regression.noise_determinant).sum())
         of_prior = float(self.precision @ self.deviation**2)
         if self.prior.informative is not None:
-            # `precision` is 0 for unknowns with an informative prior, so add their term.
+            # `precision` is 0 for unknowns with an informative prior, whose term is added here.
             root = self.prior.informative.root
             of_prior += float(np.sum((root @ self.deviation[: self.layout.n_unit]) ** 2))
         if self._common_variance:
@@ -180,7 +180,7 @@ class Point:
         return step - self.solution[0][: self.layout.n_unit]
 
     def unit_step(self, matrix: Floats) -> tuple[Floats, Floats]:
-        """Return the unit unknowns' step and Hessian's Cholesky factor; see `Reduced.matrix`."""
+        """Return the step of the unit's unknowns, and the Cholesky factor of their Hessian."""
         n = self.layout.n_unit
         information, gradient, deviation = matrix[:n, :n], matrix[:n, n], self.deviation[:n]
         if not np.isfinite(information).all():
@@ -189,7 +189,7 @@ class Point:
             precision = self.precision[:n]
             factor = factored_with_prior(information, precision)
             return solved(factor, gradient - precision * deviation), factor
-        # Unknowns are scaled by the root of the prior, which makes the equations well conditioned.
+        # Unknowns times the root of the prior precision have well conditioned equations.
         root = self.prior.informative.root
         scaled = solve_triangular(root, information, trans='T')
         scaled = solve_triangular(root, scaled.T, trans='T')
@@ -212,9 +212,9 @@ class Point:
     def linear_step(self) -> Floats:
         """Return the step in which damping keeps the nonlinear unknowns almost constant."""
         layout, local, unit = self.layout, self.normal.local.copy(), self.normal.unit.copy()
-        # A factor 1e6 on the diagonal divides the step of nonlinear unknowns by about 1e6. With an
-        # informative prior, which correlates the unknowns, a factor far above 1e6 would cause
-        # errors of double precision.
+        # A factor 1e6 on the Hessian's diagonal divides the steps of nonlinear unknowns by about
+        # 1e6. With an informative prior, which correlates the unknowns, a far larger factor would
+        # cause rounding errors in double precision.
         at = [*range(2 + layout.stretch.shape[1]), *range(layout.of_axis.shape[1], layout.n_local)]
         local[..., at, at] *= 1e6
         end = unit.shape[-1] - 1
@@ -223,18 +223,18 @@ class Point:
         return self._solution(self._reduced(Normal(local, unit), self.deviation))[0]
 
     def with_step(self, step: Floats) -> Point:
-        """Return the point at the state plus a step."""
+        """Return a `Point` whose state is this state plus a step."""
         return replace(self, state=with_step(self.state, step, self.layout))
 
     def stepped(self) -> Point:
         """
         Take Gauss-Newton's step.
 
-        If the step increases the energy, fractions of the step of the nonlinear unknowns (factors
-        of other unknowns) are tried, and the linear unknowns are solved again for each fraction.
+        If the step increases the energy, fractions of the step of the nonlinear unknowns (which
+        multiply other unknowns) are tried, each with a new step of the linear unknowns.
         """
-        # Compute the energy and the step here before the energy after the step, because the
-        # regression keeps only the last linearisation.
+        # The regression keeps only the last linearisation: compute `self.energy` and
+        # `self.solution` before the energy of the next point.
         energy, (step, _) = self.energy, self.solution
         result = self.with_step(step)
         if result.energy <= energy:
@@ -251,7 +251,7 @@ class Point:
         return result
 
     def posterior(self, end: Point) -> PosteriorMode:
-        """Return the posterior at the mode `end`, with the covariance of the point `self`."""
+        """Return the posterior at the mode `end`, with the covariance computed at this point."""
         layout, prior, precision, reduced = self.layout, self.prior, self.precision, self.reduced
         _, factor = self.solution
         n, unit_root = layout.n_unit, inverse_root(factor)
@@ -282,7 +282,7 @@ class Regression(Equations):
     _linearised: tuple[State, Layout, Floats, Tangent, Normal] | None = None
 
     def at(self, state: State, prior: Prior, grams: Floats | None = None) -> Point:
-        """Return the equations at a state, inactive weights 0; `grams`: None for all windows."""
+        """Linearise about `state`, inactive weights 0; `grams`: see `Point`, None: all windows."""
         layout = self.layout(prior.column_sd > 0.0, prior.nonlinear_sd > 0.0)
         grams = self.products(layout.used).of_positions if grams is None else grams
         return Point(self, without_inactive(state, layout), prior, layout, grams)

@@ -37,9 +37,9 @@ def is_bench(windows: ThermalWindows, up: Floats) -> bool:
 
 def _is_heated(windows: ThermalWindows) -> Bools:
     """
-    Return the heated or cooled positions, shape (n_positions,): their temperature changes by over
-    a tenth of the span of all temperatures, or differs from the median by as much; all positions
-    if there are none. Drifts of short rests in a room hardly separate bias and scale.
+    Return which positions were heated or cooled, shape (n_positions,); all if none was: the
+    temperature in the position changes, or its mean differs from the positions' median, by over a
+    tenth of the whole span. Drifts of short rests in a room hardly separate bias and scale.
     """
     t, edges, weight = windows.temperature, windows.data.edges[:-1], windows.data.weight
     mean = block_means(t[:, None], weight, edges)[:, 0]
@@ -50,10 +50,10 @@ def _is_heated(windows: ThermalWindows) -> Bools:
 
 def is_steady(windows: ThermalWindows) -> Bools:
     """
-    Return the positions whose temperatures, and their differences, change (RMS) by less than three
-    sd of the estimated board temperature, shape (n_positions,). In such a position noise would
-    count as temperature changes without drift: at three sd noise is a ninth of the mean square
-    change, and the fitted slopes would be a ninth too small.
+    Return which positions have constant temperatures, shape (n_positions,): in a position the
+    board temperature and the lags change (RMS) by less than three sd of the estimated board
+    temperature. A ninth of the mean square of a change of three sd is noise, so slopes fitted
+    over such changes would be a ninth too small.
     """
     data, model = windows.data, windows.model
     lags = [column.group in LAGS and not column.power for column in model.columns]
@@ -73,8 +73,8 @@ def is_without_drift(data: Windows, scale: Floats) -> Bools:
 
 def constant_in(data: Windows, steady: Bools, settled: Bools) -> Windows:
     """
-    Return the windows with constant columns in the positions of the mask `steady`, and without
-    effects of initial lag states, which would only fit noise, in `settled`; both (n_positions,).
+    Set the columns constant in the positions of the mask `steady`. Set the effects of initial lag
+    states, which would only fit noise, to 0 in the positions of the mask `settled`.
     """
     in_steady = steady[data.position][:, np.newaxis]
     means = (data.columns - within_positions(data.columns, data.position))[data.edges[:-1]]

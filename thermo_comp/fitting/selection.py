@@ -3,8 +3,8 @@
 """
 Owns the choice of the model: groups of columns are added to the constants in steps.
 
-The log evidence ranks the groups to be tried; the score on left-out data decides which group is
-added. The fit of each model begins from the fit of a smaller model.
+The log evidence ranks the groups of columns to try; the score on left-out data decides which to
+add. The fit of each model begins from the fit of a smaller model.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ def _best(chosen: Trial, trials: Sequence[Trial]) -> Trial:
 
 
 class Growth:
-    """Fits models made of given groups; each fit begins from the fit of a smaller model."""
+    """Fits models of given groups of columns; each fit begins from the fit of a smaller model."""
 
     def __init__(self, regression: Regression, candidates: Candidates) -> None:
         self.regression = regression
@@ -127,7 +127,7 @@ class Growth:
         self.tried: list[Trial] = []
 
     def fit(self, groups: tuple[str, ...], state: State, prior: Prior, typical: Floats) -> Trial:
-        """Fit the model of `groups`, also with columns that the fit of a smaller model dropped."""
+        """Fit all columns of `groups`, also those that the fit of a smaller model dropped."""
         candidates = replace(self._candidates, typical=typical)
         initial_sd = np.where(prior.column_sd > 0.0, prior.column_sd, typical)
         is_wanted = np.isin(self._names, groups)
@@ -147,7 +147,7 @@ class Growth:
         self, before: Trial, groups: tuple[str, ...] = (), most: Floats | None = None
     ) -> Trial:
         """
-        Fit the model `before` with further groups, beginning from the fit of `before`. `most`:
+        Fit the model `before` plus groups of columns, beginning from the fit of `before`. `most`:
         largest typical prior sd of the new columns, (2, m); None for the typical sd of `before`
         """
         regression, posterior, typical = self.regression, before.posterior, before.typical
@@ -155,11 +155,11 @@ class Growth:
             kelvins, state = regression.windows.kelvins, posterior.state
             square = float(np.mean(regression.residual(state, posterior.layout) ** 2))
             if state.pose.size:
-                # Attitudes and offsets of rests in a pose absorb errors of the model: add the mean
-                # squares of both to that of the residual.
+                # Attitudes and offsets of rests in a pose absorb errors of the model: add their
+                # mean squares to the mean square of the residual.
                 by_attitude = regression.gravity * state.from_pose
                 square += float(np.mean(state.offset**2) + np.mean(by_attitude**2))
-            # The typical weight of a new column explains the RMS residual.
+            # The typical weight of a new column is that with which it alone explains the residual.
             slope = np.sqrt(square) / (float(kelvins[0]) or 1.0)
             units = np.array([[1.0], [1.0 / (regression.gravity or 1.0)]])
             new = np.minimum(slope * units * kelvins, most)
@@ -167,7 +167,7 @@ class Growth:
         return self.fit((*before.groups, *groups), posterior.state, posterior.prior, typical)
 
     def added(self, chosen: Trial, progress: Callable[[float], None]) -> Trial:
-        """Add groups while left-out errors decrease; return the final model."""
+        """Add groups of columns while left-out errors decrease; return the final model."""
         part = 1.0
         while True:
             larger = self.trials(chosen, self.free)
@@ -183,13 +183,13 @@ class Growth:
             chosen = next(t for t in better if t is best or not is_better(t.score, best.score))
 
     def with_bends(self, before: Trial, groups: Sequence[str]) -> list[Trial]:
-        """Fit model `before` plus groups, then also with columns of `BEND`; return all fits."""
+        """Fit `before` plus `groups`, and this model plus columns of `BEND`; return all fits."""
         added = tuple(group for group in groups if group in self.free)
         smooth = self.extended(before, added, self._candidates.typical)
         return [smooth, *self.trials(smooth, [BEND])]
 
     def lowest_degree(self, constants: Trial) -> Trial:
-        """Fit the curve's first column, and further ones if the log density clearly rises."""
+        """Fit curves of all degrees; take a higher degree if the log density clearly rises."""
         prior, state = constants.posterior.prior, constants.posterior.state
         prior = replace(prior, offset_sd=prior.offset_scale or prior.offset_sd)
         number = np.cumsum(self._names == CURVE)
@@ -205,7 +205,7 @@ class Growth:
         return chosen
 
     def trials(self, chosen: Trial, groups: Sequence[str]) -> list[Trial]:
-        """Fit the chosen model plus one set of groups, for up to 4 sets of large gains."""
+        """Fit the chosen model plus groups of columns, for up to 4 choices with large gains."""
         absent = [group for group in groups if group in self.free and group not in chosen.groups]
         if not absent:
             return []
@@ -213,12 +213,12 @@ class Growth:
         columns = np.isin(self._names, absent) & typical.any(axis=0)
         inactive = self.regression.inactive(chosen.posterior, columns)
         if BEND in absent:
-            # Forward selection of up to 60 bend columns: a bump in an axis' bias needs 20 columns.
+            # Select up to 60 bends (changes of slope): a bump in an axis' bias needs 20 bends.
             is_bend = self._names == BEND
             knees = inactive.chosen(typical, is_bend, CLEAR_GAIN, 60)
             typical = np.where(is_bend & ~knees, 0.0, typical)
-        # Groups in which one effect has columns are tried together: the square of the temperature
-        # of a part with the lag m is (t - m)^2 = t^2 - 2 t m + m^2, with products and squares.
+        # Try groups together that describe one effect: the squared temperature of a part of lag m,
+        # (t - m)^2 = t^2 - 2 t m + m^2, needs the product t m and the square m^2.
         together = PRODUCTS, (*LAGS, 'product', 'gradient_x_temperature', 'square')
         sets = [tuple(group for group in groups if group in absent) for groups in together]
         sets = [*((group,) for group in absent), *(groups for groups in sets if len(groups) > 1)]
@@ -237,9 +237,9 @@ class Growth:
 def better_start(fits: Sequence[Trial]) -> Trial:
     """
     Choose by left-out data between fits begun with a small and with a large prior sd of mounting
-    offsets. If left-out data do not decide, the fit begun with the large sd is chosen only if its
-    log density is larger by `CLEAR_GAIN`. Mounting offsets and misalignments explain |f|
-    in few positions equally well, but only misalignments predict |f| in a new position.
+    offsets. If left-out data do not decide, the fit begun with the large prior sd is chosen only
+    if its log density is larger by `CLEAR_GAIN`. Mounting offsets and misalignments explain |f| in
+    few positions equally well, but only misalignments predict |f| in a new position.
     """
     small, large = fits[0], fits[-1]
     evidence_gain = log_density(large.posterior) - log_density(small.posterior)
@@ -267,7 +267,7 @@ def select(
     constants = first = better_start(fits)
     growth.tried.append(constants)
     if CURVE in growth.free:
-        # The curve is added without a test: it may improve the score only with further groups.
+        # Add the curve without a test: a curve may improve the score only with further columns.
         if regression.windows.has_drifts:
             curve = better_start([growth.extended(fit, (CURVE,)) for fit in fits])
             downweigh(regression, curve.posterior)
@@ -298,7 +298,7 @@ def select(
 def _grown(
     growth: Growth, first: Trial, parts: Trial | None, progress: Callable[[float], None]
 ) -> Trial:
-    """Add groups to `first` or, if better, to `parts`; return the best model."""
+    """Add groups of columns to the better of `first` and `parts`; return the best model."""
     chosen = first
     if parts is not None:
         trials = [parts, *growth.trials(parts, [BEND])]
@@ -313,9 +313,9 @@ def _grown(
     chosen = growth.added(chosen, progress)
     may_bend = BEND in growth.free and {*PRODUCTS} & {*chosen.groups}
     if may_bend and BEND not in chosen.groups and not chosen.is_complete:
-        # A bend of the curve of a part is found only in a model with the lag of this part, not in
-        # a model whose products and squares approximate the lag. Further groups are added to the
-        # model with bends if its left-out error is below three times that of the chosen model.
+        # A bend of the curve over a part's temperature is found only in a model with the part's
+        # lag, not in one that approximates the lag by products and squares. Add columns to a model
+        # with lags and bends if its left-out error is below three times that of the chosen model.
         _, *with_bends = growth.with_bends(first, LAGS)
         if with_bends and with_bends[0].score.rms < 3.0 * chosen.score.rms:
             growth.tried += with_bends
@@ -331,8 +331,8 @@ def fit_all(
     informative: Sequence[InformativePrior] = (),
 ) -> Selected:
     """Fit all columns, with the prior of `informative` whose fit has the largest log density."""
-    # Offsets of mountings would explain |f| in few positions as well as an ageing of the
-    # unit, so the sd of these offsets is constant until an informative prior is chosen.
+    # In few positions, offsets of mountings and ageing of the unit explain |f| equally well,
+    # so the sd of these offsets is constant until an informative prior is chosen.
     scale = prior.offset_scale
     prior = replace(prior, offset_scale=0.0 if informative else scale)
     posterior = settle(regression, state, prior, candidates)
@@ -369,9 +369,9 @@ def finish(
     large = LARGE_OFFSETS * prior.offset_scale
     is_noise = score.rms <= 4.0 * float(np.hypot(score.noise, score.by_thermometer))
     if prior.offset_sd < prior.offset_scale and is_noise:
-        # Nine constants explain |f| in nine positions, whatever the mounting offsets. The
-        # drift of a scale factor is proportional to the specific force along its axis, so drifts
-        # also determine mounting offsets, if the model explains the drifts.
+        # Nine constants explain |f| in nine positions, whatever the mounting offsets. The drift
+        # of a reading due to its scale factor is proportional to the specific force on the axis,
+        # so a model that explains the drifts determines these forces, and mounting offsets.
         prior = replace(prior, offset_sd=large, turn_on_sd=large)
         posterior = settle(regression, posterior.state, prior, candidates)
         score = score_of(regression, posterior)

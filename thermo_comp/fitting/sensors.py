@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the estimation of thermometer and detector settings from bags.
+Owns the estimation of the settings of thermometers and of the regime detector from bags.
 
 Rates of temperature are central differences over two minutes, which are not causal and so need a
-recording. The lag and the ramps of the test that the rates show, and the noise of the
-readings, become settings of the thermometers and of the regime detector, which are causal.
+recording. These rates show the lags of the thermometers and the ramps of the test. Lags, ramps and
+noise of their readings become settings of the causal thermal tracker and regime detector.
 """
 
 from __future__ import annotations
@@ -114,8 +114,8 @@ def _noise_of(recorded: Sequence[Readings], quantum: float) -> float:
     second = np.concatenate([np.diff(readings.value, 2) for readings in recorded])
     if not quantum:
         return 1.4826 * float(np.median(np.abs(second))) / float(np.sqrt(6.0))
-    # Most rounded readings are equal to their neighbours, so the median difference is 0. The mean
-    # square without the largest 1 % is used instead, less the variance of rounding.
+    # Most rounded readings equal their neighbours, so the median difference is 0: use the mean
+    # square of differences, without the largest 1 %, less the variance of rounding.
     square = np.sort(second**2)[: int(0.99 * len(second))]
     noise = float(np.sqrt(max(float(square.mean()) / 6.0 - quantum**2 / 12.0, 0.0)))
     limit = 0.1 * quantum
@@ -136,7 +136,7 @@ def _flicker(recorded: Sequence[Readings]) -> float:
         first = np.flatnonzero(np.diff(edges, prepend=np.nan))
         count = np.diff(np.append(first, len(edges)))
         edge, at_s = edges[first], time[changed[first]]
-        # Leave out edges where the temperature turns back, because it passes such an edge twice.
+        # Leave out an edge where the temperature turns back, because it passes this edge twice.
         step, apart_s = edge[2:] - edge[:-2], at_s[2:] - at_s[:-2]
         passes = np.abs(step) > 1e-9
         moves += float(np.sum(count[1:-1][passes] ** 2 - 1)) * float(np.median(np.diff(time))) ** 2
@@ -155,7 +155,7 @@ def _rate_histories(
         n_bins = int(time[-1] / _BIN_S) if len(time) >= 30 else 0
         if n_bins < 6 * _BINS_PER_SIDE:
             continue
-        # The mean over a minute is the change of the integral over the minute, divided by 60 s.
+        # The mean temperature over a minute is the change of its integral, divided by 60 s.
         integral = cumulative_trapezoid(readings.value, time, initial=0)
         edges = np.interp(np.arange(n_bins + 1) * _BIN_S, time, integral)
         means = (edges[_BINS_PER_SIDE:] - edges[:-_BINS_PER_SIDE]) / side
@@ -168,7 +168,7 @@ def _rate_histories(
 
 
 def _slowest_ramp(histories: Sequence[RateHistory], usual: float) -> float:
-    """Return 0.7 times the slowest ramp of > 10 min, from RAMP_K_MIN to `usual` [K/min]."""
+    """Return 0.7 times the slowest ramp of over 10 min, limited to RAMP_K_MIN..usual [K/min]."""
     slowest = usual / 0.7
     for history in histories:
         is_ramp = np.abs(history.rate) > max(history.least_ramp, 0.1 / 60.0)
@@ -185,7 +185,7 @@ def _ripple(histories: Sequence[RateHistory], lag_s: float, usual: float) -> flo
     rates = [np.zeros(0)]
     for history in histories:
         moving = np.abs(history.rate) > max(0.2 * history.fastest, history.least_ramp)
-        # A soak has no ramp within five minutes before and after a grid point.
+        # A grid point is in a soak if no ramp is within five minutes before or after it.
         rates.append(history.rate[np.convolve(moving, np.ones(61))[30:-30] < 0.5])
     resting = np.concatenate(rates)
     if len(resting) < 60:
@@ -193,8 +193,8 @@ def _ripple(histories: Sequence[RateHistory], lag_s: float, usual: float) -> flo
     noise = float(np.median([history.rate_sd for history in histories]))
     swing = float(np.quantile(np.abs(resting - np.median(resting)), 0.95))
     clean = float(np.sqrt(max(swing**2 - (2.0 * noise) ** 2, 0.0)))
-    # A ripple of up to 3 times the noise of the rates may be undetected: assume a ripple of this
-    # size, or of the default if the default is smaller.
+    # A ripple with rates of up to 3 sd of the noise of the rates may be undetected: assume such a
+    # ripple, but at most the `usual` ripple.
     hidden = min(usual, 3.0 * noise * lag_s)
     return float(np.clip(max(clean * lag_s, hidden), 0.02, 1.0))
 

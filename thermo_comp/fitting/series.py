@@ -1,20 +1,20 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the base series of the windows (1, columns, their derivatives, readings), the filter that
+Owns the base series of the windows (a constant, columns, derivatives, readings), the filter that
 whitens these series for slow noise, and the sums of products of whitened series.
 
 All terms of the measurement equation (`equations`) are linear combinations of the base series, so
 the sums of the products of whitened base series in each position are sufficient statistics.
 
-The noise is white plus exponentially correlated (first-order Gauss-Markov). Within a position the
+Windows' noise is white plus exponentially correlated (first-order Gauss-Markov). In a position the
 error of window k is ``c_k + e_k``: e_k is white with variance ``sigma^2 / weight_k``, c_k a
 stationary Gauss-Markov process of variance ``ratio sigma^2`` and correlation time T (IEEE Std 952,
 Annex B.4.3); a random walk is the limit for a long T. Flicker noise, the bias instability of a
 sensor, is the sum of Gauss-Markov processes of equal variance, with the correlation times T, 10 T,
 100 T and so on [2]_. The innovations of a Kalman filter for white plus Gauss-Markov noise, divided
-by their standard deviations, are white and have all information of the series. If means and
-columns are filtered in this way, ordinary least squares is the optimal estimator [1]_.
+by their standard deviations, are white and have all information of the series. With the
+innovations of means and columns, ordinary least squares is the optimal estimator [1]_.
 
 References
 ----------
@@ -120,7 +120,7 @@ class Whitener:
         Find the Gauss-Markov noise of residuals, shape (n, 3), by their profile likelihood.
 
         The axes have a common variance ratio and correlation time; the likelihood is maximised
-        over the white variance of each axis. The result is white noise unless slow noise raises
+        over the white variance of each axis. White noise is returned unless slow noise raises
         twice the log likelihood by 9.2, the 1 % point of a chi-square with two degrees of freedom.
         """
         # Ratios to try of the Gauss-Markov variance to the white variance of a window.
@@ -151,7 +151,7 @@ class Whitener:
 
 
 def _vertex(values: Floats, at: int) -> float:
-    """Return the vertex, relative to `at`, of the parabola through three values; 0 at an end."""
+    """Return the minimum of a parabola through three values, as index less `at`, or 0."""
     if not 0 < at < len(values) - 1:
         return 0.0
     before, here, after = values[at - 1 : at + 2].tolist()
@@ -182,7 +182,7 @@ class Base:
 
     @classmethod
     def of(cls, columns: Ints, lags: Ints, n_t: int, n_tilts: int) -> Base:
-        """Assign indices to the series; `lags`: index of each column's lag, -1 for none."""
+        """Assign indices to base series; `lags`: index of each column's lag, -1 for none."""
         lagged = np.flatnonzero(lags[columns] >= 0)
         counts = 1 + len(columns), len(lagged), n_t, n_tilts, 3
         _, *places = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
@@ -216,7 +216,7 @@ class Products:
         return np.asarray(np.add.reduceat(self.cells, self.first, axis=0))
 
     def without(self, sections: Ints) -> Floats:
-        """Return the sums over each position, without the windows of the given sections."""
+        """Return the sums of products over each position, less those of the given sections."""
         result: Floats = self.of_positions.copy()
         left_out = np.flatnonzero(np.isin(self.section, sections))
         position = np.searchsorted(self.first, left_out, side='right') - 1
@@ -273,7 +273,7 @@ class Series:
         self.noise_determinant = self.whitener.log_determinant(self.weight, noise)
 
     def products(self, used: Bools) -> Products:
-        """Return the sums of products for the active columns, (2, m), and the noise last set."""
+        """Return the sums of products, with the columns `used`, (2, m), for the current noise."""
         active = np.flatnonzero(used.any(axis=0))
         if self._products is None or not np.array_equal(self._products.base.columns, active):
             base = Base.of(active, self.windows.lag, self._n_t, self.windows.tilt.shape[1])
@@ -315,17 +315,17 @@ class Series:
 
     def at_starts(self, rows: Floats, state: State, base: Base) -> Floats:
         """
-        Convert linear functions of the base series, (n_positions, k, n_base): the columns, which
-        have initial lag states at the prior mean, get the initial lag states of `state`.
+        Convert linear functions of the base series, (n_positions, k, n_base), from columns with
+        initial lag states at the prior mean to columns with the initial lag states of `state`.
         """
         if not len(base.lagged):
-            return rows  # not a copy, whose memory layout would change the last bits of products
+            return rows  # a copy's memory layout would change the last bits of products
         result: Floats = rows.copy()
         starts = self.starts(state, base)[:, None]
         result[..., 1 + base.lagged] += starts * rows[..., base.at_start]
         return result
 
     def products_at(self, products: Floats, state: State, base: Base) -> Floats:
-        """Convert sums of products as `at_starts` does, shape (n_positions, n_base, n_base)."""
+        """Convert `products`, (n_positions, n_base, n_base), to initial lag states of `state`."""
         half = self.at_starts(products, state, base)
         return self.at_starts(np.swapaxes(half, 1, 2), state, base)

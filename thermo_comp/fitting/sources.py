@@ -233,7 +233,7 @@ def digest(path: Path) -> str:
 
 def known_force(path: Path, info: RecordingInfo, asked: ForceOptions) -> KnownForce | None:
     """
-    Return the known |f| of a bag from the user's options (`asked`) or its metadata; None if g.
+    Return the known |f| of a bag from the options (`asked`) or its metadata; None if |f| is g.
 
     Raises FitError for a text of |f| that cannot be parsed, and for a rotation topic without data.
     """

@@ -6,8 +6,8 @@ error of an axis at temperatures at which no position had gravity along this axi
 
 A scale factor has an effect on the readings only if gravity acts along its axis. A recording in
 one attitude at new temperatures extends the temperature range of the calibration, but determines
-only the scale factor of the vertical axis at these temperatures. The scale factors of the other
-axes are extrapolated, and the error of this extrapolation is added to the lack of fit.
+only the scale factor of the vertical axis at these temperatures. The scale factors of the
+horizontal axes are extrapolated; the error of this extrapolation is added to the lack of fit.
 """
 
 from __future__ import annotations
@@ -35,9 +35,10 @@ def union(ranges: Iterable[Range]) -> Range:
 
 def valid_range(values: Floats, smallest_margin: float, order: int = 0) -> Range:
     """
-    Return the valid range of a quantity that is proportional to a power (`order`) of a heat flow:
-    the range of its values with a margin, extended by a factor 2^order to ramps of twice the rate,
-    as heat flow is proportional to the rate. The range of a temperature (order 0) is not extended.
+    Return the valid range of a quantity that is proportional to a power (`order`) of a heat flow,
+    and so of the rate of a ramp: the range of its values with a margin, extended by the factor
+    2^order to ramps of twice the rate. With `order` 0, as for temperatures,
+    only the margin is added.
     """
     ratio = 2.0**order
     lower, upper = float(np.min(values)), float(np.max(values))
@@ -49,15 +50,15 @@ def valid_range(values: Floats, smallest_margin: float, order: int = 0) -> Range
 
 def temperature_range(windows: ThermalWindows) -> Range:
     """Return the valid range of board temperatures [degC]."""
-    # A calibration from one temperature is valid within 0.5 K of this temperature or, without a
-    # thermometer, within 50 K, as the covariance then includes an unknown slope over temperature.
+    # A calibration from one temperature is valid within 0.5 K of this temperature; without a
+    # thermometer within 50 K, as the covariance includes an unknown slope over temperature.
     return valid_range(windows.temperature, 0.5 if windows.was_measured else 50.0)
 
 
 def soak_gradient(windows: ThermalWindows, known: Calibration | None) -> Range | None:
     """
-    Return the gradient of the first sensor in soaks and its robust scatter [K]; both are those of
-    the prior calibration, `known`, if it has both; None without the sensor or without a soak.
+    Return the gradient of the first sensor in soaks and its robust scatter [K], both by the prior
+    calibration `known` if it has them, else by the windows; None without the sensor or a soak.
     """
     if known is not None and known.soak_gradient_k is not None:
         return known.soak_gradient_k
@@ -67,7 +68,7 @@ def soak_gradient(windows: ThermalWindows, known: Calibration | None) -> Range |
     is_soak = rate <= slowest
     if not windows.gradient.any() or slowest > RAMP_K_MIN or is_soak.sum() < 5:
         return None
-    # The gradient at rate 0 follows from a line over the rate, which is not yet 0 in a soak.
+    # In a soak the rate is not yet 0: fit a line over the rate to get the gradient at rate 0.
     gradient, by_rate = windows.gradient[is_soak], np.vander(windows.rate[is_soak], 2)
     slope, middle = np.linalg.lstsq(by_rate, gradient, rcond=None)[0].tolist()
     scatter = np.abs(gradient - by_rate @ (slope, middle))
@@ -78,11 +79,11 @@ def rest_gradient_range(
     windows: ThermalWindows, lag_s: float, known: Calibration | None
 ) -> Range | None:
     """
-    Return the range of the first sensor's gradient less ``lag_s * rate``, the change in ramps.
+    Return the valid range of the first sensor's gradient at rate 0, ``gradient - lag_s * rate``.
 
-    The range of a prior calibration, `known`, is included. If the prior has no range, the result
-    is None without the sensor, without ramps, which determine the lag, or for values above 100 K,
-    as in bags that are too short for a rate.
+    The range of a prior calibration, `known`, is included. The windows have no range without the
+    sensor, without ramps (which determine the lag), or if a value exceeds 100 K, as in bags that
+    are too short for a rate. The result is None if neither prior nor windows have a range.
     """
     lower, upper = valid_range(windows.gradient - lag_s * windows.rate, 0.01)
     is_small = max(-lower, upper) < 100.0
@@ -104,7 +105,7 @@ def _has_gradients(windows: ThermalWindows) -> bool:
 
 
 def usable_board_lag(windows: ThermalWindows) -> float:
-    """Return the lag of the board behind the case [s]; outside 1..1e5 s the usual lag."""
+    """Return the lag of the board behind the case [s], or a usual lag if not in 1..1e5 s."""
     lag = _slope_of_gradient(windows)
     return lag if 1.0 <= lag <= 1e5 else USUAL_BOARD_LAG_S
 
@@ -128,8 +129,8 @@ def with_unseen_axes(
     (lower, upper), (new_lower, new_upper) = _known_ranges(fit, known), _seen(fit, None)
     slope = _unknown_slope(fit) * fit.regression.gravity
     ends = _ends(fit, known)
-    # The variance grows with the square of the distance in K, but is interpolated linearly
-    # between temperatures, so five temperatures are used.
+    # The variance of an extrapolated scale factor grows with the square of the distance [K], but
+    # is interpolated linearly between stated temperatures, so it is stated at five temperatures.
     between = [
         np.linspace(edge, end, 5)
         for edge, end in zip((lower.max(), upper.min()), ends, strict=True)
@@ -173,11 +174,11 @@ def judge_unseen_axes(fit: Fit, known: Calibration | None) -> list[Finding]:
 def _known_ranges(fit: Fit, known: Calibration | None) -> Floats:
     """
     Return the range of board temperature of each axis without an added error of its scale factor,
-    shape (2, 3) [degC]. The range is infinite for an axis along which no position has gravity:
-    its scale factor keeps the sd of the prior, which includes the error.
+    shape (2, 3) [degC]. The range of an axis along which no position has gravity is infinite: the
+    prior sd of its scale factor includes the error of extrapolation.
     """
     lower, upper = _seen(fit, known)
-    # The ranges of positions in one test differ by about a tenth.
+    # The temperature ranges of the positions of one test differ by about a tenth of the range.
     reach = 0.1 * (upper - lower)
     is_seen = lower <= upper
     return np.where(is_seen, (lower - reach, upper + reach), [[-np.inf], [np.inf]])
@@ -189,7 +190,7 @@ def _seen(fit: Fit, known: Calibration | None) -> Floats:
     axis, and of a prior calibration, shape (2, 3) [degC]; (inf, -inf) if there are none.
     """
     temperature = fit.windows.temperature[:, np.newaxis]
-    # At 0.5 g along an axis, the relative error of |f| is a quarter of that of its scale factor.
+    # At 0.5 g along an axis, |f| has a quarter of the relative error of the axis' scale factor.
     is_along = np.abs(fit.posterior.state.up) >= 0.5
     is_seen = is_along[fit.windows.data.position]
     lower = np.where(is_seen, temperature, np.inf).min(axis=0)

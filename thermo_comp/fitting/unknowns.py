@@ -29,8 +29,8 @@ MISALIGNMENT_SD = 1e-3
 def misalignment_scale(noise: float) -> float:
     """
     Return the built-in prior sd of an element of the misalignment [rad], by the noise in a 1 Hz
-    bandwidth [m/s^2]. The sd is 1 mrad for a noise up to 10 ug (navigation grade, machined faces),
-    and proportional to a larger noise, up to 10 mrad (cross-axis sensitivity of consumer MEMS).
+    bandwidth [m/s^2]. The prior sd is 1 mrad for noise up to 10 ug (navigation grade, machined
+    faces), and rises with the noise up to 10 mrad (cross-axis sensitivity of consumer MEMS).
     """
     return float(np.clip(10.0 * noise, MISALIGNMENT_SD, 1e-2))
 
@@ -146,9 +146,9 @@ class Windows:
     @cached_property
     def has_turn_ons(self) -> bool:
         """
-        Whether the fit has turn-on offsets as unknowns: if there are several turn-ons or a prior
-        calibration (else the offset of a single turn-on is part of the bias), and on average two
-        or more mountings per turn-on, which separate turn-on offsets from mounting offsets.
+        Whether turn-on offsets are unknowns of the fit. Without a prior calibration the offset of
+        a single turn-on is part of the bias. On average, two or more mountings per turn-on are
+        needed to separate turn-on offsets from mounting offsets.
         """
         least = 1 if self.has_prior else 2
         return least <= self.n_turn_ons <= (int(self.mounting[-1]) + 1) / 2
@@ -192,7 +192,7 @@ class Noise(NamedTuple):
 
     @property
     def rate(self) -> float:
-        """Random walk at short times, in white-noise sds of a window [1/sqrt(s)]."""
+        """Random walk of slow noise at short times, divided by white noise [1/sqrt(s)]."""
         return math.sqrt(sum(2.0 * self.ratio / time_s for time_s in self.times_s))
 
 
@@ -304,8 +304,8 @@ class State:
     @cached_property
     def tangents(self) -> Floats:
         """
-        Two vectors perpendicular to each attitude, shape (n, 3, 2). For an attitude with a pose,
-        the vectors are the tangents of the pose, projected perpendicular to the attitude.
+        Two vectors perpendicular to the `up` of each attitude, shape (n, 3, 2). For an attitude
+        with a pose the vectors are the tangents of the pose, projected perpendicular to `up`.
         """
         result = tangent_basis(self.up)
         if self.pose.size:

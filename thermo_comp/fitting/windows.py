@@ -67,7 +67,7 @@ class Sets:
 
     @property
     def families(self) -> tuple[TemperatureFunction, TemperatureFunction]:
-        """Families of both curves; a shared dynamic curve has the higher of both orders."""
+        """Families of both curves; the dynamic curve, if shared, has the higher of both orders."""
         is_higher = self.is_shared and self.static.n_free > self.dynamic.n_free
         return self.static, self.static if is_higher else self.dynamic
 
@@ -78,7 +78,7 @@ class Sets:
 
     @property
     def level(self) -> int:
-        """Index of the column of the level of the dynamic set, which is the weight w itself."""
+        """Index of the column of the dynamic set's level: this column is the set's weight w."""
         return self.static.n_free
 
 
@@ -120,10 +120,10 @@ class Model:
         factors of the m columns of sets and response, shape (9, m), in the order of axes, then of
         powers; (0, m) without `parts`, if a column is missing, or if the sets share no cubic.
 
-        With the board temperature t and the lag m of the part, ``x = t - m``. By the binomial
-        theorem x^p is a sum of t^p, t^(p-1) m, ..., m^p, so one weight per power describes a curve
-        over x. If all bags repeat one warm-up, m is a function of t, and the data would not
-        determine separate weights of the columns.
+        The temperature of a part less the reference is ``x = t - m``, with the board temperature t
+        and the part's lag m. x^p is a sum of t^p, t^(p-1) m, ..., m^p (binomial theorem), so one
+        weight per power describes a curve over x. If all bags repeat one warm-up, m is a function
+        of t, and the data would not determine separate weights of t^p, t^(p-1) m, ..., m^p.
         """
         static, n_curves = self.sets.static, len(self.sets.groups)
         n_columns = n_curves + len(self.columns)
@@ -133,7 +133,7 @@ class Model:
         for part, power in product(self.parts or () if has_cubic else (), (1, 2, 3)):
             row = np.zeros(n_columns)
             row[power - 1] = 1.0  # the first columns are t, t^2 and t^3
-            # The columns of the powers m, m^2 and m^3 of a lag m are of these kinds.
+            # Kinds of the columns with the powers m, m^2 and m^3 of a lag m.
             kinds = ('board', 'square', 'cube')[:power] if part.tau_s else ()
             for k, kind in enumerate(kinds, 1):
                 if (place := places.get((kind, power - k, part))) is None:
@@ -212,12 +212,12 @@ class ThermalWindows:
 
     @property
     def was_measured(self) -> bool:
-        """Whether a temperature was recorded, which may be constant over the bags."""
+        """Whether a temperature was recorded, even if it is constant over the bags."""
         return self.has_temperature or bool(self.data.columns[:, 0].any())
 
     @property
     def has_temperature(self) -> bool:
-        """Whether a change of temperature was recorded."""
+        """Whether the board temperature differs between windows."""
         return bool(np.ptp(self.temperature) > 0.0)
 
 
@@ -349,8 +349,8 @@ def _windows(
     tilt = np.column_stack((t, gradient, (t + gradient) ** 2))
     tilt_rms = np.sqrt(np.mean(tilt**2, axis=0))
     is_tilting = tilt_rms > 0.0
-    # The scale factor has no level of the dynamic set, as the relative scale is 1 at the reference
-    # temperature in both regimes, and no columns whose term does not act on scale (`has_scale`).
+    # No weights in the scale: the level of the dynamic set (the relative scale at the reference
+    # temperature is 1 in both regimes), and terms that act on the bias only (not `has_scale`).
     in_scale = [True] * n_curves + [c.term.has_scale for c in columns] + [True] * len(sums)
     in_scale[model.sets.level] = False
     start = np.hstack((np.zeros((len(t), n_curves)), rows.start))
@@ -412,7 +412,7 @@ def _kelvins(model: Model, values: Floats, raw: Floats, t: Floats, gradient: Flo
     curves = model.sets.columns(grid, np.full_like(grid, 0.5))
     steepest = [float(np.abs(np.gradient(curve, grid)).max()) for curve in curves]
     rms = np.sqrt(np.mean(values**2, axis=0))
-    # The level of the dynamic set changes by 1 for a temperature change of the RMS gradient [K].
+    # The largest slope of the dynamic set's weight w over temperature is set to 1 / RMS gradient.
     steepest[model.sets.level] = 1.0 / flow
     for column, series in zip(model.columns, raw.T, strict=True):
         steepest.append(column.term.steepest(column, series, flow) * farthest**column.power)
@@ -421,7 +421,7 @@ def _kelvins(model: Model, values: Floats, raw: Floats, t: Floats, gradient: Flo
 
 
 def _part_kelvins(values: Floats) -> Floats:
-    """Return the temperature change of the RMS of each power in `Model.part_sums` [K], (9,)."""
+    """Return the RMS of each power x^p in `Model.part_sums` over its largest slope [K], (9,)."""
     power = np.tile((1, 2, 3), values.shape[1] // 3)
     # The largest slope of x^p is p |x|^(p - 1) at the largest |x|.
     most = np.repeat(np.abs(values[:, ::3]).max(axis=0, initial=0.0), 3)
@@ -430,10 +430,10 @@ def _part_kelvins(values: Floats) -> Floats:
 
 
 def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
-    """Run the thermal tracker over the readings of a bag, with 5 states per window."""
+    """Run the thermal tracker over the readings of a bag; store its state 5 times per window."""
     spec = replace(spec, lags=(), plays=())
     if not len(bag.board.value):
-        # Without readings, assume the reference temperature since 1e9 s, so that all lags are 0.
+        # Without readings take the reference temperature for the last 1e9 s: all lags are 0.
         still = np.zeros((2, StateLayout(spec).width))
         still[:, BOARD] = model.reference_temperature
         end_s = 1.0 + (bag.end_ns - bag.start_ns) * 1e-9

@@ -33,7 +33,7 @@ _FORMAT = 3  # version of the format of `RESULT`
 _LONGEST_NAME = 100  # longest name of a folder of results [characters]
 # Largest number of units listed on the page of the fleet; fleet.csv lists all units.
 _MOST_ROWS = 60
-# Verdicts on tests whose bags contradict their fit: a fit with a prior would hide the fault.
+# Verdicts on tests whose bags contradict the fit; a new fit with a prior would hide the fault.
 _CONTRADICTIONS = tuple(
     kind.value for kind in (Verdict.RECALIBRATE, Verdict.NO_BETTER, Verdict.SWAPPED)
 )
@@ -80,8 +80,8 @@ def fit_fleet(
     Fit all units without a stored result. Raises ThermoCompError if the folder has no bag, a
     package is missing or the Dask cluster cannot be used, OutputError if a file cannot be written.
 
-    `progress` is called with the numbers of finished and of all tests of a round: without a prior,
-    then with the prior.
+    `progress` gets the numbers of finished and of all tests, first for the fits without a prior,
+    then for the fits with the prior.
     """
     _require_packages()
     storage = Storage(url)
@@ -212,7 +212,7 @@ class Results:
             raise ThermoCompError(f'{folder}: cannot be created: {error.strerror}') from error
 
     def folder_of(self, name: str, with_prior: object = False) -> Path:
-        """Return the folder of a unit's files; it is inside the folder of results for any name."""
+        """Return the folder of a unit's files, whatever its name, inside the folder of results."""
         kind = 'with_prior' if with_prior else 'units'
         return self.folder.joinpath(kind, *map(_safe, name.split('/')))
 
@@ -239,7 +239,7 @@ class Results:
         return row
 
     def store(self, unit: FoundUnit, options: FleetOptions, outcome: UnitOutcome) -> Row:
-        """Store an outcome, return its row; if the fit failed, an earlier calibration stays."""
+        """Store a unit's outcome, return its table row; a failed fit keeps an old calibration."""
         folder = self.folder_of(unit.name, options.fit.prior)
         row = outcome.row
         if (folder / CALIBRATION).is_file() and not (outcome.calibration and outcome.is_final):

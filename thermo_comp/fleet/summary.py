@@ -23,10 +23,10 @@ _FALSE_ALARMS = 0.05
 _UNITS_NEEDED = 8
 # Efficiency of the median absolute deviation relative to the sample sd, for a normal distribution.
 _MAD_EFFICIENCY = 0.37
-# Largest ratio of a value's sd (by its fit) to the spread over the units. With a larger ratio
-# the data do not determine the quantity, and its value is about the prior mean of the fit.
+# The data determine a unit's value if its sd by the fit is at most this multiple of the spread
+# over the units; a value of larger sd is about the prior mean of the fit.
 _LARGEST_SD = 5.0
-# Lower limit of residuals [ug] and noises [ug/sqrt(Hz)] whose logarithms are compared.
+# Residuals [ug] and noises [ug/sqrt(Hz)] are raised to this limit before taking logarithms.
 _LEAST = 1e-12
 #: Columns of the table in which units are compared.
 QUANTITIES = tuple(column for column in COLUMNS if column.label)
@@ -39,8 +39,8 @@ class Spread(NamedTuple):
     Spread of a quantity over the units about its median, and the distance `z` of each unit.
 
     Only units whose data determine the quantity (`is_counted`) are used for `middle`, `sd` and
-    `limit`. A distance `z` is the deviation from the median divided by its sd, whose square is the
-    sum of the squares of `sd` and of the sd that the unit's fit gives to the value.
+    `limit`. A distance `z` is the deviation from the median divided by the root of the sum of two
+    squares: of `sd`, and of the sd that the unit's fit gives to the value.
     """
 
     quantity: TableColumn
@@ -48,7 +48,7 @@ class Spread(NamedTuple):
     values: Floats
     is_counted: Bools
     middle: float
-    sd: float  # 1.4826 times the median absolute deviation (for logarithms, times `middle`)
+    sd: float  # 1.4826 times the median absolute deviation; of logarithms, also times `middle`
     z: Floats
     limit: float = float('inf')  # smallest |z| of an outlier; infinite below eight units
 
@@ -161,7 +161,7 @@ def _determined(quantity: TableColumn, values: Floats, own_sd: Floats) -> Bools:
     """
     order = np.argsort(own_sd, kind='stable')
     n = len(values)
-    # Begin with eight units or, in a small fleet, with just over half of the units.
+    # Begin with the units of smallest sd: eight, or over half of a fleet of 13 units or less.
     first = min(_UNITS_NEEDED, n // 2 + 1)
     n_counted = 0
     for k in range(first, n + 1):
@@ -176,7 +176,7 @@ def _determined(quantity: TableColumn, values: Floats, own_sd: Floats) -> Bools:
 
 
 def _deviations(quantity: TableColumn, values: Floats, middle: float) -> Floats:
-    """Return the deviations of values, ppm or logarithms (`TableColumn.by`) from the median."""
+    """Return deviations from the median: of values, in ppm, or of logarithms (`quantity.by`)."""
     if quantity.by == 'ppm':
         return (values / middle - 1.0) * 1e6
     if quantity.by == 'logarithm':

@@ -39,7 +39,7 @@ _LACKS = {'temperature', 'ramps', 'directions', 'misfit'}
 
 
 class TableColumn(NamedTuple):
-    """A column of the table: name, which includes the unit of measurement, kind, meaning."""
+    """A column of the table: name with the unit of measurement, kind and meaning."""
 
     name: str
     kind: str  # text, whole, number
@@ -164,7 +164,7 @@ def is_valid(row: Row) -> bool:
 def fitted_cells(
     result: FitResult, judgement: Judgement | None, *, has_prior: bool = False
 ) -> dict[str, Any]:
-    """Return the cells of a unit's fit and of the verdict on its bags."""
+    """Return the table cells with a unit's fit and the verdict on its bags."""
     calibration, bags = result.calibration, result.bags
     start = datetime.fromtimestamp(min(bag.start_ns for bag in bags) // 10**9, timezone.utc)
     sets = calibration.regime_sets()

@@ -139,7 +139,7 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
 def _fitted(
     row: dict[str, Cell], bags: Sequence[ReducedBag], how: FitOptions, has_page: bool
 ) -> tuple[dict[str, Cell], str, str]:
-    """Fit bags; return the complete row, the texts of calibration file and certificate (or '')."""
+    """Fit bags; return the table row, the text of the calibration file, the certificate or ''."""
     from ..report.evidence import evidence_of_fit
     from ..report.page import render_report
 
@@ -166,7 +166,7 @@ def dask_setup(_worker: object) -> None:
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Make workers started in the context ignore Ctrl-C; raise KeyboardInterrupt at its end."""
+    """Make workers started in the `with` block ignore Ctrl-C; raise a Ctrl-C after the block."""
     heard: list[int] = []
     # Workers inherit the ignored SIGINT (Ctrl-C) from the fork server.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)

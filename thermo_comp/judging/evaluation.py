@@ -95,7 +95,7 @@ def open_bags(
 
 
 def _dead_axes(bag: ReducedBag, calibration: Calibration) -> str:
-    """Describe axes that are constant in a rest, although the axis' noise exceeds the step."""
+    """Describe axes with constant samples in a rest, although noise exceeds the sample's step."""
     if not any(rest.sample_sd.any() for rest in bag.intervals):
         return ''  # a converter without visible noise: its step is unknown
     unit, density = calibration.unit, np.array(calibration.noise_density_m_s2_sqrt_hz)
@@ -177,8 +177,8 @@ def evaluate(
 class Epoch:
     """
     Constants of a calibration in a soak at the reference temperature of the unit's first
-    calibration: bias of x, y, z [ug] and change of scale since the first calibration [ppm], shape
-    (6,); an unknown sd is NaN.
+    calibration, shape (6,): bias of x, y, z [ug], then change of the scale of x, y, z since the
+    first calibration [ppm]. An unknown sd is NaN.
     """
 
     date: str

@@ -247,7 +247,7 @@ def axis_shifts(
     count = np.unique(windows.position, return_counts=True)[1]
     variance = 1.0 / precision + scatter / np.maximum(count / _CORRELATED_WINDOWS, 1.0)
     sd = np.maximum(np.sqrt(np.maximum(variance, 0.0)) / gravity, _SMALLEST_NORM_SD)
-    # The norms and the prior of the misalignment give linear equations of the small shifts.
+    # Linear equations for the small shifts: |f| = g in each position, and a prior of misalignment.
     sizes = np.linalg.norm(force, axis=1)
     rows = norm_columns(force / sizes[:, None]) / sd[:, None]
     rows = np.vstack(

@@ -23,7 +23,7 @@ LARGEST_RATIO = 2.0
 WIDE_PART = 0.5
 # Smallest number of windows of a regime that is judged separately.
 _FEWEST_WINDOWS = 6
-# Largest ratio of successive known |f|, in ascending order, whose windows share a section.
+# Ratio of successive values of the known |f|, sorted, above which a new section begins.
 _LEVEL_RATIO = 1.02
 
 SECTIONS = ('static', 'dynamic', 'all', 'outside')
@@ -52,8 +52,8 @@ class Section:
     Residuals of the `n` windows of a section: ``|f| - g`` [m/s^2], or angular rate less its mean
     in the rest [rad/s].
 
-    `raw` values are corrected only with the constants at the reference temperature, the other
-    values with the whole calibration; `claimed_rms`: RMS of the claimed sd of the windows, or NaN.
+    Fields named `raw`: residuals with the constants at the reference temperature only, others:
+    with the whole calibration; `claimed_rms`: RMS of the claimed sd of the windows, or NaN.
     """
 
     n: int
@@ -71,7 +71,7 @@ class Section:
 
 
 class Sections(dict[str, Section]):
-    """Sections ``static``, ``dynamic``, ``all``, inside the calibrated ranges; and ``outside``."""
+    """The sections ``static``, ``dynamic``, ``all`` in the calibrated ranges, and ``outside``."""
 
     @property
     def regimes(self) -> list[Section]:
@@ -80,7 +80,7 @@ class Sections(dict[str, Section]):
 
     @property
     def worst_ratio(self) -> float:
-        """Largest ratio of RMS error to claimed RMS: of the regimes, and of all windows."""
+        """Largest ratio of RMS error to claimed RMS in a section: a regime, or all windows."""
         return max(part.ratio for part in (*self.regimes, self['all']))
 
     def facts(self) -> dict[str, Any]:
@@ -152,8 +152,8 @@ def judge_rates(windows: JudgedWindows, calibration: Calibration) -> RateJudgeme
     if not windows.gyro.size:
         return None
     raw, corrected, variance = (windows.gyro[:, k : k + 3] for k in (0, 3, 6))
-    # The rate of a window is compared with the mean over the rest's windows that are inside the
-    # calibrated ranges, or over all windows of the rest if none is inside.
+    # The rate of a window is compared with the mean rate in the same rest: over the windows inside
+    # the calibrated ranges or, if none is inside, over all windows.
     _, place = np.unique(windows.position, return_inverse=True)
     has_inside = np.bincount(place, windows.is_inside) > 0.0
     weight = np.where(has_inside[place], windows.is_inside, 1.0)
@@ -170,13 +170,13 @@ def judge_rates(windows: JudgedWindows, calibration: Calibration) -> RateJudgeme
         correction = Correction(triad, Correction(calibration).memory)
         bias, change = SlowUncertainty(triad, correction).of_bias(windows.gyro[:, 9:], mean_of)
         slow = np.square([axis.residual_sd_m_s2 for axis in triad.static.axes()])
-        # Errors due to thermometer noise and unknown initial lag states nearly vanish in the mean
-        # of a rest, so a change from this mean has the whole variance of these errors.
+        # Thermometer noise and unknown initial lag states hardly change the mean of a rest, so the
+        # change from this mean has the whole variance of the errors due to them.
         of_thermometers = np.maximum(variance - np.array(correction.noise) - slow - bias, 0.0)
         white = np.square(triad.noise_density_m_s2_sqrt_hz) / windows.window_s
         noise = white * (1.0 - 1.0 / np.maximum(counts, 1.0))[:, None]
         hours = counts[:, None] * windows.window_s / 3600.0
-        # The variance of a random walk about its mean is 1/6 of the variance gained in the time.
+        # The variance of a random walk about its mean is 1/6 of the variance at its end.
         walk = np.square(triad.slow_noise_m_s2_sqrt_h) * hours / 6.0
         claimed = np.sqrt(of_thermometers + change + noise + walk)
     changes = np.stack((raw - mean_of(raw), corrected - mean_of(corrected), claimed))

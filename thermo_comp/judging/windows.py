@@ -30,10 +30,10 @@ from ..unit.nonlinearity import AT_REST
 
 #: Default duration of a window of a judgement [s].
 WINDOW_S = 60.0
-# Largest sum of the distances outside the calibrated ranges [half ranges], due to noise of the
-# thermometers, at which a window counts as inside.
+# A window up to this far outside the calibrated ranges counts as inside, because of thermometer
+# noise: sum of the distances from the ranges of temperature, rate, worst column [half ranges].
 _RANGE_TOLERANCE = 0.02
-# Smallest number of samples of a used partial sum / median number of all partial sums.
+# A partial sum is used if it has at least this share of the median number of samples.
 _LEAST_FILLED = 0.9
 
 
@@ -49,8 +49,8 @@ class JudgedWindows:
     entirely inside the calibrated ranges; `is_swapped`: the board temperature leads that of the
     case. `raw` is the specific force with the constants at the reference temperature, `force` with
     the calibration, shapes (n, 3). `size`: the known |f|, which is gravity unless the bag states
-    another value. `claimed_sd` of the norm of `force`: error of the calibration, error of `size`,
-    and white noise of the mean; `noise_sd`: the white noise alone. Rows of `gyro`: angular rate
+    another value. `claimed_sd`: sd of ``|force| - size`` due to the calibration, `size` and white
+    noise of the mean; `noise_sd`: sd due to the white noise alone. Rows of `gyro`: angular rate
     raw and corrected, its claimed variances, the thermal state; empty without a gyroscope.
     """
 
@@ -78,7 +78,7 @@ class JudgedWindows:
         return len(self.time)
 
     def select(self, rows: Bools) -> JudgedWindows:
-        """Return the windows of some rows; all fields but `window_s` and `gravity` are arrays."""
+        """Return some of the windows: the given rows of each array."""
         kept = {field.name: getattr(self, field.name)[rows] for field in fields(self)[2:]}
         return replace(self, **kept)
 
@@ -99,12 +99,12 @@ class JudgedWindows:
 
 
 def sum_length(window_s: float) -> float:
-    """Divide `window_s` by the smallest integer that gives partial sums of 10 s or less [s]."""
+    """Return the longest duration [s] of a partial sum, up to 10 s, that divides `window_s`."""
     return window_s / float(np.ceil(window_s / reduction.WINDOW_S))
 
 
 def usual_window(bags: Sequence[ReducedBag]) -> float:
-    """Return the length of windows: 60 s or more, a multiple of the longest partial sum [s]."""
+    """Return the window length [s]: 60 s rounded up to a multiple of the longest partial sum."""
     longest = max(bag.window_s for bag in bags)
     return float(np.ceil(WINDOW_S / longest - 1e-6)) * longest
 
@@ -131,7 +131,7 @@ def corrected_windows(
         raw = constants.force(raw)
         along = force / np.linalg.norm(force, axis=1, keepdims=True) @ constants.misalignment
         noise = along**2 @ np.array(Correction(calibration).noise)
-        # The converter adds the remainder of rounding to the next sample: a mean lacks this noise.
+        # A mean has no rounding noise: the converter adds the remainder to the next sample.
         white = along**2 @ np.square(calibration.noise_density_m_s2_sqrt_hz)
         mean_white = white / (calibration.unit.cycle_time_s * table['count'])
         variance = np.maximum(table['variance'] - noise, 0.0) + mean_white
@@ -179,8 +179,8 @@ def columns_of(windows: JudgedWindows, bags: Sequence[str]) -> dict[str, npt.NDA
 
 # A structured array of partial sums of samples, or of windows.
 _Table: TypeAlias = npt.NDArray[Any]
-# Integer fields of a window: `count` is summed over its partial sums, the others: of its first.
-# Then fields that are averages over the partial sums; only `excess` is a maximum.
+# Integer fields of a window: `count` is the total of its partial sums, the others are those of its
+# first partial sum. Fields in `_AVERAGED` and `_TRIPLES` are means over a window's partial sums.
 _ONCE = ('bag', 'position', 'start_ns', 'count')
 _AVERAGED = ('time', 'board', 'rate', 'weight', 'variance', 'swapped', 'size', 'size_sd')
 _TRIPLES = ('mean', 'force')
@@ -246,7 +246,7 @@ def _table(
 
 
 def _joined(sums: _Table) -> _Table:
-    """Join the partial sums of each row to a window; drop windows with uncorrected sums."""
+    """Combine each row of partial sums to a window; drop windows with an unusable partial sum."""
     result = sums[:, 0].copy()
     result['count'] = sums['count'].sum(axis=1)
     result['excess'] = sums['excess'].max(axis=1)
@@ -261,7 +261,7 @@ def _correct(calibration: Calibration, bag: ReducedBag, sums: _Table) -> None:
     # The checks for stuck samples and gravity do not apply to means of samples.
     config = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
     compensator = Compensator(calibration, config)
-    # Accept any forward step of the stamps: the stamp of a partial sum is a mean of many samples.
+    # Accept any forward step of the stamps: a partial sum has the mean time of many samples.
     compensator.leap_ns = np.iinfo(np.int64).max
     thermal = compensator.thermal
     readings = iter(readings_in_order(bag, thermal.inputs))

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the correction of arrays of samples, with the same bits as that of single samples.
+Owns the correction of arrays of samples; the result equals that of single samples bit for bit.
 
-The compensator uses the temperature readings one by one. The segments between the readings are
-collected, evaluated together and applied to all samples with the arithmetic of single samples.
+Temperature readings are applied one by one. The segments between readings are collected and
+evaluated together; then all samples are corrected by the same operations as single samples.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,6 +17,7 @@ import numpy as np
 from ..recording.blocks import Block
 from ..thermal.reading_queue import DISORDER_NS, NEVER_NS, PENDING_LIMIT
 from ..typing import Bools, Floats, Ints, Stamps
+from .checks import roughness
 from .compensator import TIME_JUMP_NS, Compensator, corrected_rate
 from .segments import EVER_NS, SEGMENT_NS, Model, Segment
 from .status import DROPPED
@@ -56,7 +57,7 @@ class CompensatedBlock:
 def process_block(
     compensator: Compensator, block: Block, angular_rate: Floats | None = None
 ) -> CompensatedBlock:
-    """Correct a block's samples and angular rates (n, 3), with the bits of single samples."""
+    """Correct a block's samples and rates (n, 3); the result equals `process` bit for bit."""
     thermal = compensator.thermal
     stamps = np.asarray(block.accel_stamp_ns, dtype=np.int64)
     samples = np.asarray(block.accel, dtype=np.float64)
@@ -124,8 +125,8 @@ def _push(
     while arrivals and arrivals[-1][0] <= place:
         _, _, name, stamp_ns, celsius = arrivals.pop()
         if len(thermal.queue) >= PENDING_LIMIT:
-            # The node applies waiting readings while no samples come. A batch applies old readings
-            # if the queue is full, but once it has a sample, none later than the next sample.
+            # The node applies waiting readings while no samples come; here, if the queue is full,
+            # its old readings are applied: after the first sample, those stamped up to `due_ns`.
             limit_ns = NEVER_NS if compensator.now_ns is None else due_ns
             thermal.flush(min(limit_ns, stamp_ns - DISORDER_NS))
         thermal.push(name, stamp_ns, celsius)
@@ -224,7 +225,7 @@ def _lines(model: Model, segments: Segments) -> tuple[Floats, Floats, Bools]:
 def _corrected(
     evaluate: _Arithmetic, table: Floats, segments: Segments, stamps: Stamps, samples: Floats
 ) -> Floats:
-    """Correct the samples of segments, whose `Correction.line` results are columns of `table`."""
+    """Correct the samples of segments; column k of `table`: `Correction.line` of segment k."""
     start_ns = np.array([segment.start_ns for segment, _ in segments], dtype=np.int64)
     ends = np.cumsum([count for _, count in segments])
     n, parts = len(stamps), []
@@ -246,6 +247,7 @@ def _judge(
 ) -> Bools:
     """Mark the samples to be published; count the reasons for which samples are dropped."""
     reasons = np.zeros(len(stamps), dtype=np.int8)
+    last = compensator.stuck.last[:3]
     reasons[compensator.stuck.find(stamps, samples)] = _REASONS['n_stuck']
     is_large = ~(np.abs(samples) < compensator.calibration.unit.full_scale).all(axis=1)
     if is_large.any():
@@ -265,7 +267,9 @@ def _judge(
         elif segment.is_new:
             held = _REFUTED if gravity.is_refuted else 0
             if not is_bad and gravity.wants(stamp_ns):
-                gravity.add(stamp_ns, row[:3], row[3:], trace)
+                before = samples[begin - 1].tolist() if begin else last
+                rough = roughness(samples[begin].tolist(), before, compensator.scales)
+                gravity.add(stamp_ns, row[:3], row[3:], trace, rough)
         if held:
             is_counted = is_bad and segment.is_new and held == _REFUTED
             reasons[begin + is_counted : begin + count] = held

@@ -5,9 +5,9 @@ Owns the plausibility checks of samples: a stuck converter, more samples than th
 make, and |f| at rest, which must be gravity.
 
 A converter with noise does not repeat its numbers for seconds; three exact zeros indicate a dead
-wire. A count is charge per cycle, so the scale factor changes with the sample rate. With an aged
-calibration, or that of another unit, |f| at rest may differ from gravity by more than the stated
-uncertainty. |f| is averaged over windows of a second or longer. A window is still if its
+wire. A converter counts charge per cycle, so the scale factor changes with the sample rate. With
+an aged calibration, or that of another unit, |f| at rest may differ from gravity by more than the
+stated uncertainty. |f| is averaged over windows of a second or longer. A window is still if its
 scatter is within the sensor's noise and its mean agrees with the mean of the previous window. A
 step of |f| from a rest to another rest is judged within a second.
 """
@@ -27,9 +27,9 @@ STUCK_SAMPLES: Final = 50
 #: Change of both other axes [m/s^2] at which an axis that repeats its reading counts as stuck: the
 #: change in a turn by 1.2 degrees, above the noise and the steps of a converter at rest.
 MOTION: Final = 0.2
-#: An axis that repeats its reading although nothing moves is stuck if the other axes have changed
-#: `NOISY_CHANGES` times by `NOISY_SDS` sd of their noise from one sample to the next, and if its
-#: own noise [sd] is at least `VISIBLE_SDS` times the converter's step, which would show the noise.
+#: An axis that repeats its reading at rest is stuck if the other axes change `NOISY_CHANGES` times
+#: by `NOISY_SDS` sd of their noise from sample to sample. The noise of the stuck axis must have
+#: an sd of `VISIBLE_SDS` converter steps or more: smaller noise might not change the reading.
 NOISY_CHANGES: Final = 20
 NOISY_SDS: Final = 1.5
 VISIBLE_SDS: Final = 2.0
@@ -49,7 +49,8 @@ LONGEST_WINDOW_NS: Final = 30_000_000_000
 # Shortest time between two samples of a window of the gravity check [ns].
 PROBE_NS: Final = 90_000_000
 SMALLEST_WINDOW: Final = 5  # smallest number of samples in a window of the gravity check
-#: Largest ratio of a still window's scatter to the noise of its samples (both as sd).
+#: Largest ratio of a still window's scatter to the noise of its samples (both as sd), also of the
+#: scatter that the changes from one sample to the next show.
 SCATTER_FACTOR: Final = 3.0
 #: Largest change of the mean between two still windows in addition to noise [m/s^2]: 0.5 mg.
 LARGEST_CHANGE: Final = 5e-3
@@ -64,10 +65,10 @@ STEP_NS: Final = 300_000_000
 REFUTING_SIGMAS: Final = 5.0
 
 
-#: Run of equal readings of an axis: its first sample with the stamp [ns], number of samples after
-#: the first, the largest change since then that both other axes have made [input unit], and, after
-#: the `STUCK_SAMPLES`th repeat, the changes of the other axes from sample to sample: number of
-#: changes by `NOISY_SDS` sd or more; smallest change, the converter's step [input unit].
+#: Run of equal readings of an axis: first sample with its stamp [ns]; number of repeats; largest
+#: change of both other axes since the first sample [input unit]. Counted after the
+#: `STUCK_SAMPLES`th repeat: number of changes of the other axes by `NOISY_SDS` sd or more from
+#: sample to sample; smallest change, which is the converter's step [input unit].
 Run: TypeAlias = tuple[tuple[float, float, float, int], int, float, int, float]
 
 
@@ -75,10 +76,10 @@ class StuckCheck:
     """
     Counts consecutive equal readings of each axis; `timeout_s` [s]: 0 = nothing is stuck.
 
-    After the time-out samples are stuck if all three axes repeat their readings, or if an axis
-    repeats its reading while both other axes change by `motion` [input unit], or while another
-    axis shows noise that this axis would show as well. `noise_sds`: sd of the noise of each axis
-    [input unit]. An axis whose noise is below the converter's step may repeat its reading.
+    Samples are stuck if all three axes repeat their readings for over `timeout_s`. One axis alone
+    is stuck if it repeats its reading as long while both other axes change by over `motion` [input
+    unit], or while the other axes show noise and the sd of this axis' noise is two converter steps
+    or more. `noise_sds`: sd of the noise of each axis [input unit].
     """
 
     def __init__(self, timeout_s: float, motion: float, noise_sds: Sequence[float]) -> None:
@@ -121,7 +122,7 @@ class StuckCheck:
         j: int,
         k: int,
     ) -> Run:
-        """Return the run of an axis, extended by `sample`; `j`, `k`: the other axes."""
+        """Extend an axis' run of equal readings by `sample`; `j`, `k`: the other axes."""
         first, n, moved, n_noisy, step = run
         change, other = abs(sample[j] - first[j]), abs(sample[k] - first[k])
         if change > moved and other > moved:
@@ -135,7 +136,7 @@ class StuckCheck:
         return first, n + 1, moved, n_noisy, step
 
     def find(self, stamps: Ints, samples: Floats) -> Bools:
-        """Find the samples (n > 0, 3) that `Compensator` drops as stuck or as three zeros."""
+        """Return which samples, (n > 0, 3), `Compensator` drops as stuck or as three zeros."""
         n = len(stamps)
         columns = samples.T
         changes = np.empty((3, n), dtype=np.bool_)
@@ -177,18 +178,18 @@ class StuckCheck:
         self, run: Run, columns: Floats, here: slice, equal: Ints, axis: int
     ) -> tuple[Floats, Ints, Floats]:
         """
-        Return `moved`, `n_noisy`, `step` of a run after each of the samples `here` of `columns`;
+        Return `moved`, `n_noisy`, `step` of a `Run` after each sample of `columns[:, here]`;
         `equal`: number of repeats of the first reading of the run up to each sample.
         """
         first, _, moved, n_noisy, step = run
-        # Include the sample before `here`, which the first difference needs.
+        # The first difference needs the sample before the slice `here`.
         before = self.last[:3] if here.start == 0 else columns[:, here.start - 1]
         values = np.column_stack([before, columns[:, here]])[[axis - 2, axis - 1]]
         with np.errstate(invalid='ignore'):
             moved_by = np.abs(values[:, 1:].T - np.take(first[:3], [axis - 2, axis - 1]))
             changes = np.abs(np.diff(values))
         most = np.fmax.accumulate(np.append(moved, moved_by.min(axis=1)))[1:]
-        # The streaming check looks at changes from the repeat after the `STUCK_SAMPLES`th on.
+        # Like `_continued`, ignore changes up to the `STUCK_SAMPLES`th repeat of a reading.
         changes[:, equal <= STUCK_SAMPLES] = 0.0
         noisy = np.take(self._noisy, [axis - 2, axis - 1])[:, np.newaxis]
         counts = n_noisy + np.cumsum(np.sum(changes >= noisy, axis=0))
@@ -197,7 +198,7 @@ class StuckCheck:
 
 
 def _begun(sample: tuple[float, float, float, int]) -> tuple[Run, ...]:
-    """Return the runs of the three axes that begin with a sample."""
+    """Return a new run of equal readings for each of the three axes, begun by `sample`."""
     return ((sample, 0, 0.0, 0, math.inf),) * 3
 
 
@@ -220,7 +221,7 @@ class RateCheck:
         return excess if excess > RATE_TOLERANCE else 0.0
 
     def update(self, n_seen: int, stamp_ns: int) -> None:
-        """Update the rate with the number of samples so far and the latest sample's stamp [ns]."""
+        """Update the sample rate by the number of samples so far and the latest stamp [ns]."""
         last = self._last
         self._last = (n_seen, stamp_ns)
         if last is None:
@@ -228,8 +229,8 @@ class RateCheck:
             return
         n, dt = n_seen - last[0], (stamp_ns - last[1]) * 1e-9
         level = self._level + n - LARGEST_RATE * dt / self._cycle_s
-        # Excess samples are counted up to twice the allowance, so that the alarm ends soon after a
-        # long excess.
+        # Count at most twice the allowed number of excess samples, so that the alarm ends soon
+        # after a long excess.
         self._level = min(max(level, 0.0), 2.0 * self._allowance)
         self.is_too_fast = self._counts_cycles and self._level > self._allowance
         n, dt = n_seen - self._window[0], (stamp_ns - self._window[1]) * 1e-9
@@ -246,13 +247,20 @@ def variance_along(force: Sequence[float], covariance: Sequence[float]) -> float
     return square / (x * x + y * y + z * z)
 
 
+def roughness(sample: Sequence[float], last: Sequence[float], scales: Sequence[float]) -> float:
+    """Return half the squared change of the force between two samples [m^2/s^4]; NaN counts 0."""
+    changes = [(a - b) / scale for a, b, scale in zip(sample, last, scales, strict=True)]
+    half = 0.5 * sum(change * change for change in changes)
+    return half if half >= 0.0 else 0.0
+
+
 class GravityCheck:
     """Compares |f| with gravity in still windows; a tolerance of 0 means no limit of |f|."""
 
     def __init__(self, gravity: float, tolerance: float = 0.0) -> None:
         self.gravity = gravity
         self._tolerance = tolerance or math.inf
-        # Whether |f| of the last windows refutes the calibration.
+        # Whether |f| in the last still windows refutes the calibration.
         self.is_refuted = False
         self._n_agreeing = 0
         self._is_against = False
@@ -272,34 +280,48 @@ class GravityCheck:
         return not 0 <= stamp_ns - self._last_ns < PROBE_NS
 
     def add(
-        self, stamp_ns: int, force: Sequence[float], covariance: Sequence[float], noise: float
+        self,
+        stamp_ns: int,
+        force: Sequence[float],
+        covariance: Sequence[float],
+        noise: float,
+        rough: float = 0.0,
     ) -> None:
-        """Take a force [m/s^2], its covariance (xx to zz), and the trace of its noise part."""
-        self._watch_step(stamp_ns, force, covariance, noise)
+        """
+        Add a sample: force [m/s^2], covariance (xx to zz), trace of the noise covariance, and
+        `roughness`: samples at intervals of whole periods of a vibration are equal, as at rest.
+        """
+        self._watch_step(stamp_ns, force, covariance, noise, rough)
         since_ns, step_ns = stamp_ns - self._begin_ns, stamp_ns - self._last_ns
         if not (0 <= since_ns < LONGEST_WINDOW_NS and 0 <= step_ns < 3 * WINDOW_NS):
             self._forces = []
         if not self._forces:
             self._begin_ns = stamp_ns
         self._last_ns = stamp_ns
-        self._forces.append(force)
+        self._forces.append((*force, rough))
         is_long = stamp_ns - self._begin_ns >= 0.98 * WINDOW_NS
         if is_long and len(self._forces) >= SMALLEST_WINDOW:
             self._close(covariance, noise)
             self._forces = []
 
     def _watch_step(
-        self, stamp_ns: int, force: Sequence[float], covariance: Sequence[float], noise: float
+        self,
+        stamp_ns: int,
+        force: Sequence[float],
+        covariance: Sequence[float],
+        noise: float,
+        rough: float,
     ) -> None:
-        """Refute the calibration if |f| steps, at rest, beyond the tolerance for `STEP_NS`."""
+        """Refute the calibration if |f| at rest, after a step, misses gravity for `STEP_NS`."""
         rests = self.result and self.result.is_still and self._last_mean
         if self.is_refuted or not (self._off or rests):
             self._off, self._is_resting = [], False
             return
-        # Largest difference of two samples at rest, including four sd of the noise difference.
+        # Largest difference of two samples at rest: `LARGEST_CHANGE` + 4 sd of the difference.
         near = LARGEST_CHANGE + 4.0 * math.sqrt(2.0 * noise / 3.0)
         was_resting, reference = self._is_resting, (self._off or [self._last_mean or ()])[0]
         is_near = max(abs(a - b) for a, b in zip(force, reference, strict=True)) <= near
+        is_near = is_near and rough <= SCATTER_FACTOR**2 * noise
         variance = max(variance_along(force, covariance), noise / 3.0)
         residual = math.hypot(*force) - self.gravity
         is_off = abs(residual) > self._tolerance + REFUTING_SIGMAS * math.sqrt(variance)
@@ -321,12 +343,12 @@ class GravityCheck:
 
     def _close(self, covariance: Sequence[float], noise_variance: float) -> None:
         n = len(self._forces)
-        axes = list(zip(*self._forces, strict=True))
+        *axes, rough = zip(*self._forces, strict=True)
         mean = [math.fsum(values) / n for values in axes]
         squares = [(v - m) ** 2 for values, m in zip(axes, mean, strict=True) for v in values]
-        scatter = math.fsum(squares) / (n - 1)
+        scatter = max(math.fsum(squares) / (n - 1), sum(rough) / n)
         last, self._last_mean = self._last_mean or [math.inf] * 3, mean
-        # Largest difference of two means at rest, including four sd of the noise difference.
+        # Largest difference of two means at rest: `LARGEST_CHANGE` plus 4 sd of the difference.
         change = LARGEST_CHANGE + 4.0 * math.sqrt(2.0 * noise_variance / (3.0 * n))
         largest = max(abs(a - b) for a, b in zip(mean, last, strict=True))
         if not (scatter <= SCATTER_FACTOR**2 * noise_variance and largest <= change):
@@ -341,7 +363,7 @@ class GravityCheck:
         if is_against == self._is_against:
             self._n_agreeing += 1
         else:
-            # The windows before a change of the verdict do not describe the present error.
+            # The windows before |f| crossed the limit do not describe the present error of |f|.
             self._is_against, self._n_agreeing, self._weight = is_against, 1, 0.0
         if self._n_agreeing >= (REFUTING_WINDOWS if is_against else RESTORING_WINDOWS):
             self.is_refuted = is_against

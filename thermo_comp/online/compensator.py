@@ -4,8 +4,8 @@
 Owns the correction of a stream of samples: counts and temperatures to specific force, covariance,
 regime and status.
 
-A temperature reading applies from the first later-arriving sample with an equal or later stamp, so
-stamps and order of arrival determine the output, and a node that received all messages in order
+A temperature reading applies from the next arriving sample with an equal or later stamp on. Stamps
+and order of arrival thus determine the output: a node that received all messages in order
 publishes the same bits as the offline replay. To save time, the sample rate and |f| at rest are
 checked at the first sample of each segment only.
 """
@@ -27,7 +27,7 @@ from ..unit.correction import SCALE_VARIANCES, VARIANCES, Excess
 from ..unit.covariance import Real, covariance_at
 from ..unit.functions import TANGENT_SPANS
 from ..unit.nonlinearity import corrected_nonlinear
-from .checks import MOTION, GravityCheck, StuckCheck
+from .checks import MOTION, GravityCheck, StuckCheck, roughness
 from .segments import EVER_NS, SEGMENT_NS, Model, ThermalSide
 from .status import CompensatorConfig, Counters, GravityResidual
 
@@ -110,6 +110,7 @@ class Compensator:
         self.calibration = calibration
         self._full_scale = self._limit = calibration.unit.full_scale
         self._edge = self.thermal.correction.beyond.edge
+        self.scales = [axis.scale_factor for axis in calibration.axes]
         self.gravity = GravityCheck(*self._gravity_settings)
         self.evaluate = corrected_nonlinear if calibration.nonlinearity else corrected
         self.leap_ns = max(LEAP_NS, round(LEAP_CYCLES * 1e9 * calibration.unit.cycle_time_s))
@@ -203,7 +204,7 @@ class Compensator:
         fresh_ns = thermal.fresh_until_ns
         if stamp_ns > fresh_ns:
             thermal.count_unmeasured(1)
-            # Until a temperature arrives, each sample takes this path and is counted as dropped.
+            # Until a board temperature arrives, every sample is counted as dropped by this branch.
             self.event_ns = EVER_NS
             self.last_ns = stamp_ns
             return None
@@ -215,24 +216,26 @@ class Compensator:
         line, rate_line, is_good = thermal.model.lines(start, end, slow, excess)
         self.rate_line = rate_line.tolist()
         if not is_good:
-            # While the correction is not finite, each sample takes this path and is dropped.
+            # Each sample is dropped here while the correction is not finite.
             counters.n_unsound += 1
             self.event_ns, self.last_ns = EVER_NS, stamp_ns
             return None
         self._segment = (start_ns, line.tolist(), correction.misalignment)
         if is_new:
             self.is_refusing = is_too_fast
+        last = self.stuck.last[:3]
         row = self.process(stamp_ns, x, y, z)
         if not is_new:
             return row
         if self.gravity.is_refuted and not is_too_fast:
-            # The check of |f| also uses samples that it drops: later ones may agree with gravity.
+            # The check of |f| uses dropped samples, too: output resumes if |f| is gravity again.
             self.is_refusing = True
             if row is not None:
                 counters.n_out -= 1
                 counters.n_refuted += 1
         if row is not None and self.gravity.wants(stamp_ns):
-            self.gravity.add(stamp_ns, row[:3], row[3:], correction.noise_trace)
+            rough = roughness((x, y, z), last, self.scales)
+            self.gravity.add(stamp_ns, row[:3], row[3:], correction.noise_trace, rough)
         return None if self.is_refusing else row
 
     def is_leap(self, stamp_ns: int) -> bool:
@@ -242,7 +245,7 @@ class Compensator:
         is_far = self.last_ns != EVER_NS and max(self.last_ns, self.reading_ns) < near_ns
         if is_far and (leapt_ns is None or stamp_ns <= leapt_ns):
             self.leapt_ns = stamp_ns
-            self.event_ns = EVER_NS  # the next sample is also checked for a leap
+            self.event_ns = EVER_NS  # the next sample is checked by `is_leap`, too
             return True
         return False
 
@@ -254,13 +257,13 @@ class Compensator:
         self.stuck = self._stuck_check()
         is_refuted = self.gravity.is_refuted
         self.gravity = GravityCheck(*self._gravity_settings)
-        # A calibration refuted before the jump stays so until still windows agree with gravity.
+        # A refuted calibration stays refuted until |f| in still windows agrees with gravity.
         self.gravity.is_refuted = is_refuted
         self.counters.n_time_jumps += 1
         self.last_ns = stamp_ns - 1
 
     def take_flags(self) -> list[tuple[int, bool]]:
-        """Return new regime flags once: stamp of the deciding reading [ns], whether dynamic."""
+        """Return regime flags since the last call: stamp of a reading [ns], whether dynamic."""
         flags, self.thermal.flags = self.thermal.flags, []
         return flags
 
@@ -287,15 +290,15 @@ class Compensator:
         Build a compensator that continues from the last sample with `model` and `config`.
 
         The states of thermometers, regime and memory are kept if `model` has the detector
-        settings, lags and plays of the present model; otherwise only the last temperatures are
-        kept. The present compensator does not change, but the two must not both process samples.
+        settings, lags and play operators of the present model; otherwise only the last
+        temperatures are kept. Of the present and the new compensator, use only one from now on.
         """
         new = copy(self)
         new.take_over(model, config)
         return new
 
     def take_over(self, model: Model, config: CompensatorConfig) -> None:
-        """Use `model` and `config` from now on; an object that `self` copies does not change."""
+        """Use `model` and `config` from now on; copy objects that another compensator shares."""
         gravity, before, stuck = copy(self.gravity), self._gravity_settings, self.stuck
         self.config, self.thermal = config, copy(self.thermal)
         self.thermal.take_over(model, config, self.now_ns)
@@ -361,7 +364,7 @@ class Compensator:
 
     @property
     def scale_sd(self) -> tuple[float, ...]:
-        """Sd of each axis' relative scale in the present segment; () before the first segment."""
+        """Relative sd of each scale factor in the present segment; () before the first segment."""
         line = self._segment[1]
         return tuple(math.sqrt(max(0.0, line[place])) for place in SCALE_VARIANCES if line)
 
@@ -378,7 +381,7 @@ def corrected(
     """Return force x, y, z and covariance xx, xy, xz, yy, yz, zz, `dt` s after a segment began."""
     bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1 = line[:12]
     yx, zx, zy = misalignment
-    # Equation 7 of the paper, solved for the input of each axis.
+    # Equation 7 of the paper (docs/theory.md), solved for the input of each axis.
     x = (x - (bx + bx1 * dt)) / (sx + sx1 * dt)
     y = (y - (by + by1 * dt)) / (sy + sy1 * dt)
     z = (z - (bz + bz1 * dt)) / (sz + sz1 * dt)

@@ -4,9 +4,9 @@
 Owns the segments: time intervals between temperature readings, with a correction linear in time.
 
 A segment ends at a temperature reading, or after one second. The correction is evaluated at both
-ends of a segment and interpolated, so a sample takes a few operations, the output has no steps
-between two readings, and a batch needs one evaluation per segment. The slowly varying variance due
-to parameters and initial lag states is evaluated every 10 s, at first in each segment.
+ends of a segment and interpolated, so a sample costs a few operations, and the output has no steps
+between two readings. The slowly varying variance due to parameters and initial lag states is
+evaluated every 10 s; soon after the board readings begin, in each segment.
 """
 
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ from .status import CompensatorConfig, Counters
 #: Longest segment [ns].
 SEGMENT_NS: Final = 1_000_000_000
 SLOW_NS: Final = 10_000_000_000  # longest use of a `SlowState` and its variance [ns]
-YOUNG_READINGS: Final = 30  # number of board readings that determine the board's rate
+YOUNG_READINGS: Final = 30  # number of readings that determine the rate of the board temperature
 EVER_NS: Final = -NEVER_NS  # a stamp earlier than any real stamp
 #: Sd of the temperature of a unit without thermometer about the reference temperature [K].
 UNMEASURED_SD_K: Final = 10.0
@@ -43,7 +43,7 @@ UNMEASURED_SD_K: Final = 10.0
 class SlowState(NamedTuple):
     """
     Arguments of the variance due to parameters and initial lag states: thermal state, remaining
-    shares of the lags' unknown initial states, largest board rate since the start [K/s].
+    shares of the unknown initial lag states, largest rate of the board since the start [K/s].
     """
 
     state: tuple[float, ...]
@@ -84,7 +84,7 @@ class Model:
         self.inputs = (BOARD_INPUT, *calibration.sensors)
 
     def slow_rows(self, held: Sequence[SlowState]) -> Floats:
-        """Evaluate the slow variance of force (`n_slow` rows), then of angular rate, (rows, n)."""
+        """Return the slowly varying variances: `n_slow` rows of force, then angular rate."""
         states, shares, rates = (np.array(part).T for part in zip(*held, strict=True))
         return np.concatenate([part.at(states, shares, rates) for part in self.uncertainty])
 
@@ -144,12 +144,12 @@ class ThermalSide:
         return config, unit.board_lag_s, unit.rest_gradient_range_k or ANY_RANGE
 
     def take_over(self, model: Model, config: CompensatorConfig, now_ns: int | None) -> None:
-        """Use `model` and `config` from now on; an object that `self` copies does not change."""
+        """Use `model` and `config` from now on; copy objects that another compensator shares."""
         old, self.queue = self.tracker, copy(self.queue)
         unit, rate = self.calibration.unit, copy(self.rate)
         self._use(model, config)
         if self.calibration.unit == unit:
-            # For the same unit, output that was stopped by the check of the rate stays stopped.
+            # With a new calibration of the same unit, output stopped by the rate check stays off.
             self.rate = rate
         self.queue.keep(lambda entry: entry[2] in self.inputs)
         is_same = self.calibration.detector == old.settings
@@ -196,7 +196,7 @@ class ThermalSide:
             self.counters.n_case_rejected += n_readings
 
     def flush(self, stamp_ns: int) -> None:
-        """Apply the waiting readings up to a stamp."""
+        """Apply the waiting temperature readings up to a stamp."""
         for reading_ns, _, name, _, celsius in self.queue.due(stamp_ns):
             self._apply(name, reading_ns, celsius)
 
@@ -206,7 +206,7 @@ class ThermalSide:
         return not self.model.needs_temperature and self.tracker.board.stamp_ns is None
 
     def sample(self, stamp_ns: int) -> tuple[float, ...]:
-        """Return the thermal state at a stamp; if `is_unmeasured`, a soak at the reference."""
+        """Return the thermal state at a stamp, or if `is_unmeasured`, that of a soak at T_ref."""
         if self.is_unmeasured:
             gradients = (0.0, 0.0) * len(self.calibration.sensors)
             reference = self.calibration.reference_temperature_c
@@ -215,7 +215,7 @@ class ThermalSide:
 
     @property
     def fresh_until_ns(self) -> int:
-        """Last stamp with a fresh board temperature; NEVER_NS: none needed, EVER_NS: none read."""
+        """Last stamp with a valid board temperature; NEVER_NS: none needed, EVER_NS: none yet."""
         if not self.model.needs_temperature:
             return NEVER_NS
         board_ns = self.tracker.board.stamp_ns
@@ -246,7 +246,7 @@ class ThermalSide:
         return Segment(start_ns, is_new, rate.is_too_fast, rate.noise_excess, start, end, slow)
 
     def bias_sd(self, correction: Correction, variances: Sequence[float]) -> tuple[float, ...]:
-        """Return the bias sd of each axis: the root of the variance without a sample's noise."""
+        """Return each axis' bias sd: the root of the output variance less the noise variance."""
         excess = 1.0 + self.rate.noise_excess
         pairs = zip(variances, correction.noise, strict=False)
         return tuple(sqrt(max(0.0, whole - excess * noise)) for whole, noise in pairs)
@@ -259,15 +259,15 @@ class ThermalSide:
         return self._slow_rows
 
     def _slow_at(self, start_ns: int, end_state: tuple[float, ...]) -> SlowState:
-        """Return the arguments of the slowly varying variance, new at least every `SLOW_NS`."""
-        # The unknown initial lag states depend on the board's rate, which the first readings after
-        # a start do not determine: evaluate the variance in each segment.
+        """Return the arguments of the slowly varying variance; they are at most `SLOW_NS` old."""
+        # The unknown initial lag states depend on the rate of the board temperature, which the
+        # first readings do not determine: evaluate the variance in each segment meanwhile.
         is_young = self.tracker.board.n_in_row < YOUNG_READINGS
         key = start_ns // (SEGMENT_NS if is_young else SLOW_NS)
         if key != self._slow_key:
             self._slow_key = key
             if self.is_unmeasured:
-                # Temperature unknown: evaluate the variance one sd above the reference.
+                # The temperature is unknown: evaluate the variance at T_ref plus one sd.
                 end_state = (end_state[BOARD] + UNMEASURED_SD_K, *end_state[1:])
             memory = self.tracker.memory
             shares = memory.remaining_shares(start_ns + SEGMENT_NS)

@@ -13,9 +13,9 @@ from ..thermal.settings import ThermalConfig
 class CompensatorConfig(ThermalConfig):
     """Settings of the compensator; ValueError if a value is out of its range."""
 
-    #: Time after which samples that repeat their values on all axes, or on one axis while the
-    #: others change or show their noise, are dropped [s]; three zeros are dropped at once; 0 =
-    #: neither is dropped.
+    #: Longest accepted repetition of equal readings [s], on all axes, or on one axis while the
+    #: others change or show noise; later repetitions are dropped. Samples of three zeros are
+    #: dropped at once. 0 = repetitions and zeros are accepted.
     stuck_timeout_s: NotNegative = 2.0
     #: Gravity at the place of use [m/s^2]; 0 = the gravity of the calibration.
     local_gravity_m_s2: NotNegative = 0.0

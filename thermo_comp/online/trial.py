@@ -59,7 +59,7 @@ def _samples(model: Model) -> Iterator[Corrected]:
         compensator = Compensator(model, CompensatorConfig(gravity_tolerance_m_s2=0.0))
         for k, size in enumerate((1e-3 * largest, largest, -largest)):
             for name in model.inputs:
-                # The other thermometers read k K more than the board thermometer.
+                # At sample k the other thermometers read k K more than the board thermometer.
                 celsius_there = celsius + k * (name != BOARD_INPUT)
                 compensator.push(name, k * _STEP_NS, celsius_there)
             row = compensator.process(k * _STEP_NS, size, 0.5 * size, size)

@@ -35,12 +35,12 @@ _JUMP_NS = 10**9  # backward steps of the stamps above this are jumps of time [n
 LONGEST_PAUSE_NS = 3600 * 10**9  # longer jumps of the stamps are shortened to this length [ns]
 #: Largest number of jumps of the stamps by over an hour in a recording that is read.
 _MOST_JUMPS = 100
-# A thermometer is taken to use another clock than the accelerometer if `_FEWEST_READINGS` or more
-# of its readings are in the median more than `_APART_S` s before or after the samples around them.
+# A thermometer is taken to use another clock than the accelerometer if the median distance [s] of
+# its readings (`_FEWEST_READINGS` or more) from the samples around them is above `_APART_S`.
 _FEWEST_READINGS, _APART_S = 10, 10.0
 #: Shortest time between successive equal readings in the result of `Readings.thinned` [ns].
 _REPEAT_NS = 10_000_000_000
-#: Duration above which the mean interval between messages is limited, and its upper limit [ns].
+#: Longest mean interval between messages [ns] in a recording longer than `_SPARSE_NS` [ns].
 _SPARSE_NS, _SPARSEST_NS = 10 * 86400 * 10**9, 10 * 10**9
 
 
@@ -97,7 +97,7 @@ class RecordingInfo:
 class ImuColumns(NamedTuple):
     """
     Fields of sensor_msgs/Imu: quaternion x, y, z, w, shape (n, 4), rates [rad/s], shape (n, 3),
-    covariances, shape (n, 9). For writing, a single row applies to all messages.
+    covariances, shape (n, 9). A writer repeats an array of one row for all messages.
     """
 
     orientation: Floats
@@ -128,7 +128,7 @@ class Readings(NamedTuple):
     after: Ints = np.empty(0, np.int64)
 
     def take(self, which: Ints | Bools | slice) -> Readings:
-        """Select readings; the number of samples before each reading is dropped."""
+        """Select readings; the result has no `after`."""
         return Readings(self.stamp_ns[which], self.celsius[which])
 
     def thinned(self) -> Readings:
@@ -246,7 +246,7 @@ def with_stamps(block: Block, last_ns: int) -> tuple[Block, int]:
     """
     Give each reading without a stamp the newest stamp of the samples before it, because its log
     time depends on the speed of a playback; drop such readings before the first sample. `last_ns`:
-    newest stamp before the block. Return the block and the newest stamp up to the block's end.
+    newest stamp before the block. Return the block and the newest stamp at the block's end.
     """
     samples = np.concatenate(([last_ns], block.accel_stamp_ns))
     jumps = np.flatnonzero(np.diff(samples) < -_JUMP_NS) + 1
@@ -269,7 +269,7 @@ def with_stamps(block: Block, last_ns: int) -> tuple[Block, int]:
 
 
 def unstamped(stamp_ns: int) -> str:
-    """Return the message for samples that all have the same stamp."""
+    """Return the warning that all samples have the same stamp."""
     return f'all samples are stamped {stamp_ns * 1e-9:g} s: the driver does not stamp them'
 
 
@@ -295,7 +295,7 @@ def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
     """
     Turn a jump of the stamps by over an hour, forwards or backwards, into a gap of an hour.
     A clock that is set during a recording can leave a gap of years, too long for a time grid. A
-    gap of an hour suffices: after it the thermal state is unknown. RecordingError for more than
+    gap of an hour suffices to make the thermal state unknown. RecordingError for more than
     `_MOST_JUMPS` jumps, or if the recording is too sparse (`_SPARSE_NS`, `_SPARSEST_NS`).
     """
     last_ns: int | None = None

@@ -83,7 +83,7 @@ def translated(path: Path, *, is_foreign: bool = False) -> Iterator[None]:
 class Span:
     """
     A part of a file: a chunk, a chunk without end ('torn'), or messages outside chunks ('loose').
-    `position` and `length` exclude the indexes after the span; `size`: decompressed [bytes].
+    `length` excludes the message indexes after the part; `size`: decompressed size [bytes].
     """
 
     position: int
@@ -174,7 +174,7 @@ def _indexed(data: Bytes, index: memoryview) -> Messages | None:
     if begin != len(index) or not is_inside:
         return None
     head = gather(data, at, MESSAGE_HEAD_BYTES)
-    # A length below `_MESSAGE_FIELDS_BYTES` becomes a huge number, which the next test refuses.
+    # For a too small length the unsigned difference is huge, which the next test refuses.
     length = number_at(head, 1, '<u8') - np.uint64(_MESSAGE_FIELDS_BYTES)
     if int(np.max(length)) > len(data) or (number_at(head, 0, 'u1') != MESSAGE).any():
         return None

@@ -3,8 +3,8 @@
 """
 Owns the reading of an MCAP file chunk by chunk, in bounded memory.
 
-The summary of a complete file lists the spans that hold messages. A file without a usable summary,
-or cut off anywhere, is read record by record, and its messages are counted. The `mcap` library
+The summary of a complete file lists its chunks of messages. A file without a usable summary, or
+cut off anywhere, is read record by record, and its messages are counted. The `mcap` library
 reads all other records.
 """
 
@@ -196,7 +196,7 @@ class McapFile(BagFile):
                     raise DamagedError(f'the record at byte {at} is not complete')
                 words = _CUTS.get(opcode, _CUTS[-1]).format('{}', at=at)
                 if opcode == 0 and at == last.position + last.length:
-                    # Extend the span over the zeros: `scan_records` drops a message before zeros.
+                    # Add zero bytes to the span, so that `scan_records` drops the last message.
                     kind = last.kind if last.kind == 'loose' else 'torn'
                     spans[-1] = replace(last, length=last.length + PREFIX.size, kind=kind)
                 elif opcode == Opcode.CHUNK:
@@ -248,7 +248,7 @@ class McapFile(BagFile):
 
 
 def _in_order(pieces: Iterable[tuple[int, Messages, int | None]]) -> Iterator[Messages]:
-    """Merge pieces by log time; a piece: number, messages, first log time of the next one."""
+    """Merge pieces by log time; a piece: place in file, messages, next piece's first log time."""
     # Messages before the first log time of the next piece are final; later messages are held.
     held: dict[int, Messages] = {}
     for row, piece, next_ns in pieces:

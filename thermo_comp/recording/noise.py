@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the noise of samples at rest: glitches, single samples with wrong bits as after a transfer
-error, and the limits of a cell's variance and roughness if a low pass has coloured the noise.
+Owns the noise of samples at rest: finds glitches (single samples with wrong bits, as after a
+transfer error), and limits of a cell's variance and roughness for low-pass filtered noise.
 
 A cell is a run of about 0.5 s of samples; its roughness is half the mean square change from sample
 to sample, which equals the variance for white noise.
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 # Smallest distance of a glitch from the mean of its neighbours, in sd of the noise.
 _SDS = 25.0
-# Smallest distance of a glitch from the mean of its neighbours, divided by the samples' norm: the
-# carried remainder of a converter changes single samples by a count, which is no glitch.
+# Smallest distance of a glitch from the mean of its neighbours, divided by the samples' norm. A
+# change of a sample by one count, as by the carried remainder of a converter, is no glitch.
 _LEAST = 0.02
 # Smallest number of samples in which glitches are searched; fewer do not determine the noise.
 _FEWEST = 30
@@ -66,7 +66,7 @@ def spread_of_variances(cells: Cells, plausible: Bools, level: Floats) -> Floats
     Return the spread of the variances of cells at rest, relative to white noise, per axis: the
     ratio of the 1 - 1e-11 quantile to the 0.1 quantile, divided by this ratio for white noise.
     With a correlation r of successive samples the effective number of samples is (1 - r) / (1 + r)
-    times their number, and the roughness is 1 - r times the mean variance. The mean variance
+    times their number, and the roughness is (1 - r) times the mean variance. The mean variance
     follows from the tenth percentile `level` of the variances and the effective number of samples.
     """
     n_free = float(np.median(cells.count[plausible])) - 1.0
@@ -87,9 +87,9 @@ def spread_of_variances(cells: Cells, plausible: Bools, level: Floats) -> Floats
 def roughest_at_rest(cells: Cells, quiet: Bools, is_coloured: Bools, ratio: float) -> Floats:
     """
     Return the largest roughness of a cell at rest, per axis; infinite for white noise. `ratio`:
-    largest variance at rest / noise variance. Coloured noise hides a step in mean and variance,
-    but not in the changes from sample to sample. The roughness is taken as chi-square distributed,
-    with the degrees of freedom that give the ratio of its tenth percentile to its median.
+    largest variance at rest / noise variance. In coloured noise a step does not show in mean and
+    variance, but in the changes from sample to sample. The roughness is taken as chi-square
+    distributed, with degrees of freedom by the ratio of its tenth percentile to its median.
     """
     result = np.full(3, np.inf)
     for axis in np.flatnonzero(is_coloured) if quiet.any() else ():

@@ -26,11 +26,11 @@ from .topics import PLAIN, Topics, shown
 KELVINS = (180.0, 480.0)
 _RAMP_WINDOW_S = 120.0  # time over which the rate of a ramp is averaged [s]
 _CELL_S, _MIN_REST_S = 0.5, 3.0  # lengths of a cell and of the shortest still interval [s]
-_GAP_INTERVALS = 5.0  # shortest gap, in median intervals between samples
+_GAP_INTERVALS = 5.0  # shortest gap between samples / median interval in the first block
 # Largest share of samples of exactly 0 that is taken for glitches, and share of messages marked as
 # without acceleration above which the whole recording counts as without acceleration.
 _GLITCH_SHARE, _FAULT_SHARE = 0.01, 0.5
-# Ratio of |a| at rest to gravity: range with gravity, upper limit if gravity is subtracted.
+# Ratio |a| / gravity at rest: range if a contains gravity, upper limit if gravity is subtracted.
 _WITH_GRAVITY, _WITHOUT_GRAVITY = (0.8, 1.25), 0.3
 _NO_SAMPLES = (
     'no accelerometer samples: record accel/counts or imu/uncompensated, or name another topic '
@@ -58,7 +58,7 @@ class Survey:
     info: RecordingInfo
     n: int
     duration_s: float
-    rate_hz: float  # inverse of the median interval between samples
+    rate_hz: float  # inverse of the median interval between samples of the first block
     n_still: int
     still_s: float
     thermometers: Mapping[str, ThermometerSurvey]
@@ -165,7 +165,7 @@ def survey_recording(
 
 @dataclass
 class _Clock:
-    """Statistics of the stamps so far: median interval, gaps, stamps that do not rise."""
+    """Statistics of the stamps so far: first block's median interval, gaps, stamps not rising."""
 
     n: int = 0
     first_ns: int = 0
@@ -184,7 +184,7 @@ class _Clock:
         later = stamp_ns[not self.n :]
         steps = np.diff(later, prepend=self.last_ns)
         self.n, self.last_ns = self.n + len(stamp_ns), int(stamp_ns[-1])
-        # After a backward step by an hour or less, samples are left out until stamps are new.
+        # After a backward step by an hour or less, samples up to the newest stamp are left out.
         restarts = np.flatnonzero(steps < -LONGEST_PAUSE_NS)
         self.n_restarts += len(restarts)
         for number, part in enumerate(np.split(later, restarts)):
@@ -200,7 +200,7 @@ class _Clock:
         self.longest_gap_s = max(self.longest_gap_s, float(np.max(gaps, initial=0)) * 1e-9)
 
     def findings(self) -> list[str]:
-        """List the kinds of stamps that do not rise, and the gaps."""
+        """List the gaps between samples, and the numbers of stamps that do not rise."""
         texts = {
             f'samples with a stamp not later than an earlier stamp: {self.n_backwards}; these '
             'samples are left out': self.n_backwards,

@@ -83,7 +83,7 @@ class RecordingReader(ExitStack):
                 raise RecordingError(f'cannot be opened: {error.strerror}', path) from error
             raise
         self._part = topics.part
-        #: Time from the bag's first sample to the selected part's [s]; 0 before both are read.
+        #: Time from the first sample of the bag to that of the selected part [s]; 0 until read.
         self.since_s = 0.0
         self.apart = ''  # warning about stamps that are all equal, or of a second clock
 
@@ -97,7 +97,7 @@ class RecordingReader(ExitStack):
                 raise RecordingError(error.message, key=shown(f'{topic}:{path}')) from error
 
     def _open(self, path: Path) -> RecordingInfo:
-        """Open the files; files that rosbag2 has compressed as a whole are expanded before."""
+        """Open the files; first expand files that rosbag2 has compressed as a whole."""
         described = _described(path)
         folder = ''
         if described.compression == 'file':

@@ -57,7 +57,7 @@ class Messages:
 
     @classmethod
     def of_rows(cls, rows: Bytes, channel: NDArray[np.uint16], log_ns: Ints) -> Messages:
-        """Take the messages from rows of bytes, shape (n, size)."""
+        """Make messages of rows of bytes, shape (n, size), a message per row."""
         size = np.full(len(rows), rows.shape[1])
         return cls(rows.ravel(), np.cumsum(size) - size, size, channel, log_ns)
 
@@ -71,7 +71,7 @@ class Messages:
             yield data[at : at + size]
 
     def take(self, which: Ints | Bools | slice) -> Messages:
-        """Select messages; the result shares `data`."""
+        """Select messages; the result shares the bytes in `data`."""
         return Messages(
             self.data, self.start[which], self.size[which], self.channel[which], self.log_ns[which]
         )

@@ -4,11 +4,11 @@
 Owns still intervals: sums samples in short cells (count, mean, variance) and finds still cells.
 
 Two tests are relative to the noise of the bag's quiet cells: the variance inside a cell
-(vibration, handling) and the step between adjacent cells (a turn, a knock). A step starts a new
-interval, because a tilt by a microradian already changes a sample by a micro-g. Temperature also
-tilts a unit at rest, so a steady change over several cells of at most 50 micro-g/s is a drift and
-not a step. Two tests have absolute limits, because the quietest tenth of a flight is not a rest:
-at rest the sd of samples is below `still_sd`, and the angular rate within 1 deg/s of its median.
+(vibration, handling) and the step of the mean between adjacent cells (a turn, a knock). A step
+starts a new interval, because a tilt by a microradian changes a sample by a micro-g. Temperature
+tilts a unit at rest, too: a steady change of the mean by at most 50 micro-g/s in several cells is
+a drift, no step. Two tests have absolute limits, as the quietest tenth of a flight is not a rest:
+at rest the sd of samples is below `still_sd`, the angular rate within 1 deg/s of its median.
 """
 
 from collections.abc import Sequence
@@ -25,8 +25,8 @@ from .noise import is_glitch, roughest_at_rest, spread_of_variances
 VARIANCE_RATIO = 4.0
 #: Largest sd of samples at rest [g]: above the noise of any sensor, below that of most flights.
 STILL_SD = 0.05
-# Largest sd of the angular rate in a cell at rest, and largest difference of a cell's mean rate
-# from the bias of the rate [rad/s], interpolated between medians over `_LEVEL_S` [s].
+# Limits of the angular rate in a cell at rest [rad/s]: sd, and difference of the mean rate from
+# the rate's bias, which is interpolated between medians over `_LEVEL_S` [s].
 _STILL_RATE_SD, _STILL_RATE = np.radians(2.0), np.radians(1.0)
 _LEVEL_S = 120.0
 # `without_rotation` subtracts from the angular rate its median over this time [s].
@@ -35,8 +35,8 @@ _ROTATION_S = 10.0
 _STEP_SDS = 8.0
 # Number of steps between cells whose median is the drift; largest drift [g/s].
 _DRIFT_STEPS, _DRIFT = 9, 5e-5
-# Number of samples searched for a quantum; smallest number of changes that show the quantum if all
-# are whole multiples of the smallest change.
+# Number of samples searched for a quantum; smallest number of changes from sample to sample that
+# show a quantum if all changes are whole multiples of the smallest change.
 _QUANTUM_SAMPLES, _STEPS_NEEDED = 20000, 10
 STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # numbers of windows a cell may fill at low sample rates
 _LONGEST_CELL_NS = 86400e9  # limit of a cell's length, for wrong stamps [ns]
@@ -54,11 +54,11 @@ class Cells:
     `start_ns` and `end_ns` are the stamps of the first and last sample of the bag; `time` is the
     mean time of a cell's samples since `start_ns` [s]; `index` the cell's number on the time grid.
     Samples that are not finite or whose stamp does not rise are dropped, as are glitches, see
-    `is_glitch`. `n_repeated` counts the samples with the stamp of the sample before. `quantum` is
+    `is_glitch`. `n_repeated` counts samples with the same stamp as the sample before. `quantum` is
     the step between the possible values of the samples, or 0 if unknown; `middle` is 32768 for
     unsigned 16-bit words, else 0; rates are in rad/s. `roughness` is half the mean square change
-    from sample to sample, which equals the variance for white noise; `seam` is the change from the
-    last sample of the adjacent cell before to a cell's first sample, 0 after a gap.
+    from sample to sample, which equals the variance for white noise; `seam` is a cell's first
+    sample less the last sample of the cell before, 0 after a gap.
     """
 
     start_ns: int
@@ -90,7 +90,7 @@ class Cells:
 class CellAccumulator:
     """
     Reduces streamed samples to cells of `cell_s`, or of `least` samples if these last longer.
-    Whole cells fill a window of `window_s`, or up to 60 windows if a cell exceeds a window.
+    A whole number of cells fills a window of `window_s` or, if cells last longer, 2 to 60 windows.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class CellAccumulator:
         self._last = np.zeros((0, 3))  # last sample of the previous block
         self._shift = np.zeros(3)
         # Row of a cell: its number, number of samples, sums of times, samples and their squares;
-        # change from the cell before; sum of squared changes. The last cell may get more samples.
+        # change from the cell before; sum of squared changes. The last cell may grow.
         self._sums: list[Floats] = [np.empty((0, 15))]
         self._n_dropped = self._n_saturated = self._n_glitches = self._n_repeated = 0
         self._n_looked_at = 0
@@ -164,7 +164,7 @@ class CellAccumulator:
     def cells(self) -> Cells:
         """Return all cells so far, including the unfinished last cell."""
         sums = np.concatenate(self._sums)
-        self._sums = [sums]  # join earlier sums only once
+        self._sums = [sums]  # later calls then only add the rows of new cells
         index, count = sums[:, 0].astype(np.int64), sums[:, 1]
         total, square = np.split(sums[:, 3:-6], 2, axis=1)
         n_free = np.maximum(count[:, None] - 1.0, 1.0)
@@ -200,8 +200,8 @@ class CellAccumulator:
         step, between = float(np.median(steps)), 0.0
         gaps = steps[steps > 10.0 * step]
         if gaps.sum() > 0.5 * steps.sum():
-            # A polled buffer gives bursts of samples at a constant interval below 5 s; a cell
-            # then has two bursts. Pauses between positions held by hand are irregular or longer.
+            # A driver that polls a buffer sends bursts at a constant interval below 5 s: a cell is
+            # two intervals or longer. Pauses between positions by hand are irregular or over 5 s.
             usual = float(np.median(gaps))
             is_regular = np.mean(np.abs(gaps - usual) < 0.2 * usual) > 0.9
             if is_regular and usual < 5e9:
@@ -240,7 +240,7 @@ class CellAccumulator:
 
 
 def widened(full_scale: float, samples: Floats) -> float:
-    """Return `full_scale`, or that of 24- or 32-bit words if most samples exceed 65536."""
+    """Return `full_scale`, or 2^23 - 1 or 2^31 - 1 counts if most samples exceed 65536."""
     size = np.max(np.abs(samples), axis=1) if len(samples) else np.zeros(1)
     if np.median(size) < 2.0 * _WORD:
         return full_scale
@@ -248,7 +248,7 @@ def widened(full_scale: float, samples: Floats) -> float:
 
 
 def _part_of(window_s: float, least: float) -> float:
-    """Return a cell length [ns] of which whole cells fill 1 to 60 windows, or `least` [ns]."""
+    """Return a cell length [ns] of which a multiple is 1 to 60 windows, or else `least`."""
     for stretch in STRETCHES:
         n_cells = int(stretch * window_s * 1e9 / least * (1.0 + 1e-6))
         if n_cells:
@@ -265,12 +265,12 @@ def _quantum_of(samples: Floats, few: list[Floats]) -> Floats:
     for axis in range(3):
         changes = np.abs(np.diff(samples[:, axis]))
         changes = np.sort(np.concatenate((few[axis], changes[changes > 0.0])))
-        # One or two changes may be turns of the unit: wait for further changes.
+        # One or two changes from sample to sample may be turns of the unit: wait for more changes.
         few[axis] = changes[: 3 * (len(changes) < 3)]
         if len(changes) < 3:
             continue
         # Changes by the same multiple of the quantum differ by rounding only. The smallest change
-        # is the quantum if the changes have few values, one value, or whole multiples of it only.
+        # is the quantum if all changes are its whole multiples, or take only a few values.
         n_levels = 1 + int(np.sum(np.diff(changes) > 0.1 * changes[0]))
         steps = changes / changes[0]
         is_whole = len(changes) >= _STEPS_NEEDED and (np.abs(steps - np.rint(steps)) < 0.1).all()
@@ -398,7 +398,7 @@ def _is_turning(cells: Cells) -> Bools:
 
 
 def _drift(cells: Cells, plausible: Bools) -> Floats:
-    """Return the drift at each step between cells: the median of nine steps, at most 50 ug/s."""
+    """Return the drift from cell to cell: the median of nine steps of the mean, up to 50 ug/s."""
     both = plausible[1:] & plausible[:-1] & (np.diff(cells.index) == 1)
     step = np.where(both[:, None], np.diff(cells.mean, axis=0), 0.0)
     half = _DRIFT_STEPS // 2
@@ -421,7 +421,7 @@ def _is_joined(cells: Cells, quiet: Bools, drift: Floats) -> Bools:
     spread = np.minimum(spread, STILL_SD / _STEP_SDS * _one_g(cells))
     square = cells.variance / cells.count[:, None]
     noise = np.sqrt(np.maximum(2.0 * np.median(square[quiet], axis=0), square[1:] + square[:-1]))
-    # Samples that are mostly equal change by a whole quantum without a knock.
+    # If most samples are equal, a change by one quantum is no sign of a knock.
     is_stuck = np.median(cells.variance[quiet], axis=0) < (_STUCK * cells.quantum) ** 2
     change = np.where(is_stuck, 1.1 * cells.quantum, 0.0)
     limit = np.maximum(_STEP_SDS * np.maximum(spread, noise), change)

@@ -87,10 +87,10 @@ class Topics:
     """
     Topics of the inputs in a bag, the choice of counts or Imu, and the part to read.
     A name matches with or without its leading slash and, if only one topic fits, with any
-    namespace. If no topic has the default name of an input (not `case`), the bag's only topic of
-    the input's type is used: an Imu, preferably imu/data_raw, or else counts. Thermometers besides
-    board and case: `further`, and ``temperature/<name>`` in the board topic's namespace. The
-    reading of a thermometer may be a field, ``TOPIC:FIELD``, as for ``ros2 topic echo --field``.
+    namespace. If no topic has the default name of an input other than `case`, the only topic of
+    the input's type is used; samples: of an Imu (imu/data_raw first), else of counts. Thermometers
+    besides board and case: `further`, and ``temperature/<name>`` in the board topic's namespace.
+    A thermometer's reading may be a field, ``TOPIC:FIELD``, as for ``ros2 topic echo --field``.
     """
 
     counts: str = COUNTS.name
@@ -99,7 +99,7 @@ class Topics:
     case: str = CASE.name
     further: Mapping[str, str] = field(default_factory=dict)
     part: BagPart = WHOLE
-    input: Input = 'auto'  # 'auto' prefers counts to an Imu
+    input: Input = 'auto'  # 'auto': counts, if a topic has their name, else an Imu
 
     @classmethod
     def named(cls, names: Mapping[str, str], **others: Any) -> 'Topics':
@@ -176,7 +176,7 @@ def shown(name: str) -> str:
 
 
 def choice_note(name: str, key: str, wanted: str, among: str) -> str:
-    """Return the note that a topic was chosen by its type; '' if it has the wanted name."""
+    """Return the note that a topic was chosen by its type; '' if its name is the wanted one."""
     if is_called(name, split_field(wanted)[0]):
         return ''
     return f'{shown(name)}, its {among} {_TYPES[key].rpartition("/")[2]}, is taken for {key}'
@@ -254,7 +254,7 @@ def _candidates(
         if len(only) == 1:
             yield key, only[0]
         if of_type and key == 'imu':
-            return  # with several Imu topics, do not choose counts instead
+            return  # the choice between several Imu topics is left to the user: do not try counts
 
 
 def of_kind(present: Present, kind: str) -> list[str]:
@@ -287,7 +287,7 @@ def _text_of_unnamed(present: Present, board: str, taken: Collection[str]) -> st
 def _further(
     present: Present, topics: Topics, topics_of: Mapping[Role, str], *, is_read: bool
 ) -> dict[str, str]:
-    """Find the thermometers `topics.further`, and those in the namespace of board or case."""
+    """Find `topics.further`, and further thermometers in the namespace of board or case."""
     both = {}
     for sensor, wanted in topics.further.items():
         name = _match(present, wanted, thermometer(sensor))

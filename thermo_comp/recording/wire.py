@@ -3,7 +3,7 @@
 """
 Owns the serialized layout of stamped messages: decodes batches to blocks, and encodes columns.
 
-All three input types are a std_msgs/Header followed by float64 numbers alone. In CDR::
+Vector3Stamped, Imu and Temperature consist of a std_msgs/Header and float64 numbers. In CDR::
 
     0   encapsulation: 00, endianness (0 big, 1 little), options
     4   stamp: int32 seconds, uint32 nanoseconds
@@ -152,7 +152,7 @@ def encode_stamped(
     head = pack('<BBHiII', 0, 1, 0, 0, 0, len(text)) + text
     body = 4 + (len(head) + 3) // 8 * 8
     row = np.frombuffer(bytearray(head.ljust(body, b'\0') + bytes(8 * n_numbers)), np.uint8)
-    # `row` is copied for each message, so write values equal in all messages into `row` once.
+    # Values that are equal in all messages are written once, into `row`, before `row` is copied.
     for column, values in pieces:
         if values.ndim == 1:
             row[body:].view('<f8')[column : column + len(values)] = values

@@ -86,8 +86,8 @@ class AxisOverTemperature(NamedTuple):
 
     Cells of a row, as rounded texts: soak or ramp; temperature [degC]; bias, its expanded
     uncertainty and its deviation [micro-g]; scale relative to that at the reference temperature,
-    its expanded uncertainty and its deviation [ppm]. A deviation is the bias or scale less a line
-    that has this slope and passes through the value in a soak at the reference temperature.
+    its expanded uncertainty and its deviation [ppm]. A deviation is the bias or scale less a
+    straight line of the fitted slope through the value in a soak at the reference temperature.
     """
 
     axis: str
@@ -107,7 +107,7 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
     claimed = noise
     if calibration.has_uncertainty:
         x, y, z = (windows.force / np.linalg.norm(windows.force, axis=1, keepdims=True)).T
-        # Derivatives of |f| = g w.r.t. M[1][0], M[2][0] and M[2][1].
+        # Derivatives of |f| by M[1][0], M[2][0] and M[2][1] at |f| = g.
         by_element = np.stack((x * y, x * z, y * z)) * windows.gravity
         attitude = _rms(np.linalg.norm(by_element.T * calibration.misalignment_sd, axis=1))
         claimed = _rms(windows.claimed_sd)
@@ -127,13 +127,13 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
         Contribution('gravity', 'B', gravity, info.gravity.source or in_fit),
         Contribution('attitude', 'A', attitude, 'uncertainty of the misalignment of the axes'),
         Contribution('thermometers', 'B', drift, slope),
-        Contribution('model', 'A', model, 'posterior at the judged windows, without misalignment'),
+        Contribution('model', 'A', model, 'claimed sd of |f| in excess of noise and attitude'),
         Contribution('repeatability', 'A', excess, beyond),
     )
 
 
 def unclaimed_gravity_sd(evidence: Evidence, info: CertificateInfo) -> float | None:
-    """Return the uncertainty of gravity that the covariance lacks [m/s^2]; None if not stated."""
+    """Return the sd of gravity beyond that in the covariance [m/s^2]; None if not stated."""
     stated = info.gravity.standard_uncertainty_m_s2
     if stated is None:
         return 0.0 if evidence.gravity_sd else None
@@ -206,8 +206,8 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
         value, sd = evaluate(calibration, program, at)[2:]
         off = value - np.outer(at - calibration.reference_temperature_c, slope)
         value[:, :3] += bias_0 / MICRO_G
-        # If U is withheld, its part without gravity sets the digits of value and deviation; if the
-        # calibration states no uncertainty, the largest values are printed with 4 digits.
+        # If gravity has no stated sd, value and deviation are rounded by the uncertainty without
+        # gravity; if the calibration states no uncertainty, the largest values have 4 digits.
         largest = np.maximum(np.abs(value).max(axis=0), 1e-3)
         four_digits = 10.0 ** (np.floor(np.log10(largest)) - 2.0)
         digits = np.where(known * sd > 0.0, known * sd, four_digits)
@@ -227,7 +227,7 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
 
 
 def _gravity_part(evidence: Evidence, info: CertificateInfo) -> float:
-    """Return the scale's relative uncertainty due to gravity; NaN if gravity's is not stated."""
+    """Return the scale's relative uncertainty due to gravity; NaN if gravity has no stated sd."""
     sd = unclaimed_gravity_sd(evidence, info)
     if sd is None or evidence.calibration is None:
         return np.nan
@@ -248,9 +248,9 @@ def conformity(evidence: Evidence) -> tuple[str, str]:
     return (
         f'The unit {does} to the limit of {limit} µg.',
         'Rule: simple acceptance. Within the calibrated ranges the RMS of |f| − g of each regime '
-        'and, if known, on positions left out of the fit is at most the limit, and the overall '
-        'RMS of |f| − g is below that without correction, if the correction depends on '
-        'temperature; the uncertainty is not subtracted from the limit (guard band 0).',
+        'and, if known, on positions left out of the fit is at most the limit. If the correction '
+        'depends on temperature, the overall RMS of |f| − g is below that without correction. '
+        'The uncertainty is not subtracted from the limit (guard band 0).',
     )
 
 
@@ -266,7 +266,7 @@ def _rms(values: Floats) -> float:
 
 
 def programs(calibration: Calibration) -> list[Program]:
-    """Return a soak and, if bias or scale depend on the rate, ramps at half the largest rates."""
+    """List a soak and, if the correction differs in ramps, ramps at half the largest rates."""
     static, dynamic = calibration.regime_sets()
     result = [Program('soak', static, 0.0)]
     if calibration.response or static != dynamic:

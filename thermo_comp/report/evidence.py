@@ -52,7 +52,7 @@ _MOST_POINTS = 4000
 
 @dataclass(frozen=True)
 class Position:
-    """A still position: direction of the force in the output frame, RMS |f| - g per correction."""
+    """A still position: force direction in the output frame, RMS of |f| - g by correction."""
 
     number: int
     bag: int
@@ -72,7 +72,7 @@ class Stretch(NamedTuple):
 
 @dataclass(frozen=True)
 class ShownBag:
-    """Rates, second derivative (NaN until settled) and regimes of a bag over time [K, s]."""
+    """A bag's regimes, temperature rates and second derivative (NaN until settled) [K, s]."""
 
     index: int
     bag: ReducedBag
@@ -149,7 +149,7 @@ class Evidence:
 
     @property
     def level(self) -> Literal['good', 'reserved', 'poor', 'open']:
-        """Good: valid; reserved: reservations or large sd; poor: not valid; open: no verdict."""
+        """Verdict as a word; 'reserved': valid, with reservations or a large claimed sd."""
         if self.judgement is None or self.judgement.kind in (Verdict.OUTSIDE, Verdict.NO_CLAIM):
             return 'open'
         if not self.judgement.is_valid:
@@ -193,7 +193,7 @@ class Evidence:
 
     @cached_property
     def positions(self) -> tuple[Position, ...]:
-        """The still positions, with attitudes computed from the last entry of `forces`."""
+        """The still positions, with attitudes from the best known correction in `forces`."""
         windows = self.windows
         if windows is None or not self.forces:
             return ()
@@ -223,7 +223,7 @@ class Evidence:
         return text if n == n_rests else f'{text} ({counted(n_rests, "rest")})'
 
     def axis_residuals(self) -> dict[str, Floats]:
-        """Return the force less the known |f| along the position's mean direction, (n, 3)."""
+        """Return the force less the mean direction of the position times the known |f|, (n, 3)."""
         windows = self.windows
         if windows is None or self.gravity is None or not self.positions:
             return {}
@@ -282,7 +282,7 @@ def evidence_of_bags(
 
 
 def evidence_of_fit(result: FitResult, gravity_sd: float = 0.0) -> Evidence:
-    """Return the evidence of a fit on its bags; `gravity_sd`: given to the fit [m/s^2]."""
+    """Return the evidence of a fit on its bags; `gravity_sd`: the fit's sd of gravity [m/s^2]."""
     rests = [(bag.source.name, rest.start_ns) for bag in result.bags for rest in bag.intervals]
     left_out = {(place.source, place.start_ns): place.left_out_rms for place in result.positions}
     against = [f'{note.name}: {note.message}' for note in result.findings if _is_reservation(note)]
@@ -335,7 +335,7 @@ def span_of(bag: ReducedBag) -> tuple[int, float]:
 def widest(bags: Sequence[ReducedBag]) -> int:
     """Return the index of the bag with the widest range of T_board; if several, the longest."""
     spans = [float(np.ptp(bag.board.value)) if len(bag.board.value) else 0.0 for bag in bags]
-    # Spans within 5 % and lengths within a minute count as equal; of equal bags take the first.
+    # T_board ranges within 5 % count as equal, as do durations within 1 min: the first bag wins.
     candidates = [i for i, span in enumerate(spans) if span >= 0.95 * max(spans)]
     return max(candidates, key=lambda i: (round((bags[i].end_ns - bags[i].start_ns) / 60e9), -i))
 
@@ -353,7 +353,7 @@ def shown_bag(bag: ReducedBag, index: int, detector: DetectorSettings) -> ShownB
         rows.append((b.rate, b.var_rate, c.rate, c.var_rate, *lead.acceleration))
         flags.append((tracker.detector.regime, tracker.detector.direction))
     time: Floats = np.array([stamp_ns - start_ns for _, stamp_ns, _ in readings]) * 1e-9
-    # The last of several regimes at one time applies; equal successive regimes are joined.
+    # Of several regimes at one time the last one applies; equal successive regimes are joined.
     state_at = {
         0.0: (Regime.UNKNOWN, 0),
         **dict(zip(np.clip(time, 0.0, end).tolist(), flags, strict=True)),
@@ -372,7 +372,7 @@ def shown_bag(bag: ReducedBag, index: int, detector: DetectorSettings) -> ShownB
 
 
 def _settled(value: Floats, variance: Floats) -> Floats:
-    """Set an estimate to NaN until its sd has fallen to three times the median sd."""
+    """Replace an estimate by NaN until its sd has fallen to three times its median sd."""
     known = np.isfinite(value) & np.isfinite(variance)
     if not known.any():
         return np.full(len(value), np.nan)

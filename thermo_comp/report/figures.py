@@ -26,7 +26,7 @@ from .certificate import Curve, curves, slopes
 from .evidence import CHOSEN, LEFT_OUT, RAW, Evidence, Position, ShownBag, required
 from .style import minus, number
 
-# Length of the part at the start of a position whose mean reading counts as zero drift [s].
+# Time from the start of a position over which the mean reading is the zero of drift [s].
 _ZERO_S = 120.0
 _SHADE = '#E9E9E9'
 # Diameter of the ring of the position with the largest residual [pt].
@@ -156,14 +156,14 @@ def _rows(evidence: Evidence) -> Bools:
 
 
 def _plot(axes: Axes, evidence: Evidence, value: Floats, unit: float, **line: Any) -> None:
-    """Draw a value of the shown bag's windows over time, with gaps between positions."""
+    """Draw one value per window of the shown bag over time, with gaps between positions."""
     windows, rows = required(evidence.windows), _rows(evidence)
     time, value = style.broken(windows.time[rows], value[rows], windows.position[rows])
     axes.plot(time / unit, value, **line)
 
 
 def _drift(evidence: Evidence) -> tuple[Floats, str]:
-    """Return the change of the readings in each position, shape (n, 3), and its unit."""
+    """Return the drift of the readings from each position's start, shape (n, 3), and its unit."""
     windows = evidence.windows
     if windows is None or not _rows(evidence).any():
         return np.zeros((0, 3)), ''
@@ -184,7 +184,7 @@ def _draw_flag(axes: Axes, shown: ShownBag, unit: float) -> None:
         if stretch.regime == Regime.UNKNOWN:
             axes.axvspan(*span, fill=False, hatch='---', edgecolor='#999999', lw=0)
             continue
-        level = float(stretch.direction)  # 0 only in the static regime
+        level = float(stretch.direction)  # +1 heating, -1 cooling, 0 static regime
         times += span
         levels += [level, level]
         if level:
@@ -334,7 +334,7 @@ def draw_rates(evidence: Evidence) -> Figure:
 def _draw_less_line(
     axes: Axes, calibration: Calibration, drawn: list[Curve], k: int, unit: str
 ) -> None:
-    """Draw column `k` of the curves, with bands, less the straight line through the soak."""
+    """Draw column `k` of the curves, with bands, less the line fitted to the curve of the soak."""
     reference, slope = calibration.reference_temperature_c, slopes(drawn[0])[k]
     widest = 0.0
     for curve in drawn:
@@ -375,7 +375,7 @@ def soak_measurements(evidence: Evidence) -> tuple[Floats, Floats]:
 
 
 def draw_shares(curves: Mapping[str, Floats]) -> Figure:
-    """Draw the percentage of units up to each RMS residual [micro-g], for each section."""
+    """Draw the cumulative distribution of the units' RMS residual [micro-g], for each section."""
     figure = style.new_figure(2.6)
     axes = figure.subplots()
     drawn = {name: np.sort(values[values > 0.0]) for name, values in curves.items()}

@@ -3,7 +3,7 @@
 """
 Owns the conversion of serialized samples to serialized Imu messages, without rclpy's classes.
 
-Samples are read, and an Imu is written, at fixed offsets of their plain form, little-endian CDR: 4
+Samples are read, and an Imu is written, at fixed offsets in plain CDR, which is little-endian: 4
 bytes of encapsulation, int32 seconds, uint32 nanoseconds, uint32 length of the `frame_id` with its
 final NUL, the string, and, at the next multiple of 8 from the end of the encapsulation, float64
 values. A message in another form, such as big-endian, is first rewritten by rclpy.
@@ -18,9 +18,9 @@ from typing import Any
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu, Temperature
 
-#: Compensates a sample: from stamp [ns], x, y, z to force and covariance; None if it is dropped.
+#: Compensates a sample: from stamp [ns], x, y, z to force and covariance; None: sample dropped.
 Process = Callable[[int, float, float, float], 'tuple[float, ...] | None']
-#: Corrects the angular rate of a sample: from stamp and rate to rate and variances.
+#: Corrects the angular rate of a sample: from stamp [ns], x, y, z to rate and its variances.
 CorrectRate = Callable[[int, float, float, float], 'tuple[float, ...]']
 
 #: Longest message read [bytes]; an Imu with the longest frame name is shorter.
@@ -33,7 +33,7 @@ _HEADER = struct.Struct('<4siI4x')
 _PASSED = 8 * 25
 _NO_GYRO = struct.Struct('<25d').pack(*[0.0] * 3, 1.0, -1.0, *[0.0] * 11, -1.0, *[0.0] * 8)
 #: Offset of the angular rate in the `_PASSED` bytes; formats of the rate with the first element of
-#: its covariance, and with all elements.
+#: its covariance, and with all nine elements.
 _RATE_AT = 8 * 13
 _RATE_IN, _RATE_OUT = struct.Struct('<4d'), struct.Struct('<12d')
 _CELSIUS = struct.Struct('<d')
@@ -47,7 +47,7 @@ class Traffic:
     n_unpublished: int = 0  # output messages that the middleware did not accept
     n_malformed: int = 0  # messages that could not be read
     n_flags: int = 0  # regime flags published, one for each reading from which the regime follows
-    n_fallback: int = 0  # samples that rclpy had to convert to the plain form
+    n_fallback: int = 0  # samples that rclpy had to convert to plain CDR
     n_contested: int = 0  # messages dropped because more than one publisher may have sent them
 
 
@@ -100,7 +100,7 @@ class SampleConverter:
         )  # fmt: skip
 
     def _learn(self, data: bytes) -> bytes:
-        """Store a message's layout; return its plain form, empty bytes if it is unreadable."""
+        """Store a message's layout; return the message as plain CDR, b'' if it is unreadable."""
         is_imu = self._kind is Imu
         skip, n_after = (_PASSED, 72) if is_imu else (0, 0)
         size = skip + 24 + n_after
@@ -131,7 +131,7 @@ def read_temperature(data: bytes) -> tuple[int, float] | None:
 
 
 def _values_at(data: bytes, size: int) -> int:
-    """Return the offset of the `size` bytes of values of a message; 0 if not in plain form."""
+    """Return the offset of the `size` bytes of numbers in a message; 0 unless in plain CDR."""
     if not 16 < len(data) <= _LONGEST_MESSAGE or data[:4] != _ENCAPSULATION:
         return 0
     length = int.from_bytes(data[12:16], 'little')
@@ -146,7 +146,7 @@ def _values_at(data: bytes, size: int) -> int:
 
 
 def _plain(data: bytes, size: int, message_type: Any) -> tuple[bytes, int]:
-    """Return a message in plain form, by rclpy if needed, and the offset of its values or 0."""
+    """Return a message as plain CDR, by rclpy if needed, and the offset of its numbers or 0."""
     start = _values_at(data, size)
     if not start and len(data) <= _LONGEST_MESSAGE:
         # RuntimeError: rclpy cannot read the message. ValueError: a frame name is not UTF-8.

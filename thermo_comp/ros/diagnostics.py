@@ -33,9 +33,9 @@ from .waitloop import WaitLoop
 
 # Time without samples until waiting readings are used [s]; Fast DDS may deliver samples 3 s late.
 IDLE_S = 5.0
-#: Readings stamped later than the samples by more than this time use another clock [s].
+#: A temperature reading stamped later than the samples by over this time [s] has another clock.
 AHEAD_S = 5.0
-#: Samples have stopped if none arrives for the larger of two times [cycles], [s].
+#: Samples have stopped if none arrives for this number of conversion cycles and this time [s].
 SILENT_CYCLES, SILENT_S = 5.0, 0.5
 #: Largest error of |f| at rest without a warning, in standard deviations of the error.
 GRAVITY_SIGMAS = 5.0
@@ -63,7 +63,7 @@ _FAULTS = {
     Fault.STILL: 'stands still (equal readings), its standard deviation grows',
     Fault.FROZEN: 'frozen (equal readings) while the other temperature changes: not used',
     Fault.STEP: 'jumped by {:+.2f} K; its readings are not used',
-    Fault.COPY: 'repeats the readings of the board: is one topic given for both?',
+    Fault.COPY: "repeats the board thermometer's readings: do both read one topic?",
     Fault.LOOSE: 'is {:.1f} K farther from that of the case than in the fit: thermometer loose?',
 }
 
@@ -105,8 +105,8 @@ class Reporter:
                 rate = new['n_in'] / passed_s
         self._before, self._before_ns = counts, status.stamp_ns
         findings = [*self._findings(), *findings_of(loaded, status, new, rate, silence_s)]
-        # If the calibration has no nonlinearity, the warning begins 1 g above 1.01 times gravity,
-        # where the unknown square term has an sd of 0.1 mg, and not at each vehicle acceleration.
+        # Vehicle accelerations give no warning: without nonlinearity in the calibration, warnings
+        # begin at 2.01 g, where the unknown square term has an sd of 0.1 mg.
         least = 0.0 if loaded.calibration.nonlinearity else STANDARD_GRAVITY
         if (over := self._force_excess()) > least:
             text = f'|f| {over:.3g} m/s^2 above the largest |f| of the fit: the covariance grows'
@@ -135,7 +135,7 @@ class Reporter:
                 log.error(message.message)
 
     def _force_excess(self) -> float:
-        """Return the excess of the last |f| over that of the fit, or over 1.01 g [m/s^2]."""
+        """Return by how much the last |f| exceeds the largest |f| of the fit or 1.01 g [m/s^2]."""
         last = self._relay.running.converter.last_result
         if last is None:
             return 0.0
@@ -338,5 +338,5 @@ def _all_well(loaded: LoadedCalibration, status: CompensatorStatus) -> str:
         reference = loaded.calibration.reference_temperature_c
         return f'constants of {reference:g} degC, not corrected for temperature'
     if status.regime == Regime.UNKNOWN:
-        return 'regime not known yet, the static set applies'
+        return 'regime not known yet, the static coefficients apply'
     return f'{status.regime.name.lower()} regime'

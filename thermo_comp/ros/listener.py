@@ -79,7 +79,7 @@ class LiveTopics:
             if is_over:
                 self._stack.close()
             waiting = self._received[:]
-            # Keep the messages that the receiving thread may have appended after the copy.
+            # Delete only copied messages: the receiving thread may have appended others since.
             del self._received[: len(waiting)]
             if waiting:
                 feeds = [Feed(k, *source) for k, source in enumerate(self._feeds.items())]

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the node `thermo_comp`, which turns samples and temperatures into force, flag and diagnostics.
+Owns the node `thermo_comp`: from samples and temperatures to force, regime flag and diagnostics.
 
 The output equals that of the offline replay of the same messages in the same order bit for bit.
 Parameters are checked when they are set, and applied between two wake-ups of the node's loop.
@@ -32,8 +32,8 @@ from .waitloop import WaitLoop, overrides
 
 NODE_NAME = 'thermo_comp'
 
-#: Pause after a wake-up [s], for best-effort samples at 7 kHz or more. The pause saves a third of
-#: the CPU time at 10 kHz, but would delay a sample at 5 kHz by more than the correction takes.
+#: Pause after a wake-up [s], for best-effort samples at 7 kHz or more. The pause saves a third
+#: of the CPU time at 10 kHz; at 5 kHz it would delay a sample by more than the correction takes.
 REST_S = 0.2e-3
 
 #: Time within which the process ends after a signal, even if a call hangs [s].

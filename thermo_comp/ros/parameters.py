@@ -5,8 +5,8 @@ Owns the node's parameters: their table, and the services that set them.
 
 The table of the parameters is `NodeConfig`. The node runs with one immutable `NodeConfig`; a
 change makes a new `NodeConfig` or is refused as a whole. A separate process reads files, while a
-thread waits for the process; then the node's loop starts to use the new `NodeConfig`. Requests are
-answered in order of arrival, but a request without a file does not wait for requests with files.
+thread waits for the process; then the node's loop starts to use the new `NodeConfig`. A queue of
+requests that set `calibration_file`, and a queue of all other requests, are served in parallel.
 """
 
 import math
@@ -30,7 +30,7 @@ from ..recording.topics import Topics, parse_name, read_names
 from ..text import LONGEST_SERIAL, one_line
 from .waitloop import WaitLoop, overrides
 
-#: Largest number of waiting requests, and of parameters in a request.
+#: Largest number of waiting requests with a `calibration_file`, and of parameters in a request.
 WAITING_LIMIT, PARAMETERS_LIMIT = 64, 256
 LONGEST_FRAME = 255  # longest frame name that may be set [bytes]
 _LONGEST_REASON = 1000  # longest reason of a refusal, which may quote the request [characters]
@@ -79,7 +79,7 @@ class NodeConfig:
     input: str = _parameter(
         'counts',
         'Input to compensate: accel/counts (Vector3Stamped) or imu/uncompensated (Imu). If '
-        '`topics` names one of the two at the start, that input is used.',
+        '`topics` names only counts or only imu, the start sets `input` to this name.',
         choices=('counts', 'imu'),
     )
     frame_id: str = _parameter(
@@ -107,9 +107,9 @@ class NodeConfig:
     )
     stuck_timeout: float = _parameter(
         _DEFAULTS.stuck_timeout_s,
-        'Time after which samples that repeat their values on all axes, or on one axis while the '
-        'others change or show their noise, are not published [s]; samples of three zeros are '
-        'dropped at once; 0: repeated values and zeros are published.',
+        'Longest repetition of equal readings that is published [s], on all axes, or on one axis '
+        'while the others change or show noise. Samples of three zeros are dropped at once. 0: '
+        'repetitions and zeros are published.',
         (0.0, 3600.0),
     )
     local_gravity: float = _parameter(
@@ -127,7 +127,7 @@ class NodeConfig:
     diagnostics_period: float = _parameter(1.0, 'Period of /diagnostics [s].', (0.01, 60.0))
 
     def compensator_config(self) -> CompensatorConfig:
-        """Return the settings of the compensator, whose names end in the unit."""
+        """Build the compensator's settings; their names are the parameters' plus a unit."""
         names = [field.name for field in fields(CompensatorConfig)]
         values = (getattr(self, name.removesuffix('_m_s2').removesuffix('_s')) for name in names)
         return CompensatorConfig(**dict(zip(names, values, strict=True)))
@@ -234,7 +234,7 @@ class ParameterRequests:
     ) -> None:
         self._loop, self._prepare, self._apply = loop, prepare, apply
         self._n_waiting = 0
-        # With two threads a request without a file does not wait for requests with files.
+        # A second thread answers requests without `calibration_file`, which read no file.
         self._slow, self._quick = (ThreadPoolExecutor(1, 'parameters') for _ in range(2))
         for service in loop.node.services:
             if service.srv_type in (srv.SetParameters, srv.SetParametersAtomically):
@@ -275,7 +275,7 @@ class ParameterRequests:
                 future = (self._slow if waits else self._quick).submit(self._read, group)
                 future.add_done_callback(lambda done: self._loop.call_soon(partial(end, done)))
             return
-        # The number of results is limited: to write a result takes as long as to read a parameter.
+        # Send at most `PARAMETERS_LIMIT` results: each takes as long as reading a parameter.
         results += [_refusal(reason)] * min(len(groups), PARAMETERS_LIMIT)
         respond()
 
@@ -299,7 +299,7 @@ class ParameterRequests:
             raise
 
     def _repeats_fixed_value(self, change: Parameter) -> bool:
-        """Whether a change sets a fixed parameter to its present value, as a loaded dump does."""
+        """Whether a fixed parameter is set to its present value, as by `ros2 param load`."""
         node = self._loop.node
         return bool(
             node.has_parameter(change.name)
@@ -318,7 +318,7 @@ def _reply(service: Service, request: Any, answer: Callable[[Any], None]) -> Non
 def read_parameter(message: ParameterMessage) -> Parameter:
     """Read a received parameter; integers become floats if the parameter is a float."""
     if not message.name:
-        # rclpy would treat the empty name as declared.
+        # rclpy would treat a parameter with an empty name as declared.
         raise ParameterError('a parameter without a name')
     try:
         given = Parameter.from_parameter_msg(message)

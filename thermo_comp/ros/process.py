@@ -33,9 +33,9 @@ def use_profile() -> None:
 
 class SignalWatch:
     """
-    Calls a stop function at the first signal; a second signal ends the process. The object must be
-    used in the main thread. A process that has not ended `ending_s` [s] after the call is ended by
-    `os._exit`.
+    Calls a stop function at the first signal; a second signal ends the process. A `SignalWatch`
+    must be used in the main thread. `os._exit` ends a process that still runs `ending_s` [s] after
+    the stop function has returned.
     """
 
     # A separate thread calls the stop function, because the interpreter runs no signal handlers
@@ -66,7 +66,7 @@ class SignalWatch:
         os.close(self._reader)
 
     def on_signal(self, stop: Callable[[], None]) -> None:
-        """Set the function that a signal calls; a signal that has arrived calls it at once."""
+        """Set the function that a signal calls; call it at once if a signal came before."""
         self._stop = stop
         if self._is_over:
             stop()

@@ -4,7 +4,7 @@
 Owns the reading of calibrations in a separate process, in parallel to the samples.
 
 A parser holds the interpreter lock for milliseconds at a time, so a thread would delay samples.
-If a file makes the process crash or hang, the node continues and refuses the file.
+If a file makes the reading process crash or hang, the node continues and refuses the file.
 """
 
 import ctypes

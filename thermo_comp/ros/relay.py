@@ -3,8 +3,8 @@
 """
 Owns the processing of samples in the node in order of arrival, whenever the loop wakes up.
 
-Messages do not identify their publisher. While several publishers may send on a topic, its
-messages are dropped; so is the first batch after a publisher left: the publisher may have sent it.
+Messages do not identify their publisher. While several publishers may send on a topic, the topic's
+messages are dropped, as is the first batch of messages after a publisher has left.
 """
 
 from bisect import bisect_left, bisect_right
@@ -29,7 +29,7 @@ from .reader import LoadedCalibration
 from .rest_log import BLOCK, RestKeeper
 from .waitloop import RawSubscription, RCLError, WaitLoop
 
-#: Without samples, a reading is used once a reading stamped at least this much later arrives [ns].
+#: While no samples come, a reading is used once another is stamped this much later [ns].
 IDLE_NS = 1_000_000_000
 
 # A received temperature: time of reception [ns]; thermometer, stamp [ns], degC.
@@ -181,13 +181,13 @@ class Relay:
             self.gather()
 
     def gather(self) -> None:
-        """Sum the samples that wait for the rest log."""
+        """Sum the samples since the last call, for the rest log."""
         if self.rests is not None and self.waiting:
             messages, self.waiting = self.waiting, []
             self.rests.gather(messages, self.running.loaded, self.running.compensator)
 
     def advance_without_samples(self, silence_ns: int) -> None:
-        """Use readings while no samples arrive, so that the regime flag is still published."""
+        """Use temperatures while no samples arrive, so that regime flags are still published."""
         if self._newest_reading_ns is None:
             return
         horizon_ns, compensator = self._newest_reading_ns - IDLE_NS, self.running.compensator
@@ -217,7 +217,7 @@ class Relay:
                 self._readings.append((received, (name, *reading)))
 
     def _relay_with_readings(self, messages: list[bytes], received_ns: list[int]) -> list[bytes]:
-        """Relay samples and readings by arrival; return the samples after the last reading."""
+        """Relay samples and readings as they arrived; return the samples after all readings."""
         start, push = 0, self.running.compensator.push
         self._readings.sort(key=itemgetter(0))
         n = bisect_right(self._readings, received_ns[-1], key=itemgetter(0))
@@ -259,7 +259,7 @@ class Relay:
             self.traffic.n_flags += 1
 
     def _count_unpublished(self) -> None:
-        """Count a message that the middleware refused; raise after the shutdown."""
+        """Count a message that the middleware refused; raise an error if ROS has shut down."""
         if not self._loop.node.context.ok():
             raise ExternalShutdownException
         self.traffic.n_unpublished += 1

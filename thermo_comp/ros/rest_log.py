@@ -26,15 +26,15 @@ from ..thermal.state import StateLayout
 from ..typing import Floats, Stamps
 from .reader import LoadedCalibration
 
-#: Number of messages in a summed block; a block is shorter if a report is due earlier.
+#: Number of messages that the rest log sums at a time; fewer if a report is due earlier.
 BLOCK = 1024
 #: Largest size of the file of a day, and of the folder [bytes]; a month takes at most 10 MB.
 DAY_BYTES, FOLDER_BYTES = 320_000, 64_000_000
 #: Smallest size of the files that are thinned if the folder is too large [bytes].
 _UNTHINNED_BYTES = 16_000
-#: Largest number of lines that wait for the disk.
+#: Largest number of lines that wait to be written to the disk.
 _WAITING = 1000
-#: Stamps before 2000-01-01 [ns] are times since the start of a driver, no dates: rests with such
+#: Stamps before 2000-01-01 [ns] are times since the start of a driver, not dates: rests with such
 #: stamps get the time of this computer.
 _EPOCH_NS = 946_684_800 * 10**9
 #: Smallest backward step of the stamps [ns] that begins a new recording.
@@ -42,7 +42,7 @@ _JUMP_NS = 10**9
 # First bytes of a message in little-endian CDR; offsets of counts, force and angular rate from the
 # end of a message [bytes].
 _PLAIN, _COUNTS, _FORCE, _RATE = (0, 1, 0, 0), -24, -96, -192
-_SHORTEST = {False: 44, True: 316}  # shortest message [bytes], by whether it is an Imu
+_SHORTEST = {False: 44, True: 316}  # length of the shortest message [bytes], by `is_imu`
 
 
 class RestLog:
@@ -66,7 +66,7 @@ class RestLog:
         self._thread.start()
 
     def put(self, stamp_ns: int, start: bytes, rest: bytes) -> None:
-        """Queue the line of a rest; `start` precedes it in a new file or after a changed start."""
+        """Queue the line of a rest, after that of its `start` if the file or the start is new."""
         day = np.datetime64(stamp_ns, 'ns').astype('datetime64[D]')
         try:
             self._lines.put_nowait((str(day), start, rest))
@@ -153,9 +153,9 @@ class RestKeeper:
     def gather(
         self, messages: list[bytes], loaded: LoadedCalibration, compensator: Compensator
     ) -> None:
-        """Sum messages that the compensator has processed; queue the rests that end in them."""
-        # All messages are summed with the present calibration, although those that arrived before
-        # a reload were corrected with the old calibration.
+        """Sum messages that the compensator has processed; queue the completed rests."""
+        # The rests of all messages are assigned to the present calibration, also of messages that
+        # were corrected with the old calibration before a reload.
         self._use(loaded, compensator)
         stamps, samples = samples_of(messages, is_imu=loaded.calibration.unit.input != 'counts')
         if not len(stamps):
@@ -209,9 +209,9 @@ class RestKeeper:
 
 
 def samples_of(messages: Sequence[bytes], *, is_imu: bool) -> tuple[Stamps, Floats]:
-    """Read stamps [ns] and samples of little-endian messages that have the last one's length."""
+    """Read stamps [ns], samples of little-endian messages whose length is that of the last."""
     size = len(messages[-1]) if messages else 0
-    # Shorter messages than those with an empty frame_id are malformed.
+    # A message shorter than one with an empty frame_id is malformed.
     if size < _SHORTEST[is_imu]:
         return np.zeros(0, np.int64), np.zeros((0, 3))
     content = b''.join([message for message in messages if len(message) == size])
@@ -222,7 +222,7 @@ def samples_of(messages: Sequence[bytes], *, is_imu: bool) -> tuple[Stamps, Floa
     at = size + (_FORCE if is_imu else _COUNTS)
     samples = rows[:, at : at + 24].view('<f8')
     if is_imu:
-        # An angular rate and the first element of its covariance, which is -1 without a rate.
+        # Angular rate and the first element of its covariance, which is -1 if there is no rate.
         rate = rows[:, size + _RATE : size + _RATE + 32].view('<f8')
         if (rate[:, 3] != -1.0).all():
             samples = np.hstack((samples, rate[:, :3]))

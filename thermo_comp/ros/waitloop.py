@@ -78,7 +78,7 @@ class Sources:
         """Return the index of the first message that is surely from the only active publisher."""
         was_contested, n_before, self._n_known = self.is_contested, self._n_known, n_known
         if n_known <= 1:
-            # The first batch after a publisher has left may hold messages of this publisher.
+            # The first messages taken after a publisher has left may be from this publisher.
             self.is_contested, self._number = False, numbers[-1]
             return len(numbers) if was_contested else 0
         if n_known > n_before:
@@ -117,7 +117,7 @@ class RawSubscription:
         self._newest_ns = 0
         #: Number of messages sent and not received, by the sequence numbers of one publisher.
         self.n_lost = 0
-        #: Mean interval between the messages of the last drain [ns].
+        #: Mean interval between the messages that were taken last [ns].
         self.interval_ns = 0
 
     def drain_single_source(self) -> tuple[list[bytes], list[int], int]:
@@ -146,7 +146,7 @@ class RawSubscription:
         self.interval_ns = (self._newest_ns - before_ns) // len(messages)
         before, self._sequence = self._sequence, numbers[-1]
         if before is not None and self._sequence is not None:
-            # A smaller sequence number comes from another publisher: no message is lost.
+            # A number below the previous number comes from another publisher: no message is lost.
             self.n_lost += max(0, self._sequence - before - len(messages))
         return messages, received_ns, numbers
 
@@ -196,7 +196,7 @@ class WaitLoop:
         self.node.destroy_subscription(raw.subscription)
 
     def call_soon(self, callback: Callable[[], None]) -> None:
-        """Queue a call in the loop's thread, one per wake-up; callable from any thread."""
+        """Queue a function that the loop's thread then calls; callable from any thread."""
         self._soon.append(callback)
         with suppress(InvalidHandle):
             self._guard.trigger()
@@ -268,7 +268,7 @@ class WaitLoop:
                     served = [self._guarded(serve) for serve in ready]
                     # After a request the next request may wait already: look again at once.
                     look_ns = 0 if any(served) else woken_ns + OTHERS_PERIOD_NS
-                # An interval of 0 means that the middleware gives no arrival times.
+                # The interval of messages is 0 if the middleware gives no arrival times.
                 if waking and 0 < waking.interval_ns < crowd_ns:
                     left_ns = woken_ns + rest_ns - now_ns()
                     if left_ns > 0:

@@ -42,7 +42,7 @@ _PROGRAMS = {
     'three-soaks': '20 60min, 35@1 60min, 5@1 60min',
 }
 _FACES = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
-# Midpoints of a cube's edges: three that sum to 0, one per pair of axes; their opposites; others.
+# Midpoints of a cube's edges: three vectors of sum 0, their three opposites, then the other six.
 _EDGES = [
     *[(1, 1, 0), (0, -1, 1), (-1, 0, -1), (-1, -1, 0), (0, 1, -1), (1, 0, 1)],
     *[(1, -1, 0), (0, 1, 1), (-1, 0, 1), (-1, 1, 0), (0, -1, -1), (1, 0, -1)],
@@ -63,8 +63,8 @@ PLAN_NAMES = (
 # Times of runs through several rotation rates [s]: ends of the soaks; time from the start of a run
 # to the end of the soak; duration of each rate; duration of a change of the rate.
 _SOAK_ENDS_S, _LEAD_S, _DWELL_S, _RAMP_S = (3600.0, 8100.0, 13500.0), 1800.0, 300.0, 60.0
-# Radius [m] and rotation rates [rad/s] of the simulated machines. Centrifuge: 1 m, 2 to 10 g
-# horizontally; rate table: 0.25 m, up to 1000 deg/s.
+# Radius [m] and rotation rates [rad/s] of the simulated centrifuge (1 m, 2 to 10 g horizontally)
+# and of the simulated rate table (0.25 m, up to 1000 deg/s).
 _CENTRIFUGE = 1.0, tuple(math.sqrt(g * STANDARD_GRAVITY) for g in (2.0, 4.0, 7.0, 10.0))
 _RATE_TABLE = 0.25, tuple(math.radians(rate) for rate in (400.0, 600.0, 800.0, 1000.0))
 

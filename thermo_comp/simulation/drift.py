@@ -69,8 +69,8 @@ class Effect(ABC):
 @dataclass(frozen=True)
 class PartEffect(Effect):
     """
-    Tempco of a part, or stress or thermo-EMF between two parts. The first signal is the deviation
-    of `part` less that of `cold`, if any [K], the second signal the difference of the squares.
+    Tempco of a part, or stress or thermo-EMF between two parts. The two signals are the deviation
+    d of `part` from the reference state [K] and d^2, each less that of the part `cold` if given.
     """
 
     part: str
@@ -89,11 +89,11 @@ class FlowEffect(Effect):
     """
     Effect of the size of a heat flow between two parts, less its effect in the reference state.
 
-    With ``x = |T_hot - T_cold| / knee`` the first signal is ``x ** exponent`` times the deviation
-    of `cold` to the `power`. The exponent is 1.25 for convection in a gap, 1 for the load of a
-    heat pump, 2 for the losses of a heat pump. If `is_limited`, like the supply of a heat pump,
-    ``x ** exponent / (1 + x ** exponent)`` replaces ``x ** exponent``.
-    The second signal is the first signal times the deviation of `cold`.
+    With ``x = |T_hot - T_cold| / knee`` the first signal is ``x ** exponent * d ** power``, where
+    d is the deviation of `cold` from the reference state [K]. The exponent is 1.25 for convection
+    in a gap, 1 for the load of a heat pump, 2 for the losses of a heat pump. If `is_limited`, like
+    the supply of a heat pump, ``x ** exponent / (1 + x ** exponent)`` replaces ``x ** exponent``.
+    The second signal is the first signal times the deviation of `cold` [K].
     """
 
     hot: str
@@ -116,7 +116,7 @@ class FlowEffect(Effect):
 
 @dataclass(frozen=True)
 class CreepEffect(Effect):
-    """Creep in a part: the signal is its temperature less a lag of `time_constant` [s] of it."""
+    """Creep in a part: its temperature less that temperature lagged by `time_constant` [s]."""
 
     part: str
     time_constant: float

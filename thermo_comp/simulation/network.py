@@ -70,7 +70,7 @@ class ThermalNetwork:
         return {AIR: -1, **{name: i for i, name in enumerate(self.nodes)}}
 
     def system(self) -> tuple[Floats, Floats, Floats]:
-        """Return A, b, p of ``dx/dt = A x + b u + p`` with all exponents 1; A has shape (k, k)."""
+        """Return A, b, p of ``dx/dt = A x + b u + p``, as if heat paths were linear; A: (k, k)."""
         n, index = len(self.nodes), self._places
         size = n + (self.thermostat is not None)
         both, p = np.zeros((size + 1, size + 1)), np.zeros(size)
@@ -96,7 +96,7 @@ class ThermalNetwork:
         return A, b, p
 
     def convection(self, state: Floats, air: float) -> Floats:
-        """Return the part of ``dx/dt`` due to exponents other than 1, in a state, shape (k,)."""
+        """Return what exponents of heat paths other than 1 add to ``dx/dt``, shape (k,)."""
         index, at = self._places, np.append(state, air)
         flow = np.zeros(len(at))
         for link in self.links:
@@ -125,7 +125,7 @@ class ThermalNetwork:
         return self.settled(air)[: len(self.nodes)]
 
     def air_for(self, node: str, temperature: float) -> float:
-        """Return the air temperature at which a part has a temperature after an endless soak."""
+        """Return the air temperature at which a part settles at `temperature`."""
         i = self.nodes.index(node)
 
         def error(air: Floats) -> float:
@@ -171,7 +171,7 @@ class ThermalResponse:
         self._rate, self._modes = rate, modes
 
         length = np.diff(self._time)
-        # Per interval: the linear part alpha + beta (t - t_knot), and the modes at the start.
+        # State per interval: alpha + beta (t - t_knot) plus decaying modes from `_amplitude`.
         self._beta = -(np.diff(air) / length)[:, None] * (inverse @ b)
         self._alpha = (self._beta - np.outer(air[:-1], b) - drive) @ inverse.T
         self._amplitude = np.empty((len(length), len(rate)), dtype=complex)

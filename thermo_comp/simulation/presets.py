@@ -184,7 +184,7 @@ def _demo(draw: Specimen) -> UnitModel:
     links.append(Link('board', 'head', 0.02))
     network = ThermalNetwork(capacity, tuple(links), power={'board': draw.between(0.05, 0.15)})
     drift = PartEffect('board', **tempcos(draw))
-    # `stress` follows the temperature of board less head, `load` the heat flow case to board.
+    # `stress` follows the temperature difference board - head, `load` the heat flow case to board.
     stress = PartEffect('board', 'head', bias=draw.signed(0.5, 1.0), scale=draw.normal(1.0))
     load = FlowEffect('case', 'board', 2.0, 0.5, True, bias=draw.signed(60.0, 120.0))
     return draw.triad(network, (drift, *loads(draw), load, stress))
@@ -202,8 +202,8 @@ def tempcos(draw: Specimen) -> dict[str, Any]:
 
 def loads(draw: Specimen) -> list[Effect]:
     """
-    Draw the effect of Golovach's paper: while the ambient temperature changes, offset, slope and
-    curvature of bias and scale differ from those in a soak, as with a heat pump at its limit.
+    Draw constants of the effect in Golovach's paper: in a ramp offset, slope and curvature of bias
+    and scale differ from those in a soak, as with a heat pump at its limit.
     """
     knee, exponent = draw.between(0.4, 0.9), draw.between(1.5, 2.5)
     sizes = ((10.0, 40.0, 20.0), (1.0, 4.0, 5.0), (0.03, 0.1, 0.1))

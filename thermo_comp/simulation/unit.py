@@ -30,9 +30,9 @@ _ROWS = 1 << 20
 
 class Stream(IntEnum):
     """
-    Sources of random numbers. Each source has a separate stream, so that a source does not change
-    the numbers of another source. The values of the sources must never change or be reused,
-    because they determine the random numbers of a seed.
+    Sources of random numbers, such as the noise of the accelerometer. Each source has a separate
+    stream, so that numbers drawn from one source do not change those of another. The values of the
+    sources must never change or be reused, because they determine the random numbers of a seed.
     """
 
     ACCEL_NOISE = 0
@@ -160,7 +160,7 @@ class Bend:
     per_kelvin: float = 0.0
 
     def added(self, force: Floats, t: Floats) -> Floats:
-        """Return the nonlinear terms [m/s^2], shape (n, 3), t [K] above the reference."""
+        """Return the nonlinear terms [m/s^2], shape (n, 3); `t`: T_board - T_ref [K]."""
         f = force / STANDARD_GRAVITY
         terms = np.array(self.square) * f**2 + np.array(self.cube) * f**3
         return np.asarray(MICRO_G * (1.0 + self.per_kelvin * t)[:, None] * terms)

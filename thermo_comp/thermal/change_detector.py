@@ -4,10 +4,10 @@
 Owns the detection of departures: a temperature's rate leaves the baseline, its rate in a soak.
 
 Two Kalman filters of temperature and rate, one with a long and one with a short memory, have white
-noise as second derivative. A rate has departed if it differs from the baseline, away from 0, by
-more than swing, error of the baseline and a multiple of the sd of the noise; the multiple follows
-from the permitted rate of false alarms (Rice's formula [1]_, docs/regime.md). If noise cannot move
-the readings of a quantized sensor across a cell of one quantum, the filters are not used: two
+noise as second derivative. A rate has departed if it exceeds the baseline, away from 0, by more
+than swing plus error of the baseline plus k times the sd of the rate's noise; k follows from the
+permitted number of false alarms per hour (Rice's formula [1]_, docs/regime.md). If noise cannot
+move the readings of a quantized sensor across a cell of one quantum, the filters are not used: two
 edges of cells crossed in the same direction give the mean rate.
 
 References
@@ -25,7 +25,7 @@ from .thermometer import Thermometer
 
 # Second derivative for which a filter is tuned / second derivative at the slowest ramp's onset.
 BEND_SHARES = (1.0, 10.0)
-TUNING: Final = 1.45  # best memory / (noise sd / second derivative)^0.4, for readings at 1 Hz
+TUNING: Final = 1.45  # best memory of a filter [s] / (noise sd / d2T/dt2)^0.4, readings at 1 Hz
 # Noise variance of the rate / the filter's rate variance, if most noise is that of quantization.
 CELL_NOISE_SHARE: Final = 0.4
 SETTLING_MEMORIES: Final = 5.0  # age / memory of a filter at which the noise is stationary
@@ -53,9 +53,9 @@ class ChangeDetector:
         self._ripple_rate = min(ripple / sensor.lag_s, self._largest_swing)
         self._baseline_s = 0.5 * sensor.lag_s
         self._swing_memory_s = SWING_MEMORY_LAGS * sensor.lag_s
-        # Memory (1 / tracking frequency) of each filter [s]: the memory that detects a second
-        # derivative ``share * onset`` of the temperature [K/s^2] soonest in readings at 1 Hz. The
-        # memory determines the spectral density of this derivative for any interval of readings.
+        # Memory (1 / tracking frequency) of each filter [s]: the best memory to detect the second
+        # derivative ``share * onset`` [K/s^2] in readings at 1 Hz. The memory determines the
+        # spectral density of the filter's process noise for any interval of readings.
         self._noise = sensor.noise_sd_c**2 + sensor.quantum_c**2 / 12.0
         onset = smallest_rate / sensor.lag_s
         memories = [
@@ -71,7 +71,7 @@ class ChangeDetector:
         self.rate = 0.0
         self.swing = self._ripple_rate
         self._baseline = 0.0
-        # Largest error of the baseline [K/s]; the baseline may begin at a crest of the ripple.
+        # Largest error of the baseline [K/s]: its first rate may be at a crest of the ripple.
         self._baseline_error = self.swing
         self._trend = 0.0
         self._is_above = False
@@ -82,14 +82,14 @@ class ChangeDetector:
         """Begin a soak: the rate becomes the baseline, with at least the error `least_error`."""
         self._baseline = self.rate
         self._baseline_error = max(self.swing, least_error, 2.0 * sqrt(sensor.var_rate))
-        self._edge = nan  # a mean rate since an edge crossed in the ramp is not the soak's
+        self._edge = nan  # last edge of a cell crossed in the soak: none yet
 
     def is_following(self, stamp_ns: int) -> bool:
         """Whether the filter of `rate` has used the reading with the stamp `stamp_ns`."""
         return self._stamp_ns == stamp_ns and self._age_s > 0.0
 
     def is_back(self) -> bool:
-        """Whether the rate is nearer to the baseline than swing plus error of the baseline."""
+        """Whether |rate - baseline| is below the swing plus the error of the baseline."""
         return abs(self.rate - self._baseline) < self.swing + self._baseline_error
 
     def update(self, stamp_ns: int, sensor: Thermometer, pace: float) -> int:
@@ -143,7 +143,7 @@ class ChangeDetector:
         self._reading = sensor.reading
 
     def _tune(self, dt: float) -> None:
-        """Set the squared threshold of each filter, relative to the filter's rate variance."""
+        """Compute each filter's threshold of (rate beyond the limits)^2 / variance of the rate."""
         self._dt = dt
         self._thresholds: list[float] = []
         for power in self._powers[::-1]:

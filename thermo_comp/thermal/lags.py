@@ -26,32 +26,32 @@ BOARD_INPUT: Final = 'board'
 #: Relative jitter on the diagonal of the start covariance: lags of similar time constants are
 #: almost collinear, and their covariance would not be invertible.
 START_JITTER: Final = 3e-4
-#: Prior sd of a lag's initial state [K], for lags of the board temperature and of a gradient with
-#: the time constant `START_TAU_S` [s].
+#: Prior sd of a lag's initial state [K]: for lags of the board temperature, and for lags of a
+#: gradient, both with the time constant `START_TAU_S` [s].
 START_TAU_S: Final = 3600.0
 BOARD_START_SD: Final = 3.0
 GRADIENT_START_SD: Final = 1.0
 
 
 class Quantity:
-    """A quantity of the thermal state, from readings of `input` (a gradient: and of the board)."""
+    """A quantity of the thermal state, from readings of `input` and, for a gradient, the board."""
 
     input: str
     #: Largest magnitude of the quantity that a calibration may contain.
     largest: ClassVar[float] = QUANTITIES['temperature span'].at_most or 0.0
     #: Typical change of the quantity per kelvin of temperature change.
     per_kelvin: ClassVar[float] = 1.0
-    #: Whether the quantity is computed with the lag of one part of the unit; the board's lag is 0.
+    #: Whether the quantity depends on a part's lag behind the board (0 s for the board itself).
     is_of_part: ClassVar[bool] = True
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """The thermometers of the quantity; of a gradient, the sensor without the board."""
+        """Names of the input thermometers; for a gradient the sensor alone, without the board."""
         return (self.input,)
 
     @property
     def by_board(self) -> float:
-        """Derivative w.r.t. the board temperature, with lags and other thermometers constant."""
+        """Derivative of the quantity w.r.t. T_board, with lags and other thermometers constant."""
         return float(self.input == BOARD_INPUT)
 
 
@@ -66,28 +66,28 @@ class _Lag(NamedTuple):
 
 class Lag(_Lag, Quantity):
     """
-    The board temperature less that of a part which lags the board, or the lagged gradient of a
-    sensor (`input`) [K]. `tau_s` and `second_tau_s` are the time constants of two stages [s]; the
-    second is shorter, or 0 for a lag of one stage. A part may lag a temperature between board and
-    sensor: that of the board plus `sensor_share` of the gradient of `sensor`. `lead_s`: time by
-    which the temperature that the part lags leads the board thermometer [s].
+    T_board less the temperature of a part that lags the board or, if `input` is a sensor, the
+    lagged gradient of the sensor [K]. `tau_s` and `second_tau_s` are the time constants of two
+    stages [s]; the second is shorter, or 0 for a lag of one stage. A part may lag a temperature
+    between board and sensor: that of the board plus `sensor_share` of the gradient of `sensor`.
+    `lead_s`: lag of the board thermometer behind the temperature that drives the part [s].
     """
 
     @property
     def by_board(self) -> float:
-        """Derivative w.r.t. the board temperature, at constant first-order lags L."""
+        """Derivative of the quantity w.r.t. T_board, at constant first-order lags L."""
         if self.input != BOARD_INPUT:
             return 0.0
         return 1.0 if self.second_tau_s else self.shares[0]
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """The thermometer `input` and, for a part between board and sensor, `sensor`."""
+        """Thermometers of the lag: `input` and, for a part between board and sensor, `sensor`."""
         return (self.input, self.sensor) if self.sensor else (self.input,)
 
     @property
     def first_order_weights(self) -> dict[tuple[str, float], float]:
-        """Weights of the first-order lags whose sum is this lag, by input and tau [s]."""
+        """Weights of first-order lags whose weighted sum is this lag, by input and tau [s]."""
         stages = list(zip((self.tau_s, self.second_tau_s), self.shares, strict=True))
         return {
             (name, tau): factor * share
@@ -103,7 +103,7 @@ class Lag(_Lag, Quantity):
         return (tau - lead) / (tau - second), (lead - second) / (tau - second) if second else 0.0
 
     def remaining_share(self, age_s: Any, exp: Any = math.exp) -> Any:
-        """Return the share of the initial state (RMS) that remains after a time [s], 1 to 0."""
+        """Return the share (RMS, 1 to 0) of a lag's initial state that is left after `age_s`."""
         first = exp(-age_s / self.tau_s)
         if not self.second_tau_s:
             return first
@@ -129,8 +129,8 @@ class _Play(NamedTuple):
 class Play(_Play, Quantity):
     """
     Output of a play of half-width `width_k` less its input [K]. The input is the lagged board
-    temperature, or the board temperature if `tau_s` is 0. The difference has no variance, because
-    an error of the input shifts input and output equally.
+    temperature, or the board temperature if `tau_s` is 0. The output of a play less its input has
+    no variance, because an error of the input shifts input and output equally.
     """
 
     input = BOARD_INPUT
@@ -142,7 +142,7 @@ class Play(_Play, Quantity):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """The board and, for a play of a part between board and sensor, `sensor`."""
+        """Thermometers of the play: the board and, if the lag has a `sensor_share`, `sensor`."""
         return self.lag.inputs if self.lag else (self.input,)
 
 
@@ -150,8 +150,8 @@ class Play(_Play, Quantity):
 class MemorySpec:
     """
     Contents of the thermal state of a tracker. `sensors`: names of the thermometers other than the
-    board's; the regime detector uses the first as the leading sensor.
-    `lags`: sorted by input as in `inputs`. `rates`: sensors whose rate of change is in the state.
+    board's; the regime detector uses the first as the leading sensor. `lags`: lags of the board,
+    then lags of each sensor. `rates`: sensors whose rate of change is in the state.
     """
 
     sensors: tuple[str, ...] = ('case',)
@@ -165,7 +165,7 @@ class MemorySpec:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """The board and the sensors, in the order of their lags."""
+        """Names of the thermometers: the board, then `sensors`."""
         return (BOARD_INPUT, *self.sensors)
 
 
@@ -185,10 +185,10 @@ def start_root(lags: Sequence[tuple[Any, ...]]) -> Floats:
     Return a factor of the covariance of `start_covariance`, which is the factor times its
     transpose, shape (n, number of first-order lags) [K].
 
-    The factor exists even if the covariance is singular, as with two nearly equal lags. The
+    The factor is also computed for a singular covariance, as of two nearly equal lags. The
     input before the first reading is modelled as a random walk with ``D = 2 sd^2 / START_TAU_S``
-    [K^2/s], so that ``P_kl = D tau_k tau_l / (tau_k + tau_l)`` for two lags of one input, and 0
-    for lags of different inputs. Then P_kl decays as ``exp(-dt / tau_k) exp(-dt / tau_l)``.
+    [K^2/s]: lags k, l of one input have the covariance ``P_kl = D tau_k tau_l / (tau_k + tau_l)``,
+    lags of different inputs 0. P_kl falls in s seconds by a factor ``exp(-s/tau_k - s/tau_l)``.
     """
     all_lags = [Lag(*lag) for lag in lags]
     terms = first_order_lags(all_lags)

@@ -19,10 +19,10 @@ import numpy as np
 from ..typing import Floats
 from .lags import BOARD_INPUT, Lag, MemorySpec, first_order_lags
 
-#: Interval between readings / time constant of a lag, above which the unknown time at which the
-#: input changed between the readings adds variance.
+#: Interval between readings / time constant of a lag above which variance is added, because the
+#: time at which the input changed between the readings is unknown.
 SPARSE_SHARE: Final = 0.1
-#: Smallest weight of an old input in `_recursion`: smaller weights are below double precision.
+#: Smallest weight of an old input in `_recursion`: below it a term is lost in double precision.
 _LEAST_WEIGHT: Final = 1e-18
 
 
@@ -42,7 +42,7 @@ class LagBank:
         self.stamp_ns: int | None = None
         self.start_ns: int | None = None
         self.input = 0.0
-        #: Input less each lag [K]; its variance in addition to that of the initial state [K^2].
+        #: Input less each lag [K], and its variance without that due to the initial state [K^2].
         self.lagging = self.extra = [0.0] * len(self.taus)
 
     def step(self, stamp_ns: int, value: float, sd: float = 0.0) -> None:
@@ -70,18 +70,18 @@ class LagBank:
             if dt > SPARSE_SHARE * tau:
                 grown += (change * (1.0 - e)) ** 2
             if sd:
-                # The input has the same error in all steps, so the standard deviations of the
-                # steps add, not the variances.
+                # An error of the input is the same in all steps, so the standard deviations due
+                # to the steps add, not the variances.
                 grown = (math.sqrt(grown) + sd * (1.0 - e)) ** 2
             result.append(grown)
         self.extra = result
 
     def note_jump(self, change: float) -> None:
-        """Add to the variances the effect of a change of the input that was a sensor's error."""
+        """Add the square of a wrong step of the input [K] to the variance of each lag."""
         self.extra = [variance + change * change for variance in self.extra]
 
     def at(self, stamp_ns: int, value: float) -> tuple[list[float], list[float]]:
-        """Return ``u - L`` [K], u = `value`, and its variance without that of the first state."""
+        """Return each ``u - L`` [K] at u = `value`; its variance without the initial state's."""
         seen_ns = self.stamp_ns
         if seen_ns is None or stamp_ns <= seen_ns or not self.taus:
             return self.lagging, self.extra
@@ -95,7 +95,7 @@ class LagBank:
 
 @lru_cache(maxsize=1024)
 def _coefficients(taus: tuple[float, ...], dt_ns: int) -> tuple[list[float], list[float]]:
-    """Return for each lag the factors of its state and of the input's change in a step [ns]."""
+    """Return ``e`` and ``(1 - e) tau / dt`` of each lag, ``e = exp(-dt / tau)``, dt in ns."""
     dt = dt_ns * 1e-9
     lost = [-math.expm1(-dt / tau) for tau in taus]
     return [1.0 - part for part in lost], [
@@ -116,7 +116,7 @@ class ThermalMemory:
         terms = sorted(first_order_lags(spec.lags), key=lambda term: spec.inputs.index(term[0]))
 
         def weights(lag: Lag) -> list[tuple[int, float]]:
-            """Return index in `terms` and weight of the first-order lags of a lag."""
+            """Return index in `terms` and weight of each first-order lag in the sum `lag`."""
             return [(terms.index(term), w) for term, w in lag.first_order_weights.items()]
 
         #: The first-order lags of each input, by the input's name.
@@ -125,13 +125,13 @@ class ThermalMemory:
         }
         self.board = self.banks[BOARD_INPUT]
         self.is_empty = not spec.lags and not spec.plays
-        #: First-order lags of each lag; empty if all lags have order 1.
+        #: For each lag: index and weight of its first-order lags; [] if all lags have order 1.
         self._sums = [weights(lag) for lag in spec.lags]
         if self._sums == [[(k, 1.0)] for k in range(len(terms))]:
             self._sums = []
         #: For each play: index of the lag of its input, -1 for the board; half-width [K].
         self._inputs = [spec.lags.index(play.lag) if play.lag else -1 for play in spec.plays]
-        #: First-order lags of each play's lag; [] without a lag.
+        #: For each play: index and weight of the first-order lags of its input; [] if not lagged.
         self._followed = [weights(play.lag) if play.lag else [] for play in spec.plays]
         self._needs_sensors = any(play.inputs != (BOARD_INPUT,) for play in spec.plays)
         self._widths = [play.width_k for play in spec.plays]
@@ -172,7 +172,7 @@ class ThermalMemory:
         ]
 
     def note_jump(self, change: float) -> None:
-        """Add to all variances the effect of a change of the board reading that was an error."""
+        """Add the square of a wrong step of a board reading [K] to the variance of each lag."""
         for bank in self.banks.values():
             bank.note_jump(change)
 
@@ -184,9 +184,9 @@ class ThermalMemory:
         still: Sequence[tuple[float, float]] = (),
     ) -> list[float]:
         """
-        Return each lag [K] and its variance without that of its initial state [K^2], then each
-        play less its input [K]; `still`: for each input the possible error of constant readings
-        [K], and the time since their last change [s], or empty without constant readings.
+        Return each lag [K] and its variance without that due to the initial state [K^2], then
+        each play less its input [K]. `still`: for each input the possible error of constant
+        readings [K], and their duration [s]; empty if no input has constant readings.
         """
         behind, extra = self._first_order(stamp_ns, board, gradients)
         if still:
@@ -217,7 +217,7 @@ class ThermalMemory:
     def _first_order(
         self, stamp_ns: int, board: float, gradients: Sequence[float]
     ) -> tuple[list[float], list[float]]:
-        """Return each first-order lag [K], and its variance without that of the initial state."""
+        """Return each first-order lag [K], and its variance without the initial state's."""
         values, extra = self.board.at(stamp_ns, board)
         for name, gradient in zip(self.spec.sensors, gradients, strict=True):
             if (bank := self.banks[name]).taus:
@@ -241,9 +241,9 @@ def memory_on_grid(
     spec: MemorySpec, step_s: float, board: Floats, gradients: Sequence[Floats]
 ) -> Floats:
     """
-    Compute `ThermalMemory.at` for series on a uniform grid, equal except for rounding.
+    Compute the results of `ThermalMemory.at`, except for rounding, on a uniform grid of times.
 
-    Returns (n, 2 * n_lags + n_plays): (lag [K], 0) per lag, then each play less its input [K].
+    Returns (n, 2 * n_lags + n_plays): each lag [K] and its variance 0, then plays less inputs [K].
     """
     inputs = dict(zip(spec.inputs, (board, *gradients), strict=True))
     first_order: dict[tuple[str, float], Floats] = {}

@@ -25,37 +25,36 @@ LARGEST_RATE: Final = 0.2
 #: may be wrong.
 SETTLED_READINGS: Final = 5
 
-#: A sensor's first reading is wrong if its step to the second is impossible, and the change from
-#: second to third is below this share of the step, and of the change expected at the step's rate.
+#: A sensor's first reading is wrong if the second reading differs from it by an impossible step,
+#: and the third from the second by less than this share of the step, in K and in K/s.
 CONTINUED_SHARE: Final = 0.25
 
-#: Smallest number of equal readings, and shortest time [s], after which a sensor counts as
-#: standing still; the number is larger if the declared noise makes that many equal readings more
-#: probable than `STILL_PROBABILITY`.
+#: A sensor counts as standing still after at least this number of equal readings and this time
+#: [s]. The number is larger if the declared noise makes that many equal readings more probable
+#: than `STILL_PROBABILITY`.
 STILL_READINGS: Final = 20
 STILL_S: Final = 5.0
 STILL_PROBABILITY: Final = 1e-9
-#: Number of equal readings in a row from which, without cells, the temperature's variance grows.
+#: Number of equal readings in a row that are doubtful if the quantum is not far above the noise.
 DOUBTFUL_READINGS: Final = 4
-#: Change of the other sensor's temperature, beyond noise and quanta [K], from which a sensor with
-#: constant readings counts as frozen: for a sensor whose readings vary with the noise, and for a
-#: sensor whose quantum exceeds the noise.
+#: A sensor with constant readings counts as frozen if the other sensor's temperature changes by
+#: more than noise, quanta and this margin [K]; the second margin is for a quantum far above noise.
 OTHER_MOVED: Final = 0.3
 OTHER_MOVED_BEYOND_CELL: Final = 0.7
 #: Largest assumed error of a sensor with constant readings [K].
 LARGEST_ERROR: Final = 60.0
 
-#: Smallest difference between the temperature changes of two sensors in a ramp at which the sensor
-#: with the larger change leads: in K, and relative to the larger change.
+#: In a ramp the sensor with the larger temperature change leads if the changes of the two sensors
+#: differ by at least this: in K, and relative to the larger change.
 LEAD_K: Final = 0.5
 LEAD_SHARE: Final = 0.15
 #: A sensor leads after `LEAD_READINGS` readings in a row at which the ratio of the slower to the
-#: faster rate exceeds `LEAD_RATE_SHARE`. If the ratio exceeds `DOUBTFUL_RATE_SHARE`, a lead of
-#: the board adds variance.
+#: faster rate exceeds `LEAD_RATE_SHARE`. If the board leads and the ratio of the two rates exceeds
+#: `DOUBTFUL_RATE_SHARE`, the variance of the board temperature is increased.
 LEAD_READINGS: Final = 5
 LEAD_RATE_SHARE: Final = 0.3
 DOUBTFUL_RATE_SHARE: Final = 0.03
-#: Number of changed readings in a row equal to the board's after which a sensor counts as a copy
+#: Number of changed readings in a row that equal the board's after which a sensor counts as a copy
 #: of the board's, and the largest time between two readings that are compared [ns].
 COPIED_READINGS: Final = 10
 _TOGETHER_NS: Final = 10_000_000
@@ -78,15 +77,15 @@ class Fault(Enum):
     #: A board temperature that differs from the case's by more than ramp and self-heating explain,
     #: as with a loose thermometer: its readings are used, with a larger variance.
     LOOSE = 'apart'
-    #: Readings equal to the board's, as if both inputs had one topic: they are used, and the
-    #: gradient that a lost sensor would have adds to the variance.
+    #: Readings, used, that equal the board's, as if both inputs had one topic; the variance of the
+    #: gradient then includes the square of the gradient that is expected without the sensor.
     COPY = 'copy of the board'
 
 
 class SensorCheck:
     """
-    Judges a sensor's readings by its earlier readings and by the other sensor, which the board
-    lags by `lag_s` [s] (else 0). `is_revived`: after a fault the estimate must start again.
+    Judges readings of `sensor` by its earlier readings and by those of `other`; `lag_s`: lag of
+    the board behind `other` [s], 0 if `other` is the board; `is_revived`: `sensor` must restart.
     """
 
     def __init__(self, sensor: Thermometer, other: Thermometer, lag_s: float) -> None:
@@ -117,7 +116,7 @@ class SensorCheck:
         self._first: list[tuple[int, float]] | None = []
 
     def forget_other(self) -> None:
-        """Measure the other sensor's change from now on, as readings of a sensor were wrong."""
+        """Measure the change of the other sensor anew, from the other sensor's next reading on."""
         self._other_then = nan
 
     def has_wrong_start(self, stamp_ns: int, celsius: float) -> bool:
@@ -132,7 +131,7 @@ class SensorCheck:
         (first_ns, wrong), (second_ns, second) = first
         step, after = second - wrong, celsius - second
         possible = LARGEST_RATE * (second_ns - first_ns) * 1e-9 + 2.0 * self._quantum
-        # Change from the second to the third reading in a ramp of constant rate [K].
+        # If the step is due to a ramp: the change from the second to the third reading [K].
         continued = abs(step) * (stamp_ns - second_ns) / (second_ns - first_ns)
         is_step = abs(step) > possible + _NOISE_SDS * self.sensor.settings.noise_sd_c
         return is_step and abs(after) < CONTINUED_SHARE * min(abs(step), continued)
@@ -151,7 +150,7 @@ class SensorCheck:
         change = celsius - sensor.reading
         is_doubtful = self._n_same >= self._n_doubtful and not self._has_cells
         if is_doubtful and abs(change) > self._largest_noise:
-            # The equal readings before this reading were wrong, and so is the estimate.
+            # A large change after equal readings: the equal readings and the estimate were wrong.
             self.note_jump(stamp_ns, change)
         self._n_same = 0
         self._other_then = nan
@@ -196,7 +195,7 @@ class SensorCheck:
                 # Expect the judged sensor to follow the other sensor with a first-order lag.
                 self._expected += dt / (dt + self.lag_s) * (moved - self._expected)
         else:
-            # The board may approach this sensor's temperature, but not pass it by itself.
+            # The board may approach, but not pass, the constant temperature of `sensor`.
             ahead = self.sensor.temperature - self._other_then
             self._expected = moved - min(max(moved, min(ahead, 0.0)), max(ahead, 0.0))
         self._seen_ns = now_ns
@@ -217,7 +216,7 @@ class SensorCheck:
         return Fault.FROZEN if self._moved > OTHER_MOVED + margin else Fault.STILL
 
     def note_jump(self, stamp_ns: int, change: float) -> None:
-        """Note a jump of the sensor [K]: the readings before or after the jump are wrong."""
+        """Note a jump of the sensor's readings [K]: those before or after the jump are wrong."""
         self._jumped = self._jump_at(stamp_ns) + change * change
         self._jumped_ns = stamp_ns
 
@@ -233,7 +232,7 @@ class SensorCheck:
     def still(self, stamp_ns: int) -> tuple[float, float]:
         """
         Return the possible error of constant readings [K], and the time since their last change
-        [s]; zeros if the readings change or a cell explains why they do not.
+        [s]; zeros if the readings change, or stay equal only because of a wide quantum.
         """
         changed_ns = self.sensor.changed_ns
         is_explained = self._has_cells and self.fault is not Fault.FROZEN
@@ -254,16 +253,15 @@ def still_readings(settings: ThermometerSettings) -> int:
 
 class CopyCheck:
     """
-    Finds out whether a sensor repeats the readings of the board, as when one topic is given for
-    both. The gradients of such a sensor would be 0 in each ramp.
+    Finds out whether a sensor repeats the board's readings, as when one topic is given for both:
+    the sensor's gradient (its temperature less the board's) would be 0 even in a ramp.
     """
 
     def __init__(self) -> None:
         self.is_copy = False
         self._n_equal = 0
         self._compared = nan
-        #: The last reading [degC] and its stamp [ns] that has not been compared, and whether it is
-        #: the board's.
+        #: The reading that waits for a comparison: whether of the board, stamp [ns], value [degC].
         self._waiting: tuple[bool, int, float] | None = None
 
     def update(self, is_board: bool, stamp_ns: int, celsius: float) -> None:
@@ -284,11 +282,11 @@ class LeadCheck:
     """
     Finds out whether the case or the board temperature changes first (leads) in a ramp.
 
-    The temperature changes since the last constant temperature are compared while both sensors
-    change in the same direction. Heat from outside changes the case temperature first. If the
+    While case and board temperature change in the same direction, their changes since both rates
+    were last low are compared. Heat from outside changes the case temperature first. If the
     board leads, the topics of case and board are swapped or the heat comes from inside; either
-    way the gradient terms are wrong. `extra_variance` is the square of the difference by which the
-    board may lead in the present ramp [K^2].
+    way the gradient terms are wrong. `extra_variance` [K^2]: if the board may lead, the square of
+    the difference between the changes of board and case temperature, else 0.
     """
 
     def __init__(self, case: Thermometer, board: Thermometer, calm_k_min: float) -> None:

@@ -5,10 +5,10 @@ Owns the causal decision between static and dynamic regime; the only clock is th
 
 The dynamic state *begins* when the rate of the leading sensor has left the baseline of the soak
 (`change_detector`), or when the rate of any sensor is clearly that of a ramp. The dynamic state is
-*held* while the rate of the case or of the board, at present or predicted half a lag ahead, may
-exceed the relaxed rate, and so throughout a ramp of constant rate. With `end_condition` = 'case'
-(the paper's rule) only the rate of the case is tested; the board's is tested while the case gives
-no readings (docs/regime.md).
+*held* while the rate of the case or of the board, at present or half a lag ahead, may exceed
+`relaxed_rate_k_min`: a ramp of constant rate stays dynamic. With `end_condition` = 'case' (the
+paper's rule) only the rate of the case is tested or, while the case gives no readings, the rate
+of the board (docs/regime.md).
 
 References
 ----------
@@ -25,8 +25,8 @@ from .settings import OBVIOUS_SHARE, DetectorSettings, ThermometerSettings
 from .thermometer import Thermometer
 
 HOLD_LAGS: Final = 0.75  # shortest duration of the dynamic state / lag of the leading sensor
-# Margin for "the rate is below a limit", in sd of the rate. Half a sd suffices, because in a soak
-# most of the variance of the rate is an allowance for a ramp that may begin at any time.
+# Margin for "the rate is below a limit", in sd of the rate: half a sd, because in a soak most of
+# the variance of the rate is an allowance for a ramp that may begin at any time.
 SURE_SIGMAS: Final = 0.5
 OBVIOUS_SIGMAS: Final = 5.0  # margin for "the rate is above a limit", in sd of the rate
 FIRST_READINGS: Final = 20  # number of readings from which the noise estimate is reliable
@@ -79,8 +79,8 @@ class RegimeDetector:
         is_calm = self._case.is_calm(stamp_ns, case, change.swing)
         is_calm = self._board.is_calm(stamp_ns, board, change.swing) and is_calm
         if is_dynamic and not self._is_grown:
-            # The detector finds the onset of a ramp before the rate is large. Until the rate is
-            # large, the dynamic state ends only if the rate returns to the baseline.
+            # A ramp's onset is detected at a low rate. Until the rate exceeds 1.5 times the
+            # relaxed rate, the dynamic state can only end when the rate is back at the baseline.
             self._is_grown = abs(lead.rate) > OBVIOUS_SHARE * self._relaxed_rate
             is_calm = is_calm and change.is_back()
         if not is_calm:
@@ -111,7 +111,7 @@ class RegimeDetector:
             >= self._dwell_ns * (1.0 + 2.0 * change.swing / self._relaxed_rate)
             and (self._held_until_ns is None or stamp_ns >= self._held_until_ns)
         ):
-            # Before the first soak no swing is estimated: allow a larger error of the baseline.
+            # Before the first soak the rate's swing is unknown: allow a larger baseline error.
             is_first = self.regime == Regime.UNKNOWN
             change.settle(lead, 0.5 * self._relaxed_rate if is_first else 0.0)
             self.regime = Regime.STATIC
@@ -119,7 +119,7 @@ class RegimeDetector:
         return self.regime
 
     def _turn(self, stamp_ns: int, direction: int) -> None:
-        """Use a direction after half a dwell time: coarse quanta may change the rate's sign."""
+        """Reverse the direction if the rate's new sign lasts: coarse quanta may flip the sign."""
         if direction == self.direction or not direction:
             self._turning_ns = None
         elif self._turning_ns is None:
@@ -135,7 +135,7 @@ class RegimeDetector:
         self.direction = direction
         self._turning_ns = None
         self._is_grown = False
-        # The onset is detected before the rate is large: hold the dynamic state for `hold_ns`.
+        # A ramp is detected before its rate is large: hold the dynamic state for `hold_ns`.
         hold_ns = max(self._dwell_ns, round(HOLD_LAGS * 1e9 * lead.settings.lag_s))
         self._held_until_ns = stamp_ns + hold_ns
 
@@ -153,9 +153,8 @@ class _Watch:
         self._relaxed = settings.relaxed_rate_k_min / 60.0
         self._memory_s = 0.25 * sensor.lag_s
         self._stale_ns = round(0.5e9 * sensor.lag_s)
-        # An unchanged reading proves a low rate after the longer of two times: the time in which
-        # the relaxed rate crosses a cell, and the time for which the temperature stays in a cell
-        # while the smallest ramp reverses.
+        # A reading unchanged for `still_s` proves a low rate: the temperature would leave its cell
+        # (one quantum) at the relaxed rate, and also at a second derivative `bend` [K/s^2].
         quantum, bend = sensor.quantum_c, settings.smallest_ramp_k_min / 60.0 / sensor.lag_s
         still_s = max(quantum / self._relaxed, 2.0 * sqrt(2.0 * quantum / bend))
         self._still_ns = round(1e9 * still_s)
@@ -163,7 +162,7 @@ class _Watch:
         self._mean = 0.0
 
     def is_calm(self, stamp_ns: int, sensor: Thermometer | None, lead_swing: float) -> bool:
-        """Update a sensor's mean rate; return whether it is low; True without a fresh reading."""
+        """Update a sensor's mean rate; return True if the rate is low or no reading is fresh."""
         seen_ns = None if sensor is None else sensor.stamp_ns
         if sensor is None or seen_ns is None or stamp_ns - seen_ns > self._stale_ns:
             return True

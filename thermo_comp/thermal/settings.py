@@ -56,7 +56,7 @@ class ThermometerSettings:
 
     @property
     def has_wide_cells(self) -> bool:
-        """Whether a cell is so wide that noise alone never moves a reading across the cell."""
+        """Whether the quantum is so large that noise alone never changes a reading."""
         return self.quantum_c > WIDE_CELL_SIGMAS * self.noise_sd_c
 
 

@@ -175,8 +175,8 @@ class Thermometer:
                 reading_c, expected, variance, rate * dt, bent[6] * dt * dt
             )
 
-        # Update the filter of each mode, and the probability of the bending mode by both
-        # innovations.
+        # Update the filter of each mode, and the probability of the bending mode from the
+        # likelihoods of the innovations of both filters.
         if noise < inf:
             quiet, innovation, s = correct(quiet, measured, noise)
             bent, bent_innovation, bent_s = correct(bent, measured, noise)
@@ -225,8 +225,8 @@ class Thermometer:
         rate = self.rate
         unknown = 0.0
         if not -horizon <= ahead <= horizon:
-            # After the extrapolation horizon the temperature is held constant. Add the variance of
-            # a change at the present rate, or in a ramp that has begun after the last reading.
+            # After the extrapolation horizon the temperature is held constant, with a variance
+            # that grows by the square of the change that its rate or an unseen ramp would cause.
             dt = horizon if ahead > 0.0 else -horizon
             beyond = ahead - dt
             unseen = min(0.5 * self._bend * abs(beyond), self._rate_sd)
@@ -270,7 +270,7 @@ class Thermometer:
         noise = self._noise
         if variance < 4.0 * noise:
             # The sd of the prediction is less than twice the noise: match the moments of the
-            # prediction truncated to the cell. Readings that flicker show where the edge is.
+            # prediction truncated to the cell. Flickering readings show the edge between cells.
             spread = variance + noise
             sd = sqrt(spread)
             low = (reading - half - expected) / sd
@@ -295,8 +295,8 @@ class Thermometer:
         box = half * half / 3.0
         if variance > box:
             return reading, variance * box / (variance - box)
-        # If the estimate is outside the cell, count the edge of the cell as one measurement in the
-        # time in which the predicted temperature changes by one sd of the estimate.
+        # An estimate outside the reading's cell is corrected to the cell's edge. The readings
+        # taken while the predicted temperature changes by one sd count as one measurement.
         if abs(expected - reading) > half:
             edge = reading + (half if expected > reading else -half)
             return edge, variance * max(1.0, sqrt(variance) / (abs(move) + 1e-30))
@@ -325,8 +325,8 @@ def mix(state: State, other: State, share: float) -> State:
 
 def predict(state: State, dt: float, lag: float, power: float) -> State:
     """
-    Predict a state `dt` [s] later. The acceleration decays with the time constant `lag` [s]; white
-    noise of the density `power` [K^2/s^5] drives the acceleration.
+    Predict a filter's state `dt` [s] later. The acceleration d2T/dt2 decays with the time constant
+    `lag` [s] and is driven by white noise of the density `power` [K^2/s^5].
     """
     t, v, a, p00, p01, p02, p11, p12, p22 = state
     half = 0.5 * dt * dt

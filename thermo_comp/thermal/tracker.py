@@ -24,9 +24,9 @@ from .thermometer import RESTART_READINGS, Thermometer
 LOST_GRADIENT_RELATIVE_SD: Final = 0.5
 #: Time without a regime decision after which the regime is unknown / lag of the case thermometer.
 UNWATCHED_SHARE: Final = 0.25
-#: Largest change of the self-heating gradient that does not count as an error of the board
-#: temperature, because the air flow may differ from that in the fit: in K, and relative to the
-#: gradient in the fit.
+#: Largest change of the self-heating gradient since the fit that does not count as an error of the
+#: board temperature, because the air flow may have changed: in K, and relative to the gradient in
+#: the fit.
 SELF_HEATING_CHANGE_K: Final = 1.0
 SELF_HEATING_CHANGE: Final = 0.5
 ANY_RANGE: Final = (-inf, inf)
@@ -90,12 +90,12 @@ class ThermalTracker:
         usual_s = max(UNWATCHED_SHARE * lag_s, config.case_timeout_s)
         #: Time without a decision after which the regime is unknown [s].
         self._unwatched_s = min(usual_s, max(lag_s, self.settings.board.lag_s))
-        # The check of the board's readings is copied: another tracker may share the original.
+        # Set the lag in a copy of the board's plausibility check: other trackers may share it.
         self.checks = {**self.checks, BOARD_INPUT: copy(self.checks[BOARD_INPUT])}
         self.checks[BOARD_INPUT].lag_s = board_lag_s
 
     def is_live(self, stamp_ns: int, sensor: Thermometer) -> bool:
-        """Whether the last reading of a sensor is at most the case time-out before a stamp."""
+        """Whether the age of a sensor's last reading at a stamp is at most the case time-out."""
         seen_ns = sensor.stamp_ns
         return seen_ns is not None and (stamp_ns - seen_ns) * 1e-9 <= self.config.case_timeout_s
 
@@ -152,14 +152,14 @@ class ThermalTracker:
     def _use(
         self, name: str, sensor: Thermometer, check: SensorCheck, stamp_ns: int, celsius: float
     ) -> bool:
-        """Update a thermometer, and the memory after a jump or gap; False: reading not used."""
+        """Update a thermometer and, after a jump or gap, the lags; False: reading not used."""
         if check.has_wrong_start(stamp_ns, celsius):
             self._begin_again(name, sensor)
         before_ns, before, n_restarts = sensor.stamp_ns, sensor.temperature, sensor.n_restarts
         n_before = sensor.n_in_row
         is_anew = not check.admits(stamp_ns, celsius)
         if is_anew:
-            # A sensor starts again if all readings within the time-out were rejected as a step.
+            # Restart the estimate if all readings within the time-out were rejected as steps.
             age_s = 0.0 if before_ns is None else (stamp_ns - before_ns) * 1e-9
             config, is_board = self.config, sensor is self.board
             patience_s = config.temperature_timeout_s if is_board else config.case_timeout_s
@@ -177,7 +177,7 @@ class ThermalTracker:
         if before_ns is not None and (is_new or has_restarted):
             is_gap = has_restarted and (stamp_ns - before_ns) * 1e-9 > sensor.settings.lag_s
             if has_restarted and not is_gap and n_before < 2 * RESTART_READINGS:
-                # The few readings before the restart were wrong: begin at the present reading.
+                # The few readings before the restart were wrong: restart at the present reading.
                 self._begin_again(name, sensor)
                 sensor.update(stamp_ns, celsius)
                 return True
@@ -292,15 +292,15 @@ class ThermalTracker:
 
     def _lost_gradient(self, name: str, stamp_ns: int, rate: float) -> tuple[float, float]:
         """
-        Estimate a gradient while its sensor is lost: the gradient of self-heating, from the last
-        static reading, the fit, or else 0, plus the board's lag times the board's rate.
+        Estimate a gradient while its sensor is lost: lag times rate of the board, plus the
+        gradient due to self-heating in the last static regime, else that of the fit, else 0.
         """
         lag = self._board_lag_s
         lower, upper = self._rest_gradient_range
         is_known = name == self.spec.sensors[0] and upper < inf
         usual = 0.5 * (lower + upper) if is_known else 0.0
         gradient = self._rest_gradients.get(name, usual) + lag * rate
-        # Largest change of the case temperature after the board's extrapolation horizon [K].
+        # Largest change of the case temperature since the end of the board's extrapolation [K].
         unseen = self.settings.case.fastest_ramp_k_min / 60.0 * self.board.beyond(stamp_ns)
         variance = (
             (LOST_GRADIENT_RELATIVE_SD * gradient) ** 2
@@ -310,7 +310,7 @@ class ThermalTracker:
         return gradient, variance
 
     def is_settled(self, stamp_ns: int) -> bool:
-        """Whether the effect of temperatures before the first reading on the lags has decayed."""
+        """Whether the lags hardly depend on the temperatures before the first reading."""
         state = self.sample(stamp_ns)
         gradients = list(state[GRADIENT : GRADIENT + 2 * len(self.spec.sensors) : 2])
         lags = self.memory.at(stamp_ns, state[BOARD], gradients)[: 2 * len(self.spec.lags)]

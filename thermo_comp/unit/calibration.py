@@ -119,7 +119,7 @@ class AxisSet:
 
 @dataclass(frozen=True)
 class LackOfFit:
-    """Slow error of a regime's curves at a board temperature, not predicted by the posterior."""
+    """Error of a regime's curves at a board temperature, beyond the sd of the posterior."""
 
     temperature_c: Annotated[Celsius, 'Board temperature of the entry [degC].']
     sd_m_s2: Annotated[
@@ -131,8 +131,8 @@ class LackOfFit:
 class RegimeSet:
     """
     The curves of one regime. Outside `temperature_range_c` the covariance of the force grows, and
-    a curve differs from that of the other regime by a constant; outside the ranges of both regimes
-    a curve is a tangent for a quarter of the range, then constant.
+    each curve runs parallel to the other regime's curve. Outside the ranges of both regimes each
+    curve continues along a tangent for a quarter of the range, and is constant from there on.
     """
 
     temperature_range_c: Annotated[tuple[Celsius, Celsius], 'Calibrated range of T_board [degC].']
@@ -218,13 +218,13 @@ class Calibration:
     ] = 900.0
     rest_gradient_range_k: Annotated[
         tuple[_Kelvin, _Kelvin] | None,
-        'Range of T_s - T_board - board_lag_s * dT_board/dt in the bags, s: first of `sensors`; '
-        'null: unknown. A value far outside the range (loose sensor) adds to the sd of T_board.',
+        'Range in the bags of T_s - T_board - board_lag_s * dT_board/dt of the first sensor s; '
+        'null: unknown. Far outside the range (loose sensor) the sd of T_board is increased.',
     ] = None
     soak_gradient_k: Annotated[
         tuple[_Kelvin, _Kelvin] | None,
-        'T_s - T_board in a soak, from self-heating, and its sd, s: first of `sensors`; null: '
-        'unknown, 0 is assumed. Used in certificates and exported files.',
+        'T_s - T_board of the first sensor s in a soak, due to self-heating, and its sd; null: '
+        'unknown, taken as 0. Certificates and exported files include this self-heating.',
     ] = None
     detector: Annotated[
         DetectorSettings, 'Settings of the thermometers and of the regime detector.'
@@ -250,7 +250,7 @@ class Calibration:
         check_limits(self, parameter_layout(self))
         if self.gyroscope is not None:
             try:
-                rate_triad(self)  # a gyroscope must keep the rules of an accelerometer triad
+                rate_triad(self)  # apply a triad's rules to the gyroscope
             except ValueError as error:
                 raise ValueError(str(error).replace('`', '`gyroscope.', 1)) from error
 

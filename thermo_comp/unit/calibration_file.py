@@ -22,8 +22,8 @@ from .schema import SchemaError, build, fields_of, plain
 #: and a posterior of full rank, takes 3.3 MB with one thermometer beside the board, 6 MB with two.
 SIZE_LIMIT = 1 << 23
 
-#: First line of a written file. A file with this first line is complete only if its last line is
-#: `_END`; otherwise a file that is cut between two keys would be read as valid.
+#: First line of a written file. A file with this first line is refused if its last line is not
+#: `_END`, because a file that is cut between two keys could be read as valid.
 _HEADER = '# written by thermo_comp: the last line of a complete file is "..."'
 _END = '...'
 
@@ -35,7 +35,7 @@ _FORMER = {
     'even': 'gradient_even',
     'change': 'gradient_even_about_rest',
 }
-#: Former keys of sections of a calibration file of version 0.2.0, and the present keys.
+#: By section of a calibration file: name of a key in version 0.2.0, and its present name.
 _FORMER_KEYS = {'detector': ('closes', 'end_condition'), 'posterior': ('rest', 'diagonal')}
 
 

@@ -6,12 +6,12 @@ Owns the columns of the thermal response: the regressors of bias and scale.
 A column is ``phi = u t^power r``. The value u is computed by the column's kind (`unit.terms`), t
 is the board temperature less the reference, and r is 1, 1 - w or w, with w the weight of the
 dynamic regime. u is limited to the column's range, and t to the calibrated temperatures. Outside
-the calibrated temperatures the curves of the sets first continue along tangents, but t^power is
-constant, because no recording determines the weights of columns at these temperatures.
+the calibrated temperatures t^power is constant, though the curves over temperature first follow
+tangents: no recording determines the weights of columns there.
 
-The function `bank` makes the columns in groups of one kind or more. The fit makes group *part* of
-the kinds board, square and cube: with a curve over the board temperature, the sum of such columns
-is a curve over a part's temperature.
+The function `bank` makes the columns in groups of one kind or more. The fit makes the group *part*
+from the kinds board, square and cube: the sum of these columns and of a curve over the board
+temperature is a curve over the temperature of a part.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -32,8 +32,8 @@ from .terms import GROUPS, LINE, TERMS, Term
 
 UNBOUNDED: Final = (-1e9, 1e9)
 #: Time constants of the columns of `bank` [s], in steps of a factor sqrt(2), from a few reading
-#: intervals to the longest lag that bags determine. Columns linear in a lag have all 15 time
-#: constants: sums of columns approximate any time constant in between. Products and powers of lags
+#: intervals to the longest lag that bags determine. Columns linear in a lag are made for all 15
+#: time constants: sums of them approximate a lag of any time constant. Products and powers of lags
 #: have smaller effects than the lags, so every second time constant suffices for them.
 FINE_TAUS: Final = tuple(np.geomspace(60.0, 7680.0, 15).round(9).tolist())
 BANK_TAUS: Final = FINE_TAUS[::2]
@@ -43,7 +43,7 @@ EVEN_WIDTHS: Final = (0.375, 0.75, 1.5, 3.0, 6.0)
 PLAY_WIDTHS: Final = (0.4, 0.8, 1.6, 3.2, 6.4)
 PLAY_TAUS: Final[tuple[float, ...]] = (0.0, 450.0, 900.0, 1800.0)
 #: Kind bend: time constants [s]; least span of board temperatures per knee (change of slope) [K];
-#: most knees per lag, and most per lag given to `bank`, whose knees are three times as dense.
+#: most knees per lag; most knees per lag if `bank` gets `parts` (with a third of the least span).
 BEND_TAUS: Final = (0.0, *FINE_TAUS[4:11])
 LEAST_KNEE_K, MOST_KNEES, MOST_PART_KNEES = 1.0, 20, 60
 
@@ -75,7 +75,7 @@ class Part(NamedTuple):
 
     @property
     def of_gradient(self) -> 'Part':
-        """The part without `sensor_share` and `lead_s`, which a lag of a gradient cannot have."""
+        """The lag of a gradient: the time constants alone, without `sensor_share` and `lead_s`."""
         return Part(self.tau_s, self.second_tau_s)
 
 
@@ -146,22 +146,22 @@ class Column:
 
     @property
     def source(self) -> Quantity:
-        """The quantity of the thermal state that the value is computed from."""
+        """The quantity of the thermal state that determines the column's value."""
         return self.term.source(self)
 
     @property
     def part(self) -> Part:
-        """The lag of the part that the value is computed from."""
+        """The lag of the part of the unit whose temperature determines the column's value."""
         return Part(self.tau_s, self.second_tau_s, self.sensor_share, self.lead_s)
 
     @property
     def is_of_sensor(self) -> bool:
-        """Whether the value is computed from readings of `sensor`."""
+        """Whether the column's value depends on readings of `sensor`."""
         return self.source.inputs != (BOARD_INPUT,)
 
     @property
     def is_gradient(self) -> bool:
-        """Whether the value is the gradient of `sensor`."""
+        """Whether the column's value is linear in the gradient of `sensor`, without a lag."""
         return self.term.form is LINE and isinstance(self.source, Gradient)
 
 
@@ -172,9 +172,9 @@ def bank(
     parts: Sequence[Part] | None = None,
 ) -> tuple[Column, ...]:
     """
-    Return the candidate columns of a response, with the widest ranges. `at_rest`: gradient of
-    each sensor in a soak [K]; `span_k`: lowest and highest board temperature in the data, less the
-    reference [K]; `parts`: lags of the part of each axis; if given, all lags are from `parts`.
+    Return all candidate columns, with ranges that contain every value. `at_rest`: gradient of each
+    sensor in a soak [K]; `span_k`: lowest and highest board temperature in the data, less the
+    reference [K]; `parts`: the lag of the part of each axis; if given, no other lags are used.
     """
     fine, coarse, of_plays, of_bends = (
         list(map(Part, taus)) for taus in (FINE_TAUS, BANK_TAUS, PLAY_TAUS, BEND_TAUS)
@@ -191,8 +191,8 @@ def bank(
     columns += _family('product', ['board'], powers=(1, 2), lags=coarse)
     columns += _family('gradient_x_temperature', ['gradient'], sensors, powers=(1,))
     columns += _family('gradient_x_temperature', ['gradient_lag'], sensors, (1,), coarse_gradient)
-    # A bias that depends on a part, which lags the board by m, is a polynomial of t - m:
-    # (t - m)^2 = t^2 - 2 t m + m^2, (t - m)^3 = t^3 - 3 t^2 m + 3 t m^2 - m^3.
+    # A bias that follows the temperature of a part, t - m with the lag m, is a polynomial of
+    # t - m: (t - m)^2 = t^2 - 2 t m + m^2, (t - m)^3 = t^3 - 3 t^2 m + 3 t m^2 - m^3.
     columns += _family('square', ['square'], powers=(0, 1), lags=coarse)
     columns += _family('square', ['cube'], lags=coarse)
     even = _family('gradient_even', ['gradient_even'], sensors, (0, 1, 2), widths=EVEN_WIDTHS)
@@ -220,7 +220,7 @@ def _family(
     lags: Sequence[Part] = (Part(0.0),),
     widths: Sequence[float] = (0.0,),
 ) -> list[Column]:
-    """Return the columns of a group: one for each combination of the listed values."""
+    """Return the columns of a group, one per combination of sensor, kind, power, lag, width."""
     ranges = {kind: TERMS[kind].bounds or UNBOUNDED for kind in kinds}
     return [
         Column(group, kind, sensor, *part, width, power=power, range=ranges[kind])
@@ -251,7 +251,7 @@ _DURING: Final = ('always', 'static', 'dynamic')
 
 
 class ColumnTable:
-    """Evaluates columns at thermal states (width, n), each state by itself: (n_columns, n)."""
+    """Evaluates columns, (n_columns, n), at n independent thermal states, (width, n)."""
 
     def __init__(
         self,
@@ -301,7 +301,7 @@ class ColumnTable:
         return hold(raw, *self._range)
 
     def excess(self, raw: Floats) -> Floats:
-        """Return the excess of u over its range [half ranges]; of squares, cubes: of the root."""
+        """Return (1 + e)^(1 / n) - 1; u, of order n in T, is e half ranges outside its range."""
         lower, upper = self._range
         excess = np.asarray(np.abs(raw - self.held(raw)) / ((upper - lower) / 2.0))
         for order in {*self._orders.tolist()} - {1}:
@@ -310,7 +310,7 @@ class ColumnTable:
         return excess
 
     def factors(self, board: Floats, weight: Floats) -> tuple[Floats, Floats]:
-        """Return the factor ``phi / u = t^power r``, and its derivative w.r.t. t."""
+        """Return each column's factor ``phi / u = t^power r``, and its derivative w.r.t. t."""
         t = hold(board - self._reference, *self._t_range)
         n_powers = int(self._power.max(initial=0))
         powers = np.multiply.accumulate([np.ones_like(t), *[t] * n_powers])
@@ -325,8 +325,8 @@ class ColumnTable:
 
     def slopes(self, states: Floats) -> tuple[Floats, Floats | None]:
         """
-        Differentiate u, without limits of range: w.r.t. the quantity that u is computed from, and
-        w.r.t. the board temperature at constant lag (None if no column has a function of t - lag).
+        Differentiate each column's u, without its limits, by the quantity that determines u and,
+        at constant lag, by T_board (None if no column is a function of t - lag).
         """
         slopes, scaled = np.ones((len(self._places), states.shape[1])), self._scaled(states)
         for rows, term in self._terms:

@@ -28,11 +28,11 @@ from .functions import hold, in_order
 from .gravity import MICRO_G
 from .nonlinearity import ForceCorrection, beyond_force
 
-#: Rate of change of the force while static and dynamic set are blended [m/s^3], above which the
-#: transition time is lengthened: 1 ug per second; largest factor of this lengthening.
+#: Largest rate of change of the force in a transition between the sets [m/s^3]: 1 ug per second; a
+#: faster transition is lengthened, by a factor of at most `LONGEST_TRANSITION`.
 GENTLE_RATE = MICRO_G
 LONGEST_TRANSITION = 10.0
-#: Number of board temperatures at which slopes, and dynamic - static differences, are evaluated.
+#: Number of board temperatures at which slopes and dynamic less static curves are evaluated.
 _GAP_TEMPERATURES = 33
 #: Variance of rounding [counts^2]: twice 1/12, as the converter adds the remainder to the next
 #: cycle.
@@ -111,7 +111,7 @@ class Correction:
         self.n_slow = N_ROWS if self.of_force is None else N_ROWS + 15
 
     def _find_columns_of_pairs(self) -> None:
-        """Find the columns that depend on each quantity of the state that has a variance."""
+        """For each quantity of the state with a variance find the columns that depend on it."""
         self.layout = layout = StateLayout(self.memory)
         pair = np.array([layout.pairs.get(c.source, -1) for c in self.table.columns], np.int64)
         columns = np.argsort(pair, kind='stable')
@@ -129,12 +129,12 @@ class Correction:
 
     def _blended(self, sets: Floats, weight: Floats, phi: Floats) -> Floats:
         result = self._weigh(phi, (1.0 - weight) * sets[0] + weight * sets[1])
-        # Equation 8 of the paper gives the scale factor at the board temperature.
+        # Scale factor = K times relative scale (equation 8 of the paper).
         result[3:] *= self.K
         return result
 
     def _weigh(self, columns: Floats, start: Floats) -> Floats:
-        """Add ``W @ columns`` to initial values, shape (6, n), column by column."""
+        """Add ``W @ columns`` (W: weights) to `start`, shape (6, n), column by column."""
         if columns.shape[1] > _FEW:
             # With many states the sums are computed without a table of intermediate values.
             total: Floats = start.copy()
@@ -170,7 +170,7 @@ class Correction:
     def by_pairs(self, slopes: Floats) -> Floats:
         """
         Differentiate bias and relative scale w.r.t. the quantities of `StateLayout.pairs`, shape
-        (p, 6, n); `slopes`: derivatives of columns w.r.t. their quantities, (n_columns, n).
+        (p, 6, n); `slopes`: derivative of each column w.r.t. its quantity, (n_columns, n).
         """
         columns = self._pair_columns
         result = np.zeros((len(self._signs), 6, slopes.shape[1]))
@@ -187,13 +187,13 @@ class Correction:
         noise_excess: npt.ArrayLike,
     ) -> Floats:
         """
-        Evaluate the correction of segments, linear in time between two states 1 s apart.
+        Evaluate the correction in segments of 1 s, linear in time between the states at the ends.
 
         `slow` is the slowly varying error covariance, shape (n_slow, n), see
-        `SlowUncertainty.at`. Returns (52,) or (52, n): by axis bias and its change over the
-        segment (1 s), scale and its change, then the coefficients of the covariance, including the
-        noise of a sample, see `covariance.covariance_at`. A nonlinearity adds 15 rows to `slow`,
-        21 to the result: K2, Kq, K3 by axis, coefficients of x^3 to x^6 in the variance by axis.
+        `SlowUncertainty.at`. Returns (52,) or (52, n): by axis bias, change of the bias over the
+        segment, scale and its change; then the coefficients for `covariance.covariance_at`, noise
+        of a sample included. With a nonlinearity `slow` has 15 more rows, and the result ends with
+        K2, Kq, K3 by axis and the coefficients of x^3 to x^6 in the variance of each axis.
         """
         ends = np.array((start, end), dtype=np.float64)
         n = ends[0, 0].size
@@ -243,25 +243,25 @@ class Correction:
         slow: Floats,
     ) -> tuple[Floats, Floats]:
         """
-        Evaluate a, b, c of each axis' error variance ``a + b x + c x^2``, (3, 3, n), without noise
-        of a sample, and the factor (3, n) by which the variance grows outside the ranges.
+        Evaluate a, b, c of each axis' error variance ``a + b x + c x^2``, (3, 3, n), without
+        sample noise, and the factor (3, n) by which it grows outside the calibrated ranges.
 
         The difference of dynamic and static set (`gap`) is added as an error while the sets are
         blended, outside the calibrated ranges, and while the regime is unknown. While the regime
-        is unknown, the variances of both sets are summed in full.
+        is unknown, the variance is the sum of the variances of both sets.
         """
         board, weight, unknown = states[BOARD], states[WEIGHT], states[UNKNOWN]
         static_weight, beyond_range = 1.0 - weight, raw - held
         excess, _, relative, by_rate = self.curves.excess(states)
         if not self._has_lags:
-            # With lags, those beyond their ranges count instead of the rate: see `columns_out`.
+            # The rate's distance from its range counts only if no column has a lag.
             relative = relative + by_rate
         outside = static_weight * relative[0] + weight * relative[1]
         shares = np.array([static_weight + unknown * weight, weight + unknown * static_weight])
         variances = (shares * states[VAR_BOARD], states[self.layout.variances])
         by_source, direct = self.table.slopes(states)
         by_pair = self.by_pairs(by_source * factors[0])
-        # Derivative w.r.t. the board temperature, on which t^power, gradients and lags depend.
+        # Derivative of the columns by T_board, through t^power, gradients and lags.
         on_board = raw * factors[1]
         if direct is not None:
             on_board = on_board + direct * factors[0]
@@ -272,15 +272,15 @@ class Correction:
         v += slow
         growth = np.ones((3, len(board)))
         is_beyond = bool(beyond_range.any())
-        # A part that lags the board may return into the calibrated range after the board does.
+        # A part that lags the board may return into the calibrated range later than the board.
         parts = np.concatenate((board[np.newaxis], board - states[self._lagged]))
         parts_out = np.abs(parts - hold(parts, *self._span)).max(axis=0)
         if is_beyond or outside.any() or parts_out.any():
             columns_out = np.where(self._is_present, self.table.excess(raw), 0.0)
             columns_out = columns_out.max(axis=1, initial=0.0)
-            # Outside the calibrated range the curves are extrapolated. Add two errors: the slope
-            # at the edge of the range times the board's distance from the edge, and the sd of the
-            # slopes within the range times the larger distance: the board's or that of a part.
+            # Outside the calibrated range the curves are extrapolated, with two errors: slope of
+            # the curves at the edge of the range times the board's distance from the edge; sd of
+            # the slopes times the largest distance of the board or a part from the range.
             v += self._spread(shares * excess * excess, slopes)
             bent = shares * np.maximum(excess * excess, parts_out * parts_out)
             bends = np.broadcast_to(self._bends, (4, *slopes.shape[1:]))
@@ -302,8 +302,8 @@ class Correction:
 
     def _spread(self, variances: Floats, moved: Floats) -> Floats:
         """
-        Propagate p independent errors with variances (p, n) to the coefficients a, b, c of each
-        axis' variance, (3, 3, n); `moved`: derivatives of bias and relative scale, (p, 6, n).
+        Return a, b, c of each axis' variance, (3, 3, n), due to p independent errors of variances
+        (p, n); `moved`, (p, 6, n): derivatives of bias and relative scale w.r.t. these errors.
         """
         variance, bias, scale = variances[:, np.newaxis], moved[:, :3] / self.K, moved[:, 3:]
         parts = np.empty((*bias.shape[:2], 3, bias.shape[2]))
@@ -319,7 +319,7 @@ def memory_of_unit(calibration: Calibration) -> MemorySpec:
 
 
 def is_sound(line: Floats) -> npt.NDArray[np.bool_]:
-    """Whether a result of `Correction.line` gives finite forces: scales not 0, all below 1e140."""
+    """Whether a result of `Correction.line` gives finite forces: no scale 0, numbers < 1e140."""
     scale = line[2:12:4]
     is_finite = (np.abs(line) < _LARGEST).all(axis=0)
     return np.asarray(is_finite & (scale * (scale + line[3:12:4]) > 0.0).all(axis=0))

@@ -12,9 +12,9 @@ elements of the misalignment M. To first order the error e of the corrected forc
     e_z = zx (u0 + x u1) + zy (u2 + y u3) + u4 + z u5 + x u7 + y u8
 
 Each element of the covariance of the force error e is a polynomial of second degree in the forces
-x, y, z, and the coefficients are sums over the elements of the covariance of the errors u. An
-array of the covariance of the errors u has the rows a, b, c of each axis, whose error variance is
-``a + b x + c x^2``, then one row for each pair of errors in `BETWEEN`.
+x, y, z, and the coefficients are sums over the elements of the covariance of the errors u. The
+covariance of u is stored as rows: for each axis a, b, c of its error variance ``a + b x + c x^2``,
+then for each pair of errors in `BETWEEN` their covariance.
 """
 
 from collections.abc import Sequence
@@ -68,18 +68,18 @@ class CovarianceMap:
         factors = sums[:, u, w]
         # The row b of an axis is twice the covariance of its constant error and its scale error.
         factors[:, 1:9:3] /= 2.0
-        # Each coefficient is a weighted sum of few rows: keep the indices and weights of those.
+        # Coefficients of xx, ..., zz are sums of few rows of the covariance of u: keep only these.
         n = int((factors != 0.0).sum(axis=1).max())
         self._places = np.argsort(factors == 0.0, axis=1, kind='stable')[:, :n]
         self._factors = np.take_along_axis(factors, self._places, axis=1)[:, :, np.newaxis]
 
     def coefficients(self, rows: Floats) -> Floats:
-        """Return the coefficients of xx, xy, ..., zz, (40, n), for rows of shape (45, n)."""
+        """Map the covariance of errors u, (45, n), to coefficients of xx, xy, ..., zz, (40, n)."""
         return in_order(self._factors * rows[self._places], 1)
 
 
 def grown(between: Floats, growth: Floats) -> Floats:
-    """Increase the rows `BETWEEN` (36, n) by the growth factors (3, n) of the axes' variances."""
+    """Increase the covariances `BETWEEN`, (36, n), by growth factors of axis variances, (3, n)."""
     # The misalignment does not depend on the temperature, so its errors have the factor 1.
     roots = np.concatenate((np.repeat(np.sqrt(growth), 2, 0), np.ones_like(growth)))
     return np.asarray(between * roots[_FIRST] * roots[_SECOND])
@@ -87,17 +87,17 @@ def grown(between: Floats, growth: Floats) -> Floats:
 
 def rows_between(errors: Floats, misalignment_variances: Floats) -> Floats:
     """
-    Return the rows `BETWEEN`, (36, n), of errors that are linear in p independent unit variances,
-    (9, p, n), with variances, (3,), added to those of the elements of the misalignment.
+    Return the rows `BETWEEN`, (36, n), of the covariance of u. `errors`, (9, p, n): u due to each
+    of p independent causes; `misalignment_variances`, (3,): variances due to further causes.
     """
-    # Products and sums are explicit, because results of BLAS depend on the arrays' alignment.
+    # The sums do not use BLAS, whose results depend on the arrays' alignment.
     result = in_order(errors[_FIRST] * errors[_SECOND], 1)
     result[_OF_M] += misalignment_variances[:, np.newaxis]
     return result
 
 
 def misalignment_variances(between: Floats) -> Floats:
-    """Return the variances of the elements of the misalignment, (3, n), in rows `BETWEEN`."""
+    """Return the variances of the misalignment's elements, (3, n), from the rows `BETWEEN`."""
     return between[_OF_M]
 
 

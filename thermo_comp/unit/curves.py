@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the curves of static and dynamic set over board temperature, within and beyond their ranges.
+Owns bias and scale of both regimes over the board temperature, within and beyond their ranges.
 
 n thermal states are the columns of an array; results have the rows bias x, y, z, scale x, y, z.
 """
@@ -16,13 +16,11 @@ from .functions import TANGENT_SPANS, basis_slopes, hold
 
 class Curves:
     """
-    Bias and scale of both sets as functions of the board temperature; the static set is row 0 of a
-    result.
+    Bias and scale of the static set (row 0) and the dynamic set over the board temperature.
 
-    Where the range of only one set ends, the difference of the two sets is held constant. Beyond
-    both ranges the curves continue along their tangent at the edge for `TANGENT_SPANS` times the
-    width of the range, and are constant from there on; the set with the narrower range on that
-    side follows the tangent of the other set.
+    Where only one set is within its range, the difference of the two sets is constant. Beyond both
+    ranges the curves of the set whose range extends farther follow tangents for `TANGENT_SPANS`
+    times the width of the range, then are constant; the other set's curves run parallel to them.
     """
 
     def __init__(self, calibration: Calibration) -> None:
@@ -36,8 +34,8 @@ class Curves:
             [axis.bias_function for axis in axes] + [axis.scale_function for axis in axes]
             for axes in (part.axes() for part in sets)
         ]
-        # Index of the set whose tangent each set follows at the lower and at the upper end, shape
-        # (2, 2).
+        # For the lower, then the upper end of the ranges: index of the set whose tangent each set
+        # follows, shape (2, 2).
         regimes, (lower, upper) = np.arange(2), self._t_range[:, :, 0]
         self._leads = np.where([lower > lower.min(), upper < upper.max()], 1 - regimes, regimes)
         self._ends = lower.min(), upper.max()
@@ -51,7 +49,7 @@ class Curves:
         self._lacks = [np.array(points).reshape(-1, 4).T for points in lacks]
 
     def excess(self, states: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Return T_board [K] and rate [K/s] beyond their ranges, then in half ranges, (2, n)."""
+        """Return distances of T_board [K] and rate [K/s] from the ranges, also in half ranges."""
         t, rate = states[BOARD] - self._reference, states[RATE]
         over, too_fast = t - hold(t, *self._t_range), rate - hold(rate, *self._rate_range)
         span, rate_span = (edges[1] - edges[0] for edges in (self._t_range, self._rate_range))
@@ -72,17 +70,17 @@ class Curves:
         return result
 
     def _evaluate(self, t: Floats, what: str = 'value') -> Floats:
-        """Evaluate curves or slopes of both sets at t [K from T_ref], one row per set, (2, n)."""
+        """Evaluate curves or slopes of each set at its row of t [K from T_ref], (2, n)."""
         pairs = zip(self._rows, t, strict=True)
         return np.array([[getattr(function, what)(at) for function in row] for row, at in pairs])
 
     def _beyond(self, t: Floats) -> tuple[Floats, Floats]:
-        """Return how far each set follows its lower and its upper tangent [K], (2, n)."""
+        """Return how far t is below and above the ranges, up to the tangents' ends [K], (2, n)."""
         (lower, upper), (below, above) = self._ends, self._reaches
         return hold(t - lower, -below, 0.0), hold(t - upper, 0.0, above)
 
     def unexplained(self, board: Floats) -> Floats:
-        """Evaluate ``residual_sd_m_s2 ** 2`` plus lack of fit, shape (2, 3, n)."""
+        """Evaluate residual plus lack-of-fit variance by set and axis, (2, 3, n)."""
         return self._residuals + self.lack_of_fit(board)
 
     def lack_of_fit(self, board: Floats) -> Floats:
@@ -101,7 +99,7 @@ class Curves:
         return result
 
     def slopes(self, board: Floats) -> Floats:
-        """Differentiate bias and scale of both sets w.r.t. T_board [per K], (2, 6, n)."""
+        """Differentiate bias and scale of both sets by T_board [per K], shape (2, 6, n)."""
         held = hold(board - self._reference, *self._t_range)
         return self._evaluate(held, 'slope')
 
@@ -123,8 +121,8 @@ class Curves:
         return result
 
     def _followed(self, regime: int, place: int, t: Floats, shares: Floats) -> Floats:
-        """Differentiate values beyond the ranges w.r.t. free coefficients, (n_free, n)."""
-        # Beyond its range a curve is a constant plus either a tangent or the other set's curve.
+        """Differentiate bias or scale beyond the ranges by free coefficients, (n_free, n)."""
+        # Beyond its range a curve is a constant plus a tangent, or plus the other set's curve.
         function = self._rows[regime][place]
         own_range, other_range = self._t_range[:, regime], self._t_range[:, 1 - regime]
         bases = (function.basis(hold(at, *own_range)) for at in (t, hold(t, *other_range)))

@@ -25,12 +25,11 @@ from ..quantities import QUANTITIES
 from ..typing import Floats
 from .schema import broken
 
-#: One temperature difference [K], or an array of temperature differences.
+#: A temperature difference [K], or an array of temperature differences.
 Kelvins: TypeAlias = float | Floats
 
 #: Length of the tangent that continues a curve beyond its range / width of the range. A parabola
-#: deviates from a tangent in proportion to the square of the distance from the point of contact:
-#: at the outer end of the tangent by 1/16 of the deviation at the far end of the range.
+#: differs from its tangent 16 times less at the tangent's outer end than at the range's other end.
 TANGENT_SPANS = 0.25
 #: Largest accepted error of a function's value at the reference temperature.
 NORMALISATION_TOLERANCE = 1e-9
@@ -117,7 +116,7 @@ class Polynomial(_Family):
 @dataclass(frozen=True)
 class CubicSpline(_Family):
     """
-    Natural cubic spline through values at rising knots t [K from T_ref]. One knot is 0, with
+    Natural cubic spline through values at rising knots t [K from T_ref]. One knot is t = 0, with
     the value 0 (bias) or 1 (scale). Beyond the outer knots the spline is constant.
     """
 
@@ -145,7 +144,7 @@ class CubicSpline(_Family):
         return tuple(v - self.values[at] for v in self.values[:at] + self.values[at + 1 :])
 
     def with_free(self, values: tuple[float, ...], at_reference: float) -> CubicSpline:
-        """Return a spline on `knots_k` through `at_reference` plus `values` (0 at t = 0)."""
+        """Return a spline: `at_reference` at t = 0, plus `values` at the other knots."""
         at = self.knots_k.index(0.0)
         moved = (*values[:at], 0.0, *values[at:])
         return replace(self, values=tuple(at_reference + v for v in moved))
@@ -205,7 +204,7 @@ class Exponential(_Family):
         return self.amplitudes
 
     def with_free(self, values: tuple[float, ...], at_reference: float) -> Exponential:
-        """Return a sum of the exponentials `e_fold_k`, with the amplitudes `values`."""
+        """Return exponentials of the present e-folds, with the amplitudes `values`."""
         return replace(self, constant=at_reference - math.fsum(values), amplitudes=values)
 
     def _evaluate(self, t: Floats, *, is_slope: bool = False) -> Floats:
@@ -216,7 +215,7 @@ class Exponential(_Family):
         return np.asarray(result)
 
     def basis(self, t: Kelvins) -> list[Floats]:
-        """Evaluate the derivatives w.r.t. the amplitudes; the value at t = 0 stays constant."""
+        """Evaluate derivatives by the amplitudes, at a constant value of the function at t = 0."""
         return [by_element(math.exp, t / e_fold) - 1.0 for e_fold in self.e_fold_k]
 
 
@@ -225,7 +224,7 @@ TemperatureFunction = Polynomial | CubicSpline | Exponential
 
 
 def check_reference(name: str, function: TemperatureFunction, expected: float) -> None:
-    """Raise ValueError, with the key's name, if a function is not `expected` at t = 0."""
+    """Raise ValueError, with the key's name, if a function differs from `expected` at t = 0."""
     with np.errstate(all='ignore'):
         value = function.value(0.0)
     if not abs(value - expected) <= NORMALISATION_TOLERANCE:

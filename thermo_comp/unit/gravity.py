@@ -24,7 +24,7 @@ _UNITS = {
 
 
 def ug_text(acceleration: float) -> str:
-    """Format an error in ug, from 1 mg on in mg: with two digits, from 99.5 on as integer."""
+    """Format an error in ug or, from 1 mg on, in mg: two digits below 99.5, else an integer."""
     value, unit = acceleration / MICRO_G, 'ug'
     if abs(value) >= 999.5:
         value, unit = value / 1e3, 'mg'

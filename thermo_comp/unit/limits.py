@@ -5,7 +5,7 @@ Owns the limits of a calibration's bias and scale over its temperatures.
 
 The bias at the reference temperature, and its change over temperature, are each at most twice the
 full scale. The effect of a column on the bias, and of a parameter's sd on bias or scale, is at
-most a million times the limit of bias or scale: beyond any instrument, but without overflow.
+most a million times the limit of bias or scale: no instrument reaches this, no float overflows.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from .schema import broken
 if TYPE_CHECKING:
     from .calibration import Calibration
 
-#: Limits of the relative scale, also with the largest change of the scale by all columns.
+#: Limits of the relative scale: curve less, and plus, the largest effect of all columns.
 SMALLEST_RELATIVE_SCALE, LARGEST_RELATIVE_SCALE = 0.1, 10.0
 #: Largest bias / full scale; samples in an offset code have a bias of half of their range.
 FULL_SCALES = 2.0
@@ -110,7 +110,7 @@ def _check_bias(key: str, level: float, reached: tuple[float, float], most: floa
 
 
 def _check_scale(key: str, reached: tuple[float, float], gain: float) -> None:
-    """Refuse a relative scale that breaks its limits if columns add `gain` or -`gain`."""
+    """Refuse curves of the relative scale that, plus or minus `gain`, leave the limits."""
     for word, value, is_kept, limit in (
         ('above', reached[0] - gain, operator.gt, SMALLEST_RELATIVE_SCALE),
         ('below', reached[1] + gain, operator.lt, LARGEST_RELATIVE_SCALE),
@@ -142,7 +142,7 @@ def _extremes(function: TemperatureFunction, edges: Sequence[float]) -> tuple[fl
 def _regressors(
     functions: Sequence[TemperatureFunction], edges: Sequence[Sequence[float]]
 ) -> list[float]:
-    """Return each function's largest derivatives w.r.t. its level and its free coefficients."""
+    """Return each function's largest |derivative| by value at T_ref and by each coefficient."""
     pairs = zip(functions, edges, strict=True)
     both = [function.basis(np.array(ends)) for function, ends in pairs]
     return [size for basis in both for size in (1.0, *(float(np.abs(v).max()) for v in basis))]

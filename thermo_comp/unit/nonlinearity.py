@@ -85,7 +85,7 @@ class Nonlinearity:
     beyond_sd_g_g2: Annotated[
         float,
         QUANTITIES['nonlinearity'],
-        'Sd of K2 of an unknown square term that begins at the largest norm in the fit.',
+        'Sd of K2 of an unknown square term that begins at the largest force of the fit.',
     ]
     terms: Annotated[
         tuple[NonlinearTerm, ...], 'At most one square, odd square and cube term, in this order.'
@@ -98,7 +98,7 @@ class Nonlinearity:
             raise ValueError(f'`terms` must be of {list(POWERS)}, at most one each, in this order')
 
     def check_slope(self, force: float, temperatures: Sequence[float]) -> None:
-        """Raise ValueError if the slope is too large up to |f| = `force` [m/s^2], at any t [K]."""
+        """Raise ValueError if the nonlinear terms are too steep up to |f| = `force` [m/s^2]."""
         for t in temperatures:
             k2, kq, k3 = np.abs(self.coefficients(np.array([t])))[..., 0]
             slope = float(np.max(2.0 * (k2 + kq) * force + 3.0 * k3 * force * force))
@@ -124,8 +124,8 @@ def unit_of(kind: Kind) -> float:
 def linearised(x: Real, k2: Real, kq: Real, k3: Real) -> Real:
     """
     Solve ``x = f + k2 f^2 + kq |f| f + k3 f^3`` for f by one step of Halley's method from x. The
-    error of the result is about (k^2 - k3) (x - f)^3, k = k2 + kq sign(f): at f = 10 g, 1e-14 g
-    with k2 = 100 ug/g^2, and 1e-11 g with k3 = 10 ug/g^3.
+    error of f is about (k^2 - k3) (x - f)^3 with k = k2 + kq sign(f): at f = 10 g 1e-14 g for
+    k2 = 100 ug/g^2, 1e-11 g for k3 = 10 ug/g^3.
     """
     r = k3 * x * x
     s = k2 * x + kq * abs(x) + r
@@ -172,8 +172,8 @@ def nonlinear_covariance(
 
 class BeyondForce(NamedTuple):
     """
-    The variance of an unknown square term that begins at the force `edge` [m/s^2]. `growth`:
-    variance / (2 d)^4, with d the distance of |x| beyond `edge`.
+    The variance of the force due to an unknown square term that begins at the force `edge`:
+    ``growth (2 d)^4`` [m^2/s^4], with d = |x| - `edge` [m/s^2]; 0 below `edge`.
     """
 
     edge: float
@@ -183,7 +183,7 @@ class BeyondForce(NamedTuple):
         self, x: Real, y: Real, z: Real,
         xx: Real, xy: Real, xz: Real, yy: Real, yz: Real, zz: Real,
     ) -> tuple[Real, Real, Real, Real, Real, Real, Real, Real, Real]:  # fmt: skip
-        """Add the unknown term's variance to the covariance xx, xy, xz, yy, yz, zz of a sample."""
+        """Add the variance of an unknown K2 term to the covariance xx, xy, ..., zz of a sample."""
         xx, yy, zz = xx + self._variance(x), yy + self._variance(y), zz + self._variance(z)
         return x, y, z, xx, xy, xz, yy, yz, zz
 
@@ -195,7 +195,7 @@ class BeyondForce(NamedTuple):
 
 
 def beyond_force(calibration: Calibration) -> BeyondForce:
-    """Return the variance of an unknown square term beyond the fit's |f|, by default 1.01 g."""
+    """Return the variance of an unknown square term beyond the largest |f| of the fit."""
     known = calibration.nonlinearity
     edge = known.force_range_m_s2[1] if known else AT_REST * calibration.gravity_m_s2
     sd = (known.beyond_sd_g_g2 if known else K2_SD) / STANDARD_GRAVITY
@@ -242,12 +242,12 @@ class ForceCorrection:
     ) -> Floats:
         """
         Return the contribution of the nonlinear terms to the coefficients of x^2 to x^6 in the
-        error variance of an axis, (5, n), at temperatures less the reference, (n,).
+        error variance of an axis, (5, n); `t`: T_board - T_ref, (n,) [K].
 
-        `rows`, `rest`: covariance of the coefficients of k terms as a factor, (2 k, rank), and
-        variances added to its diagonal; `on_bias`, `on_scale`: factors for bias and relative
-        scale, (rank, n). The covariances of Kq with other parameters are omitted: most are
-        negative, so in most cases the result is too large.
+        The covariance of the coefficients of k terms has the factor `rows`, (2 k, rank), and the
+        variances `rest` added to its diagonal; `on_bias`, `on_scale`, (rank, n): bias and relative
+        scale due to each column of the factor. The covariances of Kq with other parameters are
+        omitted: most are negative, so in most cases the result is too large.
         """
         k = len(self._of.terms)
         kinds = [list(POWERS).index(term.kind) for term in self._of.terms]
@@ -256,7 +256,7 @@ class ForceCorrection:
         along[kinds] = (rows[:k, :, np.newaxis] + t * rows[k:, :, np.newaxis]) / units[:, :, None]
         alone[kinds] = (rest[:k, np.newaxis] + t * t * rest[k:, np.newaxis]) / (units * units)
         (n2, nq, n3), (v2, vq, v3) = along, alone
-        # Products and sums are explicit, because results of BLAS depend on the arrays' alignment.
+        # The sums do not use BLAS, whose results depend on the arrays' alignment.
         products = (
             2.0 * on_bias * n2,
             2.0 * (on_scale * n2 + on_bias * n3),

@@ -37,7 +37,7 @@ class Posterior:
         str, 'base64 of little-endian float32: one row of `rank` numbers per parameter.'
     ]
     diagonal: Annotated[
-        str, 'base64 of little-endian float32: one variance per parameter, of diag(diagonal).'
+        str, 'base64 of little-endian float32: the vector `diagonal`, a variance per parameter.'
     ]
 
     def __post_init__(self) -> None:
@@ -50,7 +50,7 @@ class Posterior:
 
     @classmethod
     def of(cls, matrix: npt.NDArray[np.floating[Any]], variances: Floats) -> Posterior:
-        """Encode a factor, shape (n_parameters, rank), and the variances of diag(diagonal)."""
+        """Encode a factor, (n_parameters, rank), and the variances to add to the diagonal."""
         return cls(matrix.shape[1], _encoded(matrix), _encoded(variances))
 
     @property
@@ -83,8 +83,8 @@ class Posterior:
 class Block(NamedTuple):
     """
     Indices of the parameters of an axis' bias or scale in the posterior. `static`, `dynamic`:
-    index of the set's level; the coefficients of the set's function follow. `response`: index of
-    the first weight of the columns; `end`: index after the last weight of the columns.
+    index of the regime's value at T_ref, which its other coefficients follow. `response`:
+    index of the first weight of the columns; `end`: index after the last weight of the columns.
     """
 
     static: int
@@ -101,7 +101,7 @@ class Block(NamedTuple):
 def lay_out(
     pairs: Iterable[tuple[TemperatureFunction, TemperatureFunction]], n_columns: int
 ) -> list[Block]:
-    """List the blocks of parameters for pairs of a static and a dynamic function."""
+    """Return a block of parameters for each pair of a static and a dynamic function."""
     blocks = [Block(0, 0, 0, 0)]
     for static, dynamic in pairs:
         begin = blocks[-1].end
@@ -113,9 +113,9 @@ def lay_out(
 
 class ParameterLayout(NamedTuple):
     """
-    The order of a calibration's parameters in its posterior: axis by axis the bias [input units],
-    then the scale [relative]; axis by axis from `nonlinear` on the nonlinear coefficients, then
-    the changes of these per kelvin; from `misalignment` on M[1][0], M[2][0], M[2][1].
+    The order of a calibration's parameters in its posterior: for each axis bias [input units],
+    then scale [relative]; from the index `nonlinear` on, for each axis nonlinear coefficients,
+    then their changes per kelvin; from `misalignment` on M[1][0], M[2][0], M[2][1].
     """
 
     bias: list[Block]

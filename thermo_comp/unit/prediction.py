@@ -4,12 +4,12 @@
 Owns the slowly varying error covariance of thermal states, due to the parameters and the unknown
 initial lag states, and the thermal states of a soak and of a ramp.
 
-After s seconds of a ramp of rate q the sensors are ``board_lag_s q`` warmer than the board (these
-differences are the gradients), a part of time constant tau lags the board by ``tau q (1 - exp(-s /
-tau))``, and the output of a play lags its input by the play's half-width; in a soak (q = 0) all
-these are 0. `soak_gradient_k` is added to the gradient of the first sensor and its lags in soaks
-and ramps. In a soak the static set applies, in a ramp the dynamic set. Predicted variances include
-neither noise nor thermometer errors.
+After s seconds of a ramp of rate q each gradient is ``board_lag_s q``, a part of time constant tau
+lags the board by ``tau q (1 - exp(-s / tau))``, and the output of a play lags its input by the
+play's half-width. In a soak (q = 0) all gradients, lags and plays are 0.
+`soak_gradient_k` is added to the gradient of the first sensor and its lags in soaks and ramps. In
+a soak the static set applies, in a ramp the dynamic set. Predicted variances include neither noise
+nor thermometer errors.
 """
 
 from collections.abc import Callable
@@ -39,7 +39,7 @@ class SlowUncertainty:
         self._root = start_root(lags)
         edges = [edge for part in calibration.regime_sets() for edge in part.temperature_range_c]
         self._span = max(edges) - min(edges)
-        #: Delay of each lag's part behind the board in a long ramp [s].
+        #: For each lag: lag [K] / rate of the board temperature [K/s] in a long ramp.
         self._behind_s = np.array([
             sum(w * tau for (of, tau), w in lag.first_order_weights.items() if of == BOARD_INPUT)
             for lag in lags
@@ -49,8 +49,8 @@ class SlowUncertainty:
         diagonal[layout.misalignment :] = np.square(calibration.misalignment_sd)
         if posterior is not None:
             matrix, diagonal = posterior.matrix, posterior.variances
-        #: For each axis, for bias, scale and nonlinear terms, and for the misalignment: rows of
-        #: factor and diagonal of the covariance of the parameters.
+        #: Factor and diagonal of the covariance of the parameters of bias, scale and nonlinear
+        #: terms, for each axis; then factor and diagonal for the misalignment.
         self._blocks = [
             [(matrix[part], diagonal[part]) for part in (bias.rows, scale.rows, force)]
             for bias, scale, force in zip(layout.bias, layout.scale, layout.force, strict=True)
@@ -65,8 +65,8 @@ class SlowUncertainty:
         (width, n). `start_shares`, (n_lags, n): share of each lag's initial state that remains;
         `start_rates`, (n,): largest board rate since the start, if above the present rate [K/s].
         Returns `Correction.n_slow` rows: a, b, c of each axis' error variance ``v(x) = a + b x + c
-        x^2`` [m^2/s^4], then the rows between axes and misalignment, then the contribution of a
-        nonlinearity to the coefficients of x^2 to x^6 of each axis' variance.
+        x^2`` [m^2/s^4], then the covariances of the pairs of errors in `BETWEEN`, then the
+        contributions of a nonlinearity to the coefficients of x^2 to x^6 of v(x).
         """
         cuts = range(_CHUNK, states.shape[1], _CHUNK)
         rates = np.abs(states[RATE])
@@ -86,8 +86,8 @@ class SlowUncertainty:
         factors, _ = table.factors(states[BOARD], states[WEIGHT])
         by_pair = self._correction.by_pairs(table.slopes(states)[0] * factors)
         moved = by_pair[self._correction.layout.lag_pairs] * start_shares[:, np.newaxis]
-        # The unit may have been started in a ramp: the assumed sd of a part's lag at the start is
-        # its lag in a long ramp at the largest rate since the start, at most the calibrated span.
+        # The unit may have been started in a ramp: the sd of each lag at the start is its value in
+        # a long ramp at the largest rate since the start, limited to the calibrated span.
         behind = hold(self._behind_s[:, np.newaxis] * rates, -self._span, self._span)
         in_ramp = in_order(moved * behind[:, np.newaxis], 0)
         by_root = in_order(self._root[:, :, np.newaxis, np.newaxis] * moved[:, np.newaxis], 0)
@@ -127,8 +127,8 @@ class SlowUncertainty:
         self, states: Floats, mean_of: Callable[[Floats], Floats]
     ) -> tuple[Floats, Floats]:
         """
-        Return the variance of the bias due to the parameters at thermal states (n, width), and
-        that of the bias less the mean that `mean_of` computes, shapes (n, 3) [m^2/s^4].
+        Return variances due to the parameters at thermal states (n, width), shape (n, 3)
+        [m^2/s^4]: of the bias, and of the bias less its mean (function `mean_of`).
         """
         columns = states.T
         phi = self._correction.table.values(columns)
@@ -201,7 +201,7 @@ def sd_of_states(calibration: Calibration, states: Floats) -> tuple[Floats, Floa
     """
     Predict the sd of bias [m/s^2] and relative scale at thermal states, shapes (n, 3), including
     the sd of the self-heating gradient in a soak. The lack of fit of an axis at 1 g may be an
-    error of the bias or of the scale, so it is included in both sd.
+    error of the bias or of the scale, so the sd of the bias and that of the scale include it.
     """
     correction = Correction(calibration)
     slow = SlowUncertainty(calibration, correction)
@@ -245,7 +245,7 @@ def ramp_states(
 
 
 def _add_gradient(states: Floats, calibration: Calibration, change_k: float) -> None:
-    """Add a constant change of the first sensor's gradient to thermal states, in place."""
+    """Add `change_k` to the first sensor's gradient and its lags in thermal states, in place."""
     layout = StateLayout(memory_of_unit(calibration))
     for quantity, place in layout.places.items():
         if isinstance(quantity, Gradient) and quantity.input == calibration.sensors[0]:

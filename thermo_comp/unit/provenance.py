@@ -18,7 +18,7 @@ class GroupEvidence:
     """Contribution of one group of columns to the correction in the fitted data."""
 
     group: Annotated[str, 'Name of the group, as in the key `response`.']
-    part: Annotated[Literal['bias', 'scale'], 'Whether the group corrects bias or scale.']
+    part: Annotated[Literal['bias', 'scale'], 'Quantity that the group corrects.']
     explains_m_s2: Annotated[_Error, "RMS of the group's correction in the fitted data."]
     effective_parameters: Annotated[
         float, QUANTITIES['number'], 'Effective number of weights determined by the data.'
@@ -26,8 +26,8 @@ class GroupEvidence:
     log_evidence_change: Annotated[
         float,
         QUANTITIES['log evidence'],
-        'Loss of log evidence without the group; in a fit with a prior: with the weights of the '
-        'group at the mean of the prior.',
+        'Loss of log evidence if the group is left out or, in a fit with a prior, if the weights '
+        'of the group keep the mean of the prior.',
     ]
     prior_sd: Annotated[tuple[_WeightSd, ...], "Prior sd of the group's weights."]
 
@@ -44,7 +44,7 @@ class Source:
 @dataclass(frozen=True)
 class ResidualSummary:
     """
-    ``|f| - g`` of the fitted data in one regime or both; raw: corrected with the constants alone.
+    ``|f| - g`` of fitted data in one regime or both; raw: with bias and scale at T_ref only.
     """
 
     section: str

@@ -62,7 +62,7 @@ class Gyroscope:
     """
     Bias of the angular rate over temperature: ``w = measured - bias``. The scale factor is 1.
 
-    Order of the posterior, axis by axis: level and coefficients of each set, weights of columns.
+    Order of the posterior, for each axis: coefficients of each regime, then weights of columns.
     """
 
     bias_rad_s: Annotated[

@@ -53,7 +53,7 @@ def broken(key: str, rule: str, got: object) -> ValueError:
 
 
 def check_ranges(value: object, **spans: Bounds) -> None:
-    """Raise ValueError, with the key's name, if a range is reversed or narrower than its bound."""
+    """Raise ValueError, with the key's name, if a range is reversed or narrower than permitted."""
     for key, span in spans.items():
         lower, upper = getattr(value, key)
         shown = f'[{lower}, {upper}]'

@@ -4,11 +4,11 @@
 Owns the table of the kinds of regressors of the thermal response.
 
 The value of a column is ``u = form.value(x)``, ``x = (n - centre) / width``; n is a quantity of
-the thermal state (`source`) or, if `is_temperature`, ``t - source``, the temperature less T_ref of
-a part that lags the board. Notation: ``t = T_board - T_ref``, ``g_s = T_s - T_board`` of a sensor
-s, and ``q_s = g_s - rest``. The constant `rest` is 0, or the gradient in a soak if self-heating
-warms the board above the case. Even functions of q_s have the same value for heating and for
-cooling at the same rate.
+the thermal state (`source`) or, if `is_temperature`, ``t - source``: the temperature of a part
+that lags the board by `source`, less T_ref. Notation: ``t = T_board - T_ref``, ``g_s = T_s -
+T_board`` of a sensor s, and ``q_s = g_s - rest``. The constant `rest` is 0 or, in a unit that
+heats itself, g_s in a soak. Even functions of q_s have equal values in heating and in cooling at
+the same rate.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class Form(NamedTuple):
-    """A function of x and its derivative; equal x give equal bits in arrays of any length."""
+    """A function of x, and its derivative: the bits of a result depend only on that x."""
 
     value: Callable[[Floats], Floats]
     slope: Callable[[Floats], Floats]
@@ -76,11 +76,11 @@ class Term:
     has_scale: bool = True
 
     def centre(self, column: Column) -> float:
-        """Return the centre in ``x = (n - centre) / width`` of a column."""
+        """Return a column's centre of n, a quantity of the state: ``x = (n - centre) / width``."""
         return float(getattr(column, self.centre_key, 0.0))
 
     def width(self, column: Column) -> float:
-        """Return the width in ``x = (n - centre) / width`` of a column."""
+        """Return a column's width of n, a quantity of the state: ``x = (n - centre) / width``."""
         return float(getattr(column, self.width_key, 1.0))
 
     def largest(self, column: Column) -> float:
@@ -90,7 +90,7 @@ class Term:
         return (column.source.largest + abs(self.centre(column))) ** self.order
 
     def steepest(self, column: Column, raw: Floats, flow_k: float) -> float:
-        """Return the largest slope [1/K] of values u; `flow_k` is the RMS of the gradient [K]."""
+        """Return the largest change of a column's value u per kelvin; `flow_k`: RMS gradient."""
         if self.bounds is not None:
             return 1.0 / flow_k
         largest = float(np.abs(raw).max(initial=0.0)) ** (1.0 / self.order)
@@ -126,20 +126,20 @@ def _play(column: Column) -> Quantity:
 
 
 _ALL: Final = (
-    # Effect of the heat flow from a thermometer to the board; `rate`: without case thermometer.
+    # `gradient`: heat flow from a thermometer to the board; `rate`: a fit never uses this kind.
     Term('gradient', 'g_s', _gradient),
     Term('rate', 'dT_board/dt [K/s]', lambda _: state.Rate()),
-    # Effect of a part that lags the board; `gradient_lag`: of a part between thermometers.
+    # `board`: for a part that lags the board; `gradient_lag`: for a part between thermometers.
     Term('board', 'T_board - lagged T_board', _part, positive=('tau_s',)),
     Term('gradient_lag', 'lagged g_s', _lagged_gradient, positive=('tau_s',)),
-    # Curve over the temperature of a part; without lag, effect of the square of a heat flow.
+    # `square`: with a lag, a curve over a part's temperature; without, the square of a heat flow.
     Term(
         *('square', '(T_board - lagged T_board)^2, or q_s^2 without lag', _part_or_gradient),
         *(_SQUARE, 2, 'rest_k'),
     ),
     # Cubic curve over the temperature of a part.
     Term('cube', '(T_board - lagged T_board)^3', _part, _CUBE, 3, 'rest_k', positive=('tau_s',)),
-    # Effect of a heat load, as of a heat pump; `gradient_even`: of a load that saturates.
+    # `size`: a heat load, as of a heat pump; `gradient_even`: a heat load that saturates.
     Term('size', 'abs(q_s)', _gradient, _SIZE, centre_key='rest_k'),
     Term(
         *('gradient_even', 'tanh((q_s / width)^2)', _gradient, _EVEN),
@@ -169,7 +169,7 @@ GROUPS: Final = {
     # `board`, `product` and `square`, for each axis.
     'part': 'curve of the part of each axis',
     'gradient_lag': 'parts between case and board',
-    # The columns of the next two groups give coefficients that change with temperature.
+    # `product` and `gradient_x_temperature`: the effect of a lag or gradient changes with t.
     'product': 'lags, with effects that change with temperature',
     'gradient_x_temperature': 'heat flow, with an effect that changes with temperature',
     'square': 'curves of parts that lag',
