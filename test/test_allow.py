@@ -151,6 +151,14 @@ def test_likely_mistakes_are_refused_with_the_name_of_the_refusal(rng, spoil, na
     assert name == 'unmeasured' or 'unmeasured' not in findings
 
 
+def test_one_bag_in_kelvins_among_others_is_refused_by_name(rng):
+    # WHY: a fit used one of ten bags in kelvins without a message, and was valid up to 313 degC.
+    rests = [Rest(rng, level=tuple(GRAVITY * up)) for up in positions(7, 3)]
+    in_kelvins(rests[4])
+    with pytest.raises(FitError, match=r'^bag4: temperature/board reads 2\d+\S* degC .* kelvins'):
+        fit(sources_of(rests), FORCE)
+
+
 def test_the_advice_for_rests_without_noise_names_the_parameter_of_the_node(rng):
     # WHY: the node takes equal samples for those of a stuck converter: 60 % of all were dropped.
     rests = [Rest(rng, level=tuple(GRAVITY * up), sd=0.3 * MG) for up in positions(7, 3)]

@@ -23,7 +23,7 @@ from thermo_comp.fitting.data_checks import (
     judge_windows,
 )
 from thermo_comp.fitting.thermal_ranges import soak_gradient
-from thermo_comp.fitting.windows import Model, Sets, ThermalWindows
+from thermo_comp.fitting.windows import Model, Sets, ThermalWindows, Track
 from thermo_comp.simulation.campaign import positions
 from thermo_comp.thermal.settings import DetectorSettings
 from thermo_comp.unit.functions import Polynomial
@@ -123,6 +123,10 @@ def test_rests_at_room_temperature_are_sufficient_with_a_prior_of_the_unit(good)
     warm = replace(desk, temperature=desk.temperature + 20.0)
     advised = findings_of(warm, up, prior=prior)['span']
     assert (advised.level, 'the bags reach 42 to 4' in advised.message) == ('advice', True)
+    # Windows beyond the prior's range are not used, but their temperatures are reported.
+    track = Track(0.0, 1.0, np.full((2, 9), 50.0), np.ones(2, dtype=bool))
+    advised = findings_of(replace(desk, tracks=(track,)), up, prior=prior)['span']
+    assert 'to 50 degC' in advised.message
     # If the prior is from other units of the type, not from this unit, a chamber test is advised.
     of_type = replace(prior, provenance=replace(prior.provenance, model='population'))
     assert {'span', 'ramps'} <= {*findings_of(desk, up, prior=of_type)}

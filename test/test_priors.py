@@ -14,6 +14,7 @@ from thermo_comp.cli.app import run
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.population import _scatter, population
+from thermo_comp.fitting.priors import prior_model
 from thermo_comp.fitting.selection import fit_all
 from thermo_comp.fitting.unknowns import Prior
 from thermo_comp.simulation.campaign import Position, parse_cyclogram, positions
@@ -323,6 +324,13 @@ def test_the_command_prior_names_the_nonlinear_terms_that_it_leaves_out(cli, tmp
     printed = cli('prior', *paths, '-o', tmp_path / 'type.yaml').stdout
     assert f'leaves out the nonlinear terms K2, K3 of units {first.unit.serial}\n' in printed
     assert load_calibration(tmp_path / 'type.yaml').nonlinearity is None
+
+
+def test_an_update_uses_the_temperatures_of_its_prior_and_1_k_more():
+    known = replace(rich_calibration(), response=(), posterior=None)
+    provenance = replace(known.provenance, model='population')
+    assert prior_model(known).range_c == (4.0, 36.0)
+    assert prior_model(replace(known, provenance=provenance)).range_c == (-np.inf, np.inf)
 
 
 def test_a_prior_without_covariance_is_refused():

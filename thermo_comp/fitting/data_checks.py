@@ -18,6 +18,7 @@ import numpy as np
 from ..errors import FitError, UndeterminedError
 from ..text import counted
 from ..thermal.settings import ADVISED_SPAN_K, RAMP_K_MIN
+from ..thermal.state import BOARD
 from ..typing import Floats
 from ..unit.calibration import POPULATION, Calibration
 from ..unit.gravity import MICRO_G, ug_text
@@ -87,7 +88,7 @@ def judge_windows(
         yield advice('temperature', text)
         return
     if prior is not None and prior.provenance.model != POPULATION:
-        yield _judge_beyond(windows.temperature, prior)
+        yield _judge_beyond(windows, prior)
     else:
         yield _judge_span(windows)
         yield from _judge_ramps(windows)
@@ -123,7 +124,10 @@ def _judge_span(windows: ThermalWindows) -> Finding:
     return advice('span', f'{text} ({ADVISED_SPAN_K:g} degC advised): {why}')
 
 
-def _judge_beyond(temperature: Floats, prior: Calibration) -> Finding:
+def _judge_beyond(windows: ThermalWindows, prior: Calibration) -> Finding:
+    # The model of a prior omits windows beyond its range, which the tracks contain.
+    tracks = (track.states[track.is_known, BOARD] for track in windows.tracks)
+    temperature = np.concatenate((windows.temperature, *tracks))
     edges = [edge for part in prior.regime_sets() for edge in part.temperature_range_c]
     lower, upper, coldest, hottest = min(edges), max(edges), temperature.min(), temperature.max()
     text = f'the prior gives the effect of temperature from {lower:.0f} to {upper:.0f} degC'
@@ -131,8 +135,9 @@ def _judge_beyond(temperature: Floats, prior: Calibration) -> Finding:
         return Finding('span', 'good', text)
     return advice(
         'span',
-        f'{text}; the bags reach {coldest:.0f} to {hottest:.0f} degC: fit them together with the '
-        'bags of the prior',
+        f'{text}; the bags reach {coldest:.0f} to {hottest:.0f} degC, and of each rest the fit '
+        'uses only the part in this range, if there is one: fit the bags together with the bags '
+        'of the prior',
     )
 
 
@@ -185,15 +190,13 @@ def _judge_ramps(windows: ThermalWindows) -> Iterator[Finding]:
             f'hardly any {missing} was recorded; heating and cooling cause errors of opposite '
             f'sign, so record more {missing}',
         )
-    calm = windows.weight <= 0.5
-    span = float(np.ptp(windows.temperature))
-    static = float(np.ptp(windows.temperature[calm])) if calm.any() else 0.0
-    if np.mean(calm) < 0.05 or static < 0.5 * span:
+    if not windows.has_soaks:
+        share, span = np.mean(~windows.is_dynamic), float(np.ptp(windows.temperature))
         yield advice(
             'soak',
-            f'only {100.0 * np.mean(calm):.0f} % of the windows are static, over {static:.1f} of '
-            f'{span:.1f} K: the soaks end before the temperatures of the unit are constant; let '
-            'some soaks last for hours',
+            f'only {100.0 * share:.0f} % of the windows are static, over '
+            f'{windows.static_span:.1f} of {span:.1f} K: the soaks end before the temperatures of '
+            'the unit are constant; let some soaks last for hours',
         )
 
 

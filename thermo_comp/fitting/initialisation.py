@@ -32,7 +32,7 @@ from .reduction import ReducedBag
 from .regression import Regression
 from .selection import LARGE_OFFSETS, Fit, fit_all, select
 from .unknowns import BIAS_SD, SCALE_SD, InformativePrior, Prior, State, misalignment_scale
-from .windows import CURVE, PART, ThermalWindows
+from .windows import CURVE, PART, SET, ThermalWindows
 
 #: Largest prior sd of a slope over temperature: of the bias [m/s^2 per K] (500 ug/K), and of the
 #: relative scale factor [1/K] (200 ppm/K), the limits in data sheets of consumer MEMS triads.
@@ -288,6 +288,10 @@ def _candidates(
     allowed = {*data.groups} if options.groups is None else {*options.groups, *options.forced}
     is_candidate = np.isin(groups, list(allowed)) & (data.kelvins > 0.0)
     is_candidate &= windows.has_temperature
+    # Without soaks at several temperatures the static set is unknown: the difference of the sets
+    # would describe any effect in the dynamic windows, and be wrong in a soak.
+    is_forced = SET in options.forced or options.model == 'golovach'
+    is_candidate &= (groups != SET) | windows.has_soaks | is_forced
     parts = np.stack((is_candidate, is_candidate & data.in_scale))
     steepest = _steepest(problem.n_directions)
     slopes = _typical_slopes(steepness, steepest, options.gravity)

@@ -18,7 +18,7 @@ from scipy.linalg import solve_triangular
 
 from ..errors import FitError
 from ..typing import Floats
-from ..unit.calibration import Calibration, parameter_layout
+from ..unit.calibration import POPULATION, Calibration, parameter_layout
 from ..unit.columns import Column
 from .assembly import file_jacobian, parameters_of
 from .equations import as_vector
@@ -26,6 +26,7 @@ from .hyperparameters import CLEAR_GAIN, log_student
 from .initial_triad import ConstantCalibration
 from .options import FitOptions
 from .regression import Regression
+from .thermal_ranges import union
 from .unknowns import InformativePrior, State
 from .windows import Model, Sets
 
@@ -45,8 +46,16 @@ def prior_columns(calibration: Calibration) -> tuple[Column, ...]:
 
 
 def prior_model(calibration: Calibration) -> Model:
-    """Return the model of a calibration, with one curve for each regime."""
-    static, dynamic = (regime.x.bias_function for regime in calibration.regime_sets())
+    """
+    Return the model of a calibration, with one curve for each regime.
+
+    More than 1 K beyond the temperatures of the calibration of the same unit, the windows would
+    change its effects of temperature by extrapolated columns, so they are not used.
+    """
+    regimes = calibration.regime_sets()
+    static, dynamic = (regime.x.bias_function for regime in regimes)
+    lower, upper = union(regime.temperature_range_c for regime in regimes)
+    is_limited = calibration.needs_temperature and calibration.provenance.model != POPULATION
     return Model(
         name=calibration.provenance.model,
         sets=Sets(static, dynamic, is_shared=False),
@@ -54,6 +63,7 @@ def prior_model(calibration: Calibration) -> Model:
         sensors=calibration.sensors,
         detector=calibration.detector,
         reference_temperature=calibration.reference_temperature_c,
+        range_c=(lower - 1.0, upper + 1.0) if is_limited else (-np.inf, np.inf),
     )
 
 

@@ -90,6 +90,7 @@ class Model:
     name: name of the model in the provenance
     parts: the lag of the part of each axis, or None in a model without one lag per axis
     sensors: thermometers other than the board's; the first is that of the case
+    range_c: board temperatures of the windows that are used, unless a rest has no others [degC]
     """
 
     name: str
@@ -99,6 +100,7 @@ class Model:
     detector: DetectorSettings
     reference_temperature: float
     parts: tuple[Part, Part, Part] | None = None
+    range_c: tuple[float, float] = (-np.inf, np.inf)
 
     @property
     def acts_on(self) -> Bools | None:
@@ -197,6 +199,18 @@ class ThermalWindows:
         return np.asarray(self.weight > 0.5)
 
     @property
+    def static_span(self) -> float:
+        """Range of the board temperatures of the static windows [K]."""
+        static = self.temperature[~self.is_dynamic]
+        return float(np.ptp(static)) if len(static) else 0.0
+
+    @property
+    def has_soaks(self) -> bool:
+        """Whether 5 % of the windows are static, and span half of the temperatures of all."""
+        is_short = self.static_span < 0.5 * float(np.ptp(self.temperature))
+        return bool(np.mean(self.is_dynamic) <= 0.95) and not is_short
+
+    @property
     def was_measured(self) -> bool:
         """Whether a temperature was recorded, even if it is constant over the bags."""
         return self.has_temperature or bool(self.data.columns[:, 0].any())
@@ -256,6 +270,9 @@ def thermal_windows(
         grid, known = track.grid_s, track.is_known.astype(np.float64)
         for interval in bag.intervals:
             use = np.interp(interval.time, grid, known, left=0.0) == 1.0
+            board = np.interp(interval.time, grid, states[BOARD])
+            inside = use & (board >= model.range_c[0]) & (board <= model.range_c[1])
+            use = inside if inside.any() else use
             if use.any():
                 time = interval.time[use]
                 at = np.array([np.interp(time, grid, series) for series in states])
