@@ -107,7 +107,7 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
             'measures more, state its range with --full-scale'
         )
         yield advice('full-scale', text)
-    yield from _judge_thermometers(bags, options.prior)
+    yield from _judge_thermometers(bags)
     yield from _judge_units(bags, size, options)
     per_mg = 1e-3 * (STANDARD_GRAVITY if options.input == 'm/s^2' else size)
     yield from _judge_jumps(bags, per_mg)
@@ -121,10 +121,8 @@ def _rests(bags: Sequence[ReducedBag]) -> list[StillInterval]:
     return [rest for bag in bags for rest in bag.intervals]
 
 
-def _judge_thermometers(
-    bags: Sequence[ReducedBag], prior: Calibration | None
-) -> Iterator[Finding]:
-    """Check the readings of the thermometers; FitError if only some bags are in kelvins."""
+def _judge_thermometers(bags: Sequence[ReducedBag]) -> Iterator[Finding]:
+    """Check the readings of the thermometers; FitError if those of a bag are in kelvins."""
     names = sorted({name for bag in bags for name in bag.temperatures})
     for name in names:
         if n := sum(bag.n_spikes.get(name, 0) for bag in bags):
@@ -139,13 +137,11 @@ def _judge_thermometers(
             for bag in bags
             if len(bag.readings(name).value)
         }
-        edges = [part.temperature_range_c[1] for part in prior.regime_sets()] if prior else []
         # 233 K is -40 degC, the lower limit of industrial electronics; none works at 233 degC.
-        odd = [bag for bag, median in medians.items() if 233.0 < median < KELVINS[1]]
-        if odd and (len(odd) < len(medians) or max(edges, default=np.inf) < KELVINS[0]):
+        if odd := [bag for bag, median in medians.items() if 233.0 < median < KELVINS[1]]:
             raise FitError(
                 f'{odd[0]}: temperature/{name} reads {medians[odd[0]]:.4g} degC in the median: '
-                'that looks like kelvins, unlike the other bags or the prior; record degC'
+                'that looks like kelvins; record degC'
             )
         celsius = np.concatenate([bag.readings(name).value for bag in bags])
         if len(celsius) and KELVINS[0] < np.median(celsius) < KELVINS[1]:
