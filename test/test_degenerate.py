@@ -9,10 +9,12 @@ import pytest
 @pytest.mark.parametrize(
     ('name', 'command'),
     [
-        ('jump of a year', 'evaluate'), ('jump from 1970', 'fit'), ('equal stamps', 'replay'),
+        ('jump from 1970', 'fit'), ('equal stamps', 'replay'),
+        pytest.param('jump of a year', 'evaluate', marks=pytest.mark.slow),
         ('reversed stamps', 'fit'), ('stamps of the limits', 'info'), ('one sample', 'fit'),
         ('all zeros', 'fit'), ('readings of one stamp', 'info'),
-        ('all values 1e308', 'report'), ('name not UTF-8', 'replay'),
+        pytest.param('all values 1e308', 'report', marks=pytest.mark.slow),
+        ('name not UTF-8', 'replay'),
     ],
 )  # fmt: skip
 def test_a_degenerate_input_ends_with_a_sentence_in_bounded_memory(name, command, tmp_path):

@@ -268,6 +268,7 @@ def test_counts_of_32_bits_are_fitted(rng):
     assert axes.x.scale_factor == pytest.approx(K, rel=0.01)
 
 
+@pytest.mark.slow
 def test_the_bias_sd_of_one_recording_contains_the_sd_of_a_turn_on(rng):
     # WHY: the claimed bias sd was 1/6 of the bias error, as if each position had its own turn-on.
     offsets = 5e-3 * rng.standard_normal((8, 3))
@@ -368,6 +369,7 @@ def test_the_sd_of_turn_ons_in_a_prior_is_used_for_six_positions(rng):
     assert 2e-4 < helped.static.x.residual_sd_m_s2 < 4e-4
 
 
+@pytest.mark.slow
 def test_an_update_by_three_positions_has_errors_near_the_claimed_sd(rng):
     # WHY: a scale change was attributed to the bias, and force errors were 2.4 claimed sd RMS.
     known = fit([turned(rng, positions(18, 3))], replace(OPTIONS, mounting_sd=1e-5)).calibration

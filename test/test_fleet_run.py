@@ -163,6 +163,7 @@ def children_of(pid):
     return [int(word) for word in Path(f'/proc/{pid}/task/{pid}/children').read_text().split()]
 
 
+@pytest.mark.slow
 def test_ctrl_c_while_workers_start_prints_no_traceback(tmp_path):
     # WHY: after Ctrl-C each starting worker and Dask printed a traceback.
     write_unit(tmp_path / 'bags' / 'u', 1, 1)
