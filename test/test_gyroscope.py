@@ -28,7 +28,7 @@ from thermo_comp.unit.calibration import gyroscope_of, rate_triad
 from thermo_comp.unit.calibration_file import dump_calibration, parse_calibration
 from thermo_comp.unit.functions import Polynomial
 from thermo_comp.unit.gravity import EARTH_RATE, STANDARD_GRAVITY
-from thermo_comp.unit.prediction import bias_and_scale, ramp_states, sd_of_states
+from thermo_comp.unit.prediction import bias_and_scale, bias_scale_and_sd, ramp_states
 from thermo_comp.unit.rate_bias import MILLIDEGREE, RateCurve
 
 OPTIONS = FitOptions(gravity=STANDARD_GRAVITY, input='m/s^2')
@@ -180,7 +180,7 @@ def test_a_gyroscope_is_read_back_from_a_file_bit_for_bit():
     states = ramp_states(triad, np.array([10.0, 20.0, 30.0]))
     bias, scale = bias_and_scale(triad, states)
     np.testing.assert_array_equal(scale, 1.0)
-    sd_bias, sd_scale = sd_of_states(triad, states[1:2])
+    _, sd_bias, _, sd_scale = bias_scale_and_sd(triad, states[1:2])
     np.testing.assert_array_equal(sd_scale, 0.0)
     # At 20 degC the bias is its level; its variance is that of the level plus that of a turn-on.
     np.testing.assert_allclose(bias[1], (0.02 + 1e-5, -0.03, 0.01 + 1e-5))
