@@ -220,8 +220,13 @@ def test_the_advice_about_residuals_follows_from_their_sizes(given, name, messag
 @pytest.mark.parametrize(
     ('change', 'message'),
     [
-        ({'full_scale': -5.0}, '`full_scale` must be positive, got -5.0'),
-        ({'min_rest_s': 0.0}, '`min_rest_s` must be positive, got 0.0'),
+        ({'full_scale': -5.0}, '`full_scale` must be greater than 0, got -5.0'),
+        ({'min_rest_s': 0.0}, '`min_rest_s` must be greater than 0, got 0.0'),
+        ({'k2_sd': 0.0}, '`k2_sd` must be greater than 0, got 0.0'),
+        ({'k3_sd': 2.0}, '`k3_sd` must be at most 1, got 2.0'),
+        ({'still_sd': float('nan')}, '`still_sd` must be greater than 0, got nan'),
+        ({'gravity_sd': -1e-5}, '`gravity_sd` must be at least 0, got -1e-05'),
+        ({'mounting_sd': float('inf')}, '`mounting_sd` must be finite, got inf'),
         ({'input': 'g'}, '`input` must be one of counts, m/s'),
         ({'allow': ('span',)}, r'`allow` must be one of prior, saturation, .* got .span.'),
     ],

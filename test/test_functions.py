@@ -27,7 +27,7 @@ from thermo_comp.unit.functions import (
 )
 from thermo_comp.unit.metrics import norm_residual, residual_statistics, statistics_by_regime
 from thermo_comp.unit.posterior import posterior_of
-from thermo_comp.unit.prediction import in_a_soak, ramp_states, sd_of_states
+from thermo_comp.unit.prediction import bias_scale_and_sd, in_a_soak, ramp_states
 
 KNOTS = (-15.0, -6.0, 0.0, 4.0, 15.0)
 FUNCTIONS = [Polynomial((1.0,)), Polynomial((0.0, 2e-3, -3e-5, 4e-7, 1e-9)),
@@ -156,21 +156,21 @@ def test_the_predicted_sd_agrees_with_hand_numbers():
     # level of each set (5, 6).
     unit = slope_and_lag({0: 4e-4, 1: 1e-6, 2: 9e-4, 3: 0.0, 4: 1e-6, 5: 1e-12, 6: 4e-12})
     states = ramp_states(unit, np.array([20.0, 30.0]), 0.0, np.inf)
-    bias, scale = sd_of_states(unit, states)
+    _, bias, _, scale = bias_scale_and_sd(unit, states)
     # Bias variance at 30 degC: 4e-4 + 100 * 1e-6 counts^2, plus the residual's (30 um/s^2)^2.
     expected = np.sqrt([4e-4, 5e-4]) / 300.0
     assert bias[:, 0] == pytest.approx(np.hypot(expected, 3e-5), rel=1e-6)
     assert bias[:, 1] == pytest.approx([3e-5, 3e-5])
     assert scale[:, 0] == pytest.approx([1e-6, 1e-6], rel=1e-6)
     # In an endless ramp of 0.6 K/min a part with a lag of 600 s is 6 K behind the board.
-    bias, scale = sd_of_states(unit, ramp_states(unit, np.array([25.0]), 0.01, np.inf))
+    _, bias, _, scale = bias_scale_and_sd(unit, ramp_states(unit, np.array([25.0]), 0.01, np.inf))
     assert bias[0, 0] == pytest.approx(np.sqrt(9e-4 + 36e-6) / 300.0, rel=1e-6)
     assert scale[0, 0] == pytest.approx(2e-6, rel=1e-6)
 
 
 def test_parameters_without_variance_give_no_sd():
     unit = replace(rich_calibration(), posterior=None)
-    bias, scale = sd_of_states(unit, ramp_states(unit, np.array([20.0]), 0.0, np.inf))
+    _, bias, _, scale = bias_scale_and_sd(unit, ramp_states(unit, np.array([20.0]), 0.0, np.inf))
     assert bias == pytest.approx(np.full((1, 3), 1e-5))
     assert not scale.any()
 

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The calibration of a gyroscope agrees with simulated truth and closed formulas."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from thermo_comp.errors import CalibrationError
 from thermo_comp.fitting import FitOptions, FitSource, fit
 from thermo_comp.fitting.initial_triad import within_positions
 from thermo_comp.fitting.reduction import reduce_source
+from thermo_comp.fitting.sources import KnownForce, Section
 from thermo_comp.judging.evaluation import judge_bags
 from thermo_comp.judging.verdicts import Verdict
 from thermo_comp.online.batch import process_block
@@ -26,7 +28,7 @@ from thermo_comp.unit.calibration import gyroscope_of, rate_triad
 from thermo_comp.unit.calibration_file import dump_calibration, parse_calibration
 from thermo_comp.unit.functions import Polynomial
 from thermo_comp.unit.gravity import EARTH_RATE, STANDARD_GRAVITY
-from thermo_comp.unit.prediction import bias_and_scale, ramp_states, sd_of_states
+from thermo_comp.unit.prediction import bias_and_scale, bias_scale_and_sd, ramp_states
 from thermo_comp.unit.rate_bias import MILLIDEGREE, RateCurve
 
 OPTIONS = FitOptions(gravity=STANDARD_GRAVITY, input='m/s^2')
@@ -120,7 +122,8 @@ def test_a_gyroscope_does_not_change_the_accelerometer_s_fit(unit):
     stations = [replace(station, program=program) for station in plan('chamber-9', 2)[:2]]
     records = arrays(unit, stations, 2, rate_hz=RATE_HZ)
     options = replace(OPTIONS, groups=('curve', 'gradient'))
-    with_rate = fit([source_of(record, unit.scale_factor) for record in records], options)
+    plain = [source_of(record, unit.scale_factor) for record in records]
+    with_rate = fit(plain, options)
     silent = [np.zeros((len(record.counts), 3)) for record in records]
     sources = [
         source_of(o, unit.scale_factor, rate) for o, rate in zip(records, silent, strict=True)
@@ -144,6 +147,13 @@ def test_a_gyroscope_does_not_change_the_accelerometer_s_fit(unit):
     (messages,) = (finding.message for finding in result.findings if finding.name == 'rate')
     assert messages == 'first: not every sample has an angular rate, so no gyroscope was fitted'
     assert 'rate' not in {finding.name for finding in (*with_rate.findings, *without.findings)}
+    # If the stated |f| of rests differs, the file says, too, why it has no gyroscope.
+    known = KnownForce('stated', (Section(0.0, math.inf, 1.002 * STANDARD_GRAVITY, 0.0),))
+    result = fit([replace(plain[0], force=known), plain[1]], options)
+    notes = result.calibration.provenance.notes
+    assert result.calibration.gyroscope is None
+    assert any(note.startswith('rate: the stated |f| differs') for note in notes)
+    assert notes == tuple(str(each) for each in result.findings if each.level != 'good')
 
 
 @given(st.lists(st.integers(0, 4), min_size=1, max_size=30), st.integers(0, 2**32 - 1))
@@ -170,7 +180,7 @@ def test_a_gyroscope_is_read_back_from_a_file_bit_for_bit():
     states = ramp_states(triad, np.array([10.0, 20.0, 30.0]))
     bias, scale = bias_and_scale(triad, states)
     np.testing.assert_array_equal(scale, 1.0)
-    sd_bias, sd_scale = sd_of_states(triad, states[1:2])
+    _, sd_bias, _, sd_scale = bias_scale_and_sd(triad, states[1:2])
     np.testing.assert_array_equal(sd_scale, 0.0)
     # At 20 degC the bias is its level; its variance is that of the level plus that of a turn-on.
     np.testing.assert_allclose(bias[1], (0.02 + 1e-5, -0.03, 0.01 + 1e-5))

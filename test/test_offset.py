@@ -65,7 +65,7 @@ def test_constants_of_unsigned_words_equal_those_of_signed_words(words, plain, o
     np.testing.assert_allclose(scale, K, rtol=3e-4)
     np.testing.assert_allclose(result.calibration.misalignment, M, atol=3e-4)
     assert any(finding.name == 'offset' for finding in result.findings)
-    assert 'zero force reads' in result.calibration.provenance.notes[-1]
+    assert 'zero force reads' in result.calibration.provenance.notes[0]
     assert not any(finding.name == 'offset' for finding in plain.findings)
 
 

@@ -26,7 +26,7 @@ from thermo_comp.unit.calibration import AxisSet, LackOfFit, parameter_layout
 from thermo_comp.unit.correction import VARIANCES, Correction
 from thermo_comp.unit.covariance import N_ROWS
 from thermo_comp.unit.functions import CubicSpline, Exponential, Polynomial
-from thermo_comp.unit.prediction import SlowUncertainty, ramp_states, sd_of_states
+from thermo_comp.unit.prediction import SlowUncertainty, bias_scale_and_sd, ramp_states
 
 
 def test_the_claimed_sd_covers_a_start_in_a_ramp():
@@ -138,10 +138,10 @@ def test_the_lack_of_fit_is_included_in_the_sd_of_bias_and_of_scale():
     plain = calibration()
     lacking = replace(plain, static=replace(plain.static, lack_of_fit=lacks))
     states = ramp_states(plain, np.array([0.0, 20.0]))
-    before, after = (np.square(sd_of_states(unit, states)) for unit in (plain, lacking))
+    before, after = (np.square(bias_scale_and_sd(unit, states)) for unit in (plain, lacking))
     added = np.array([[0.0, 3e-3, 4e-3], [0.0, 0.0, 0.0]]) ** 2
-    np.testing.assert_allclose(after[0] - before[0], added, rtol=1e-9, atol=1e-18)
-    np.testing.assert_allclose(after[1] - before[1], added / GRAVITY**2, rtol=1e-9, atol=1e-18)
+    np.testing.assert_allclose(after[1] - before[1], added, rtol=1e-9, atol=1e-18)
+    np.testing.assert_allclose(after[3] - before[3], added / GRAVITY**2, rtol=1e-9, atol=1e-18)
 
 
 def test_a_state_beyond_the_edge_of_a_column_is_limited_and_increases_the_sd():

@@ -125,6 +125,7 @@ _PREPARED: dict[str, Bounds] = {
     'columns': Bounds(longest=2000, why='the columns of ten thermometers'),
 }
 Positive = Annotated[float, Bounds(above=0.0, below=math.inf)]
+PositiveOrNone = Annotated[float | None, Bounds(above=0.0, below=math.inf)]
 NotNegative = Annotated[float, Bounds(at_least=0.0, below=math.inf)]
 #: Bounds by the name of the quantity; the keys of a calibration refer to these names.
 QUANTITIES: Final[Mapping[str, Bounds]] = MappingProxyType(_PREPARED)
@@ -142,6 +143,7 @@ def refuse_impossible(value: Any) -> None:
     """Raise ValueError with the name of the key if a field of a dataclass violates its bounds."""
     cls: type = type(value)
     for name, bounds in _bounds_of(cls).items():
-        for bound in bounds:
-            if fault := bound.fault(getattr(value, name)):
-                raise ValueError(f'`{name}` {fault}, got {getattr(value, name)}')
+        given = getattr(value, name)
+        for bound in bounds if given is not None else ():
+            if fault := bound.fault(given):
+                raise ValueError(f'`{name}` {fault}, got {given}')

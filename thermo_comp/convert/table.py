@@ -11,10 +11,8 @@ import csv
 import os
 import re
 from array import array
-from calendar import timegm
 from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from decimal import Decimal
 from io import TextIOWrapper
 from itertools import chain, islice, takewhile
@@ -43,7 +41,7 @@ _MOST_ROWS_PER_BYTE = 4  # largest plausible number of rows per byte of a Parque
 STAMP_EXPONENTS: dict[TimeUnit, int] = {'s': 9, 'ms': 6, 'us': 3, 'ns': 0}
 #: Date of ISO 8601, in UTC unless an offset is given; the name of a zone may follow in brackets.
 _ISO = re.compile(
-    r'(\d{4})-(\d\d)-(\d\d)[T ](\d\d):(\d\d)(?::(\d\d)(?:[.,](\d{1,9})\d*)?)?'
+    r'(\d{4}-\d\d-\d\d[T ]\d\d:\d\d)(?:(:\d\d)(?:[.,](\d{1,9})\d*)?)?'
     r'\s*(?:(Z|UTC)|([+-])(\d\d):?(\d\d)?)?(?:\s*\[[^\]]*\])?'
 )
 
@@ -275,26 +273,24 @@ def _not_used(headings: Sequence[str], width: int, used: Container[int | None]) 
 
 def exact_ns(cell: object, unit: TimeUnit | None) -> int:
     """Return the exact stamp of a number or date; `NO_STAMP` if neither, or beyond 64 bits."""
-    if unit == 'iso':
-        return _iso_ns(str(cell).strip())
+    text = str(cell).strip()
     try:
-        number = Decimal(str(cell).strip()) * 10 ** STAMP_EXPONENTS[unit or 'ns']
+        number = (
+            _iso_ns(text) if unit == 'iso' else Decimal(text) * 10 ** STAMP_EXPONENTS[unit or 'ns']
+        )
         return round(number) if abs(number) < 2**63 - 1 else NO_STAMP
-    except ArithmeticError:
+    except (ArithmeticError, ValueError):
         return NO_STAMP
 
 
 def _iso_ns(text: str) -> int:
+    """Return nanoseconds since 1970; ValueError for an invalid date, such as 2026-02-30."""
     match = _ISO.fullmatch(text)
     if match is None:
-        return NO_STAMP
-    *moment, fraction, _, sign, hours, minutes = match.groups()
-    year, month, day, hour, minute, second = (int(part or 0) for part in moment)
-    try:
-        seconds = timegm(datetime(year, month, day, hour, minute, second).timetuple())
-    except ValueError:  # an invalid date, such as 2026-13-01
-        return NO_STAMP
-    east_s = 3600 * int(hours or 0) + 60 * int(minutes or 0)
+        raise ValueError('not a date of ISO 8601')
+    minute, second, fraction, _, sign, east_h, east_min = match.groups()
+    seconds = int(np.datetime64(minute + (second or ''), 's').astype(np.int64))
+    east_s = 3600 * int(east_h or 0) + 60 * int(east_min or 0)
     seconds += east_s if sign == '-' else -east_s
     return seconds * 10**9 + int((fraction or '').ljust(9, '0'))
 

@@ -30,7 +30,6 @@ from ..unit.posterior import posterior_of
 from ..unit.provenance import Provenance, ResidualSummary
 from . import thermal_ranges as ranges
 from .claim import Claim
-from .data_checks import Finding
 from .equations import as_vector
 from .evidence import ResidualRow, group_evidence, lack_of_fit
 from .initial_triad import white_noise_of
@@ -48,7 +47,6 @@ def build_calibration(
     bags: Sequence[ReducedBag],
     unit: Unit,
     residuals: Sequence[ResidualRow] = (),
-    findings: Sequence[Finding] = (),
     known: Calibration | None = None,
     nonlinearity: Nonlinearity | None = None,
 ) -> Calibration:
@@ -86,7 +84,7 @@ def build_calibration(
         rest_gradient_range_k=ranges.rest_gradient_range(windows, lag_s, known),
         soak_gradient_k=ranges.soak_gradient(windows, known),
         detector=model.detector,
-        provenance=_provenance(fit, bags, residuals, findings),
+        provenance=_provenance(fit, bags, residuals),
         evidence=group_evidence(regression, posterior) if windows.was_measured else (),
         nonlinearity=nonlinearity,
     )
@@ -166,10 +164,7 @@ def _of_columns(windows: ThermalWindows, mask: Bools) -> list[int]:
 
 
 def _provenance(
-    fit: Fit,
-    bags: Sequence[ReducedBag],
-    residuals: Sequence[ResidualRow],
-    findings: Sequence[Finding],
+    fit: Fit, bags: Sequence[ReducedBag], residuals: Sequence[ResidualRow]
 ) -> Provenance:
     # State the left-out RMS of ``|f| - g`` only if left-out |f| is scored in all positions.
     is_norm = bool(np.isfinite(fit.selected.score.norms.square).all())
@@ -198,7 +193,6 @@ def _provenance(
             for row in residuals
             if row.fitted.n
         ),
-        notes=tuple(str(finding) for finding in findings if finding.level != 'good'),
     )
 
 

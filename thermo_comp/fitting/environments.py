@@ -22,6 +22,7 @@ from ..text import one_line
 from ..typing import Bools, Floats
 from ..unit.calibration import Calibration, LackOfFit, RegimeSet
 from ..unit.gravity import MICRO_G
+from ..unit.metrics import means_by
 from .coverage import distinct_directions
 from .data_checks import POSITIONS_NEEDED, Finding, advice
 from .evidence import drift_variance
@@ -132,9 +133,8 @@ def _at_calibration(
 
 def _norm_errors(regression: Regression, state: State) -> Floats:
     """Return the error of |f| of each position's mean [m/s^2], shape (n_positions,)."""
-    position, n_windows = regression.windows.position, np.diff(regression.windows.edges)
-    means = [np.bincount(position, axis) / n_windows for axis in regression.force(state).T]
-    return np.asarray(np.linalg.norm(means, axis=0) - regression.norms(state))
+    means = means_by(regression.windows.position, regression.force(state))
+    return np.asarray(np.linalg.norm(means, axis=1) - regression.norms(state))
 
 
 def with_excluded_error(

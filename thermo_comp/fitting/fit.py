@@ -9,7 +9,7 @@ at zero force is subtracted before the fit and added to the bias after the fit.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -110,13 +110,17 @@ def fit_bags(
     # Threads would slow down the products of small matrices in the fit.
     with threadpool_limits(1, 'blas'):
         try:
-            return _fit_without_code_offset(recordings, options, progress)
+            result = _fit_without_code_offset(recordings, options, progress)
         except np.linalg.LinAlgError as error:
             raise FitError(
                 'the bags do not determine the fit: its equations have no solution in double '
                 'precision. Record rests of ten minutes or longer; bags that update a '
                 'prior calibration can be fitted together with the bags of the prior'
             ) from error
+    notes = tuple(str(finding) for finding in result.findings if finding.level != 'good')
+    calibration = result.calibration
+    provenance = replace(calibration.provenance, notes=notes)
+    return replace(result, calibration=replace(calibration, provenance=provenance))
 
 
 def _fit_without_code_offset(
@@ -134,7 +138,7 @@ def _fit_without_code_offset(
     result = _fit_one_environment(centred_bags, replace(options, prior=prior), progress)
     return replace(
         result,
-        calibration=with_notes(with_code_offset(result.calibration, offset), [finding]),
+        calibration=with_code_offset(result.calibration, offset),
         findings=(finding, *result.findings),
         bags=tuple(bags),
     )
@@ -183,13 +187,6 @@ def with_code_offset(calibration: Calibration, offset: Floats) -> Calibration:
     return replace(calibration, unit=replace(unit, full_scale=full_scale), axes=Axes(*axes))
 
 
-def with_notes(calibration: Calibration, findings: Iterable[Finding]) -> Calibration:
-    """Add findings to the notes of a calibration's provenance."""
-    provenance = calibration.provenance
-    notes = (*provenance.notes, *map(str, findings))
-    return replace(calibration, provenance=replace(provenance, notes=notes))
-
-
 def _fit_one_environment(
     bags: Sequence[ReducedBag], options: FitOptions, progress: Progress
 ) -> FitResult:
@@ -222,10 +219,7 @@ def _fit_one_environment(
         refit.calibration, left_out, others, is_updated=is_updated
     )
     return replace(
-        refit,
-        calibration=with_notes(calibration, [finding]),
-        findings=(*refit.findings, finding),
-        bags=tuple(bags),
+        refit, calibration=calibration, findings=(*refit.findings, finding), bags=tuple(bags)
     )
 
 
@@ -259,7 +253,6 @@ def _refined(
     )
     return replace(
         tilted,
-        calibration=with_notes(tilted.calibration, [finding]),
         positions=refit_checks.of_whole_rests(tilted.positions, bags),
         findings=(*tilted.findings, finding),
         bags=tuple(bags),
@@ -302,7 +295,7 @@ def _fit(
     try:
         nonlinearity = of_file(fit.regression, terms, options)
         calibration = build_calibration(
-            *(fit, claim, bags, _unit(bags, options)), *(residuals, findings, known, nonlinearity)
+            fit, claim, bags, _unit(bags, options), residuals, known, nonlinearity
         )
         rates: tuple[RateRow, ...] = ()
         if known is not None or not is_beyond(fit.windows):
@@ -313,14 +306,15 @@ def _fit(
     except ValueError as error:
         raise _unusable(error, fit.posterior.state.up) from error
     least = least_known(calibration, fit.posterior.state.up)
-    unseen = [*data_checks.judge_coverage(least), *judge_terms(calibration)]
-    unseen += judge_unseen_axes(fit, known)
+    findings += data_checks.judge_coverage(least)
+    findings += judge_terms(calibration)
+    findings += judge_unseen_axes(fit, known)
     return FitResult(
-        calibration=with_notes(calibration, unseen),
+        calibration=calibration,
         fit=fit,
         residuals=residuals,
         positions=position_reports(fit, in_sample, left_out),
-        findings=(*findings, *unseen),
+        findings=tuple(findings),
         least_known=least,
         bags=tuple(bags),
         rates=rates,

@@ -19,6 +19,7 @@ from scipy.optimize import least_squares
 from ..errors import FitError
 from ..typing import Floats, Ints
 from ..unit.gravity import STANDARD_GRAVITY
+from ..unit.metrics import means_by
 from .unknowns import BIAS_SD, SCALE_SD, Windows
 
 
@@ -177,7 +178,5 @@ def thermometer_error_of(windows: Windows, scale: Floats, *, beyond_noise: bool 
 
 def within_positions(values: Floats, position: Ints) -> Floats:
     """Subtract the mean over each position from values of windows, shape (n, k)."""
-    _, where, count = np.unique(position, return_inverse=True, return_counts=True)
-    total = np.zeros((len(count), values.shape[1]))
-    np.add.at(total, where, values)
-    return np.asarray(values - (total / count[:, None])[where])
+    _, where = np.unique(position, return_inverse=True)
+    return np.asarray(values - means_by(position, values)[where])

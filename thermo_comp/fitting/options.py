@@ -17,12 +17,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
 from ..errors import FitError
-from ..quantities import QUANTITIES
+from ..quantities import QUANTITIES, NotNegative, Positive, PositiveOrNone, refuse_impossible
 from ..recording.stillness import STILL_SD
 from ..thermal.settings import DetectorSettings
 from ..unit.calibration import Calibration
@@ -86,20 +86,20 @@ class FitOptions:
     groups: tuple[str, ...] | None = None
     forced: tuple[str, ...] = ()
     prior: Calibration | None = None
-    ageing_bias: float = 0.0
-    ageing_scale: float = 0.0
-    mounting_sd: float | None = None
-    gravity_sd: float = 0.0
-    k2_sd: float | None = None
-    k3_sd: float | None = None
+    ageing_bias: NotNegative = 0.0
+    ageing_scale: NotNegative = 0.0
+    mounting_sd: PositiveOrNone = None
+    gravity_sd: NotNegative = 0.0
+    k2_sd: Annotated[PositiveOrNone, QUANTITIES['nonlinearity']] = None
+    k3_sd: Annotated[PositiveOrNone, QUANTITIES['nonlinearity']] = None
     serial: str | None = None
     input: Literal['counts', 'm/s^2'] = 'counts'
-    full_scale: float | None = None
+    full_scale: PositiveOrNone = None
     offset: float | None = None
     reference_temperature: float = 20.0
     detector: DetectorSettings | None = None
-    min_rest_s: float | None = None
-    still_sd: float = STILL_SD * STANDARD_GRAVITY
+    min_rest_s: PositiveOrNone = None
+    still_sd: Positive = STILL_SD * STANDARD_GRAVITY
     allow: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -109,17 +109,7 @@ class FitOptions:
             raise FitError(
                 f'local gravity {self.gravity:g} m/s^2 is not found on Earth ({low}..{high} m/s^2)'
             )
-        for name in ('min_rest_s', 'still_sd', 'full_scale', 'mounting_sd', 'k2_sd', 'k3_sd'):
-            value = getattr(self, name)
-            if value is not None and not 0.0 < value < math.inf:
-                raise ValueError(f'`{name}` must be positive, got {value}')
-            if name in ('k2_sd', 'k3_sd') and value is not None:
-                fault = QUANTITIES['nonlinearity'].fault(value)
-                if fault:
-                    raise ValueError(f'`{name}` {fault}, got {value:g}')
-        for name in ('ageing_bias', 'ageing_scale', 'gravity_sd'):
-            if not 0.0 <= getattr(self, name) < math.inf:
-                raise ValueError(f'`{name}` must be 0 or positive, got {getattr(self, name)}')
+        refuse_impossible(self)
         if self.offset is not None and not math.isfinite(self.offset):
             raise ValueError(f'`offset` must be finite, got {self.offset}')
         if self.prior is not None:

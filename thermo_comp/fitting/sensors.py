@@ -219,11 +219,16 @@ def gradients_at_rest(bags: Sequence[ReducedBag], sensors: Sequence[str]) -> dic
                 rate.append(np.gradient(at, 60.0))
                 gradient.append(beside - at)
         g, v = np.concatenate(gradient), np.concatenate(rate)
-        moved = v - v.mean() if len(v) else v
-        power = float(moved @ moved)
-        lag = float(moved @ g) / power if power > 0.0 else 0.0
+        lag = np.nan_to_num(slope_of_gradient(g, v)) if len(g) else 0.0
         result[name] = round(float(np.median(g - lag * v)), 3) if len(g) else 0.0
     return result
+
+
+def slope_of_gradient(gradient: Floats, rate: Floats) -> float:
+    """Return the slope of the gradient over the rate [s], NaN at a constant rate."""
+    moved = rate - np.mean(rate)
+    power = float(moved @ moved)
+    return float(moved @ gradient) / power if power > 0.0 else np.nan
 
 
 def without_copies(bags: Sequence[ReducedBag]) -> tuple[list[ReducedBag], list[str]]:

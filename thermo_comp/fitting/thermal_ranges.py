@@ -22,6 +22,7 @@ from ..typing import Floats
 from ..unit.calibration import Calibration, LackOfFit
 from .data_checks import Finding, advice
 from .selection import Fit
+from .sensors import slope_of_gradient
 from .windows import CURVE, PART, ThermalWindows
 
 Range = tuple[float, float]
@@ -95,7 +96,7 @@ def rest_gradient_range(
 
 def measured_board_lag(windows: ThermalWindows) -> float:
     """Return the lag of the board behind the case [s], NaN without ramps or a case temperature."""
-    return _slope_of_gradient(windows) if _has_gradients(windows) else np.nan
+    return slope_of_gradient(windows.gradient, windows.rate) if _has_gradients(windows) else np.nan
 
 
 def _has_gradients(windows: ThermalWindows) -> bool:
@@ -106,15 +107,8 @@ def _has_gradients(windows: ThermalWindows) -> bool:
 
 def usable_board_lag(windows: ThermalWindows) -> float:
     """Return the lag of the board behind the case [s], or a usual lag if not in 1..1e5 s."""
-    lag = _slope_of_gradient(windows)
+    lag = slope_of_gradient(windows.gradient, windows.rate)
     return lag if 1.0 <= lag <= 1e5 else USUAL_BOARD_LAG_S
-
-
-def _slope_of_gradient(windows: ThermalWindows) -> float:
-    """Return the slope of the gradient over the rate [s], NaN at a constant rate."""
-    rate = windows.rate - np.mean(windows.rate)
-    power = float(rate @ rate)
-    return float(rate @ windows.gradient) / power if power > 0.0 else np.nan
 
 
 def with_unseen_axes(

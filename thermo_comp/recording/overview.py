@@ -16,6 +16,7 @@ from ..thermal.thermometer import COLDEST, HOTTEST
 from ..topics import TEMPERATURE
 from ..typing import Ints
 from ..unit.gravity import STANDARD_GRAVITY
+from ..unit.metrics import means_by
 from .blocks import LONGEST_PAUSE_NS, Block, Readings, RecordingInfo, unstamped
 from .fields import temperature_fields
 from .reader import RecordingReader, open_recording
@@ -226,10 +227,7 @@ def survey_thermometer(readings: Sequence[Readings]) -> ThermometerSurvey | None
     # Rates are taken between two-minute means, so that a step by a quantum is not a ramp.
     time = (stamp_ns - stamp_ns[0]) * 1e-9
     bins = np.maximum(time // _RAMP_WINDOW_S, 0).astype(np.int64)
-    _, place = np.unique(bins, return_inverse=True)
-    count = np.bincount(place)
-    mean_time = np.bincount(place, time) / count
-    mean = np.bincount(place, celsius) / count
+    mean_time, mean = means_by(bins, np.column_stack((time, celsius))).T
     rates = np.diff(mean) / np.maximum(np.diff(mean_time), 1e-9) * 60.0
     steps = np.abs(np.diff(celsius))
     intervals = np.diff(stamp_ns)

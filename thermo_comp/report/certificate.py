@@ -16,10 +16,10 @@ from ..unit.calibration import AXES, Calibration, RegimeSet
 from ..unit.gravity import MICRO_G
 from ..unit.prediction import (
     bias_and_scale,
+    bias_scale_and_sd,
     in_a_soak,
     nonlinear_coefficients,
     ramp_states,
-    sd_of_states,
 )
 from .evidence import Evidence
 from .statements import CertificateInfo
@@ -283,8 +283,7 @@ def evaluate(calibration: Calibration, program: Program, temperature: Floats) ->
     begun = lower if rate > 0.0 else upper
     lasted_s = (temperature - begun) / rate if rate else 0.0
     states = ramp_states(calibration, temperature, rate, lasted_s)
-    bias, scale = bias_and_scale(calibration, states)
-    sd_bias, sd_scale = sd_of_states(calibration, states)
+    bias, sd_bias, scale, sd_scale = bias_scale_and_sd(calibration, states)
     bias_0, _, scale_0, _ = in_a_soak(calibration)
     value = np.hstack(((bias - bias_0) / MICRO_G, (scale / scale_0 - 1.0) * 1e6))
     return Curve(program, temperature, value, np.hstack((sd_bias / MICRO_G, sd_scale * 1e6)))

@@ -285,7 +285,6 @@ def evidence_of_fit(result: FitResult, gravity_sd: float = 0.0) -> Evidence:
     """Return the evidence of a fit on its bags; `gravity_sd`: the fit's sd of gravity [m/s^2]."""
     rests = [(bag.source.name, rest.start_ns) for bag in result.bags for rest in bag.intervals]
     left_out = {(place.source, place.start_ns): place.left_out_rms for place in result.positions}
-    against = [f'{note.name}: {note.message}' for note in result.findings if _is_reservation(note)]
     window_s = usual_window(result.bags)
     judged = evidence_of_bags(result.bags, result.calibration, window_s=window_s, serial='')
     return replace(
@@ -293,7 +292,6 @@ def evidence_of_fit(result: FitResult, gravity_sd: float = 0.0) -> Evidence:
         steps=result.residuals,
         gravity_sd=gravity_sd,
         left_out={k: left_out[at] for k, at in enumerate(rests) if left_out.get(at, 0.0) > 0.0},
-        findings=tuple(dict.fromkeys((*judged.findings, *against))),
         checks=tuple(note.message for note in result.findings if not _is_reservation(note)),
     )
 

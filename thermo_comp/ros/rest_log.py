@@ -22,7 +22,6 @@ from ..errors import OutputError
 from ..field.gather import RestFinder
 from ..field.rest import SUFFIX, Start, counted_rests, encode, thinned
 from ..online.compensator import Compensator
-from ..thermal.state import StateLayout
 from ..typing import Floats, Stamps
 from .reader import LoadedCalibration
 
@@ -202,9 +201,6 @@ class RestKeeper:
         thermal, now_ns = compensator.thermal, compensator.now_ns
         if now_ns > thermal.fresh_until_ns or thermal.rate.is_too_fast:
             return None
-        if thermal.is_unmeasured:
-            width = StateLayout(thermal.correction.memory).width
-            return (*thermal.sample(now_ns), *[0.0] * width)[:width], ()
         return thermal.sample(now_ns), thermal.tracker.memory.remaining_shares(now_ns)
 
 

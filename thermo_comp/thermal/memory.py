@@ -12,6 +12,7 @@ between two readings (first-order hold) the exact step of m over dt is
 import math
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import accumulate
 from typing import Final
 
 import numpy as np
@@ -275,11 +276,7 @@ def _recursion(decay: float, driven: Floats) -> Floats:
 
 
 def _play(v: Floats, width: float) -> Floats:
-    held, result = float(v[0]), []
-    for value in v.tolist():
-        if held < value - width:
-            held = value - width
-        elif held > value + width:
-            held = value + width
-        result.append(held)
-    return np.array(result)
+    def step(p: float, v: float) -> float:
+        return v - width if p < v - width else v + width if p > v + width else p
+
+    return np.array(list(accumulate(v.tolist(), step)))

@@ -45,8 +45,11 @@ class Curves:
         self._levels = np.add(biases, deltas)[:, :, np.newaxis]
         residuals = [[axis.residual_sd_m_s2**2 for axis in part.axes()] for part in sets]
         self._residuals = np.array(residuals)[:, :, np.newaxis]
-        lacks = ([(p.temperature_c, *p.sd_m_s2) for p in part.lack_of_fit] for part in sets)
-        self._lacks = [np.array(points).reshape(-1, 4).T for points in lacks]
+        # For each set with a lack of fit: the temperatures of its points, then its variances.
+        lacks = (
+            [(p.temperature_c, *np.square(p.sd_m_s2)) for p in part.lack_of_fit] for part in sets
+        )
+        self._lacks = {regime: np.array(rows).T for regime, rows in enumerate(lacks) if rows}
 
     def excess(self, states: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Return distances of T_board [K] and rate [K/s] from the ranges, also in half ranges."""
@@ -86,16 +89,8 @@ class Curves:
     def lack_of_fit(self, board: Floats) -> Floats:
         """Evaluate the variance of the lack of fit by set and axis [m^2/s^4], shape (2, 3, n)."""
         result = np.zeros((2, 3, len(board)))
-        for regime, points in enumerate(self._lacks):
-            at, variance = points[0], points[1:] ** 2
-            if len(at) == 1:
-                result[regime] += variance
-            elif len(at):
-                held = hold(board, at[0], at[-1])
-                left = np.minimum(np.searchsorted(at, held, side='right') - 1, len(at) - 2)
-                share = (held - at[left]) / (at[left + 1] - at[left])
-                change = variance[:, left + 1] - variance[:, left]
-                result[regime] += variance[:, left] + change * share
+        for regime, (at, *variances) in self._lacks.items():
+            result[regime] = [np.interp(board, at, variance) for variance in variances]
         return result
 
     def slopes(self, board: Floats) -> Floats:

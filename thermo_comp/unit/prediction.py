@@ -154,9 +154,7 @@ def in_a_soak(
     at a board temperature [degC], by default the reference temperature.
     """
     at = np.array([calibration.reference_temperature_c if temperature is None else temperature])
-    states = ramp_states(calibration, at)
-    bias, scale = bias_and_scale(calibration, states)
-    sd_bias, sd_scale = sd_of_states(calibration, states)
+    bias, sd_bias, scale, sd_scale = bias_scale_and_sd(calibration, ramp_states(calibration, at))
     return bias[0], sd_bias[0], scale[0], sd_scale[0]
 
 
@@ -197,11 +195,13 @@ def bias_and_scale(calibration: Calibration, states: Floats) -> tuple[Floats, Fl
     return (bias / correction.K).T, scale.T
 
 
-def sd_of_states(calibration: Calibration, states: Floats) -> tuple[Floats, Floats]:
+def bias_scale_and_sd(
+    calibration: Calibration, states: Floats
+) -> tuple[Floats, Floats, Floats, Floats]:
     """
-    Predict the sd of bias [m/s^2] and relative scale at thermal states, shapes (n, 3), including
-    the sd of the self-heating gradient in a soak. The lack of fit of an axis at 1 g may be an
-    error of the bias or of the scale, so the sd of the bias and that of the scale include it.
+    Return bias [m/s^2], its sd, scale [input units per m/s^2] and its relative sd at thermal
+    states, shapes (n, 3). The sds include that of the self-heating gradient in a soak. The lack of
+    fit of an axis at 1 g may be an error of the bias or of the scale, so both sds include it.
     """
     correction = Correction(calibration)
     slow = SlowUncertainty(calibration, correction)
@@ -213,11 +213,12 @@ def sd_of_states(calibration: Calibration, states: Floats) -> tuple[Floats, Floa
     lack = correction.curves.lack_of_fit(board)[regime, :, each]
     warmer = states.copy()
     _add_gradient(warmer, calibration, (calibration.soak_gradient_k or (0.0, 0.0))[1])
-    by_gradient = correction.bias_scale(warmer.T) - correction.bias_scale(states.T)
-    bias, scale = (by_gradient / correction.K).swapaxes(1, 2) ** 2
+    here = correction.bias_scale(states.T)
+    of_bias, of_scale = ((correction.bias_scale(warmer.T) - here) / correction.K).swapaxes(1, 2)
     a, c = variance[:, :, 0] + unexplained, np.maximum(variance[:, :, 2], 0.0)
     c += lack / calibration.gravity_m_s2**2
-    return np.sqrt(a + bias), np.sqrt(c + scale)
+    bias, scale = (here[0] / correction.K).T, here[1].T
+    return bias, np.sqrt(a + of_bias**2), scale, np.sqrt(c + of_scale**2)
 
 
 def ramp_states(
