@@ -8,6 +8,7 @@ several options; `expanded` replaces such a parameter by its options, for typer.
 """
 
 import inspect
+import math
 import re
 import sys
 from collections.abc import Callable, Iterator
@@ -125,14 +126,20 @@ def check_serial(serial: str | None) -> str | None:
     return serial
 
 
+def check_rate(rate_hz: float | None) -> float | None:
+    """Refuse a sample rate above 1 MHz, which no accelerometer has."""
+    if rate_hz is not None and rate_hz > 1e6:
+        raise usage(f'expected at most 1e6 Hz, got {rate_hz:g} Hz')
+    return rate_hz
+
+
 FORCE = option('Overwrite an existing output of the same kind.', False, '-f')
 QUIET = option('Print only errors and missing parts of bags.', False, '-q')
 NEW_CALIBRATION = option('Calibration to write (YAML).', ..., '-o')
 CERTIFICATE_INFO = option(
     'Statements of the laboratory for the certificate: number, customer, ... (YAML).'
 )
-# No accelerometer samples faster than 1 MHz.
-TABLE_RATE = option('Samples per second of a table without times.', min=0.01, max=1e6)
+TABLE_RATE = option('Samples per second of a table without times.', min=0.01, callback=check_rate)
 SERIAL = option(
     "Serial of the unit, instead of the bag's; '': accept a calibration of any unit.",
     callback=check_serial,
@@ -316,13 +323,11 @@ def fitting(
         'Data-sheet bound (1 sd) of the quadratic nonlinearity, in ug/g^2; default: 100 with '
         '--k3-sd or if some rests are not at 1 g, else no nonlinearity.',
         min=1e-6,
-        max=1e6,
     ),
     k3_sd: float | None = option(
         'Data-sheet bound (1 sd) of the cubic nonlinearity, in ug/g^3; default: 10 with --k2-sd '
         'or if some rests are not at 1 g, else no nonlinearity.',
         min=1e-6,
-        max=1e6,
     ),
     allow: list[str] | None = option('Name of a refusal to override, as in the error message.'),
 ) -> dict[str, Any]:
@@ -330,6 +335,9 @@ def fitting(
     given = locals() | where
     if fault := QUANTITIES['temperature'].fault(reference_temperature):
         raise usage(f'--reference-temperature: {fault} degC, got {reference_temperature:g}')
+    for name, value, unit in (('--k2-sd', k2_sd, 'ug/g^2'), ('--k3-sd', k3_sd, 'ug/g^3')):
+        if value is not None and value > 1e6 * (QUANTITIES['nonlinearity'].at_most or math.inf):
+            raise usage(f'{name}: must be at most 1e6 {unit}, got {value:g}')
     del given['where']
     return given | {
         'still_sd': acceleration(still_sd, '--still-sd'),
