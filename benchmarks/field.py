@@ -84,8 +84,8 @@ def root_mean(values: Floats) -> float:
 
 def worse(after: list, new: Calibration, kalman: Floats) -> tuple[bool, bool]:
     """
-    Return whether the updated calibration has a larger RMS of |f| - g on the rests of a day than
-    the laboratory's calibration, and whether the Kalman filter has.
+    Return whether the RMS of |f| - g on the rests of a day is larger than with the laboratory's
+    calibration, for the updated calibration and for the Kalman filter.
 
     An RMS counts as larger if it exceeds the laboratory's by more than the standard error of an
     RMS over n turn-ons, the claimed sd / sqrt(2 n).

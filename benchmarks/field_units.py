@@ -149,8 +149,8 @@ def temperature(day: float, rng: np.random.Generator) -> float:
 
 def lasting(kind: str, seconds: float, rng: np.random.Generator) -> Iterator[float]:
     """
-    Yield the durations [s] of constant attitude in a rest of `seconds`: the rest itself in the
-    kinds 'level' and 'fixed', 20 to 90 s each in the other kinds.
+    Yield the durations [s] of the attitudes in a rest of `seconds`: one attitude in the kinds
+    'level' and 'fixed'; in the other kinds each attitude lasts 20 to 90 s.
     """
     while seconds >= WINDOW_S:
         rest = seconds if kind in ('level', 'fixed') else min(seconds, rng.uniform(20.0, 90.0))

@@ -199,8 +199,8 @@ def scaling(folder: Path, n_units: int, repeats: int, model: str) -> None:
             measure(folder / 'fleet', units, workers, options)
             for units, workers in ((n_units, 1), (n_units, 2), (n_units // 2, 1))
         )
-        # Other programs on the cores slow two workers more than one worker. `free` is the speed-up
-        # with a free core per worker; it is below 2, because workers wait and share memory.
+        # Other programs on the cores slow two workers more than one worker. `free`: speed-up if
+        # each worker had a core for itself; below 2, because workers wait and share memory.
         free = 2.0 * pair.busy(2) / solo.busy(1) * solo.cpu_s / pair.cpu_s
         collected.append((solo.seconds / pair.seconds, free, 2.0 * half.seconds / pair.seconds))
         print(

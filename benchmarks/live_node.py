@@ -191,6 +191,6 @@ def through_the_node(
             return n_in == n_sent and [*recorder.counts.values()] == [n_out, n_flags, n_flags]
 
         wait_until(is_complete, PATIENCE_S)
-    # The node does not count temperature readings, so `is_complete` does not wait for the regime
-    # flag of a reading after the last sample: this flag may arrive until the recorder is closed.
+    # The node does not count temperature readings, so `is_complete` does not wait for regime flags
+    # of readings after the last sample; such flags may arrive until the recorder is closed.
     return played, recorder.counts

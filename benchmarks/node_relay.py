@@ -22,9 +22,9 @@ removes samples from the source's store 859 at a time; with 2000 kept samples th
 the source by 1 to 3 ms, with the node and with the naive relay.
 
 Processes that missed each other's first DDS announcements discover each other at the next
-announcements, 3 s later. A process that opens the shared memory of another process may be blocked
-for a third of a second, because Fast DDS waits for a reader. The measurement begins when all
-processes have discovered each other.
+announcements, 3 s later. Fast DDS may block a process for a third of a second
+when the process opens the shared memory of another one. The measurement begins when all processes
+have discovered each other.
 
 An idle core sleeps and needs time to wake up, and the host may use an idle virtual core for other
 machines. On Linux, as root, all cores are kept awake for all relays, by a request for a wake-up

@@ -34,7 +34,7 @@ SINK_REST_S = 2e-3
 
 COUNTS = struct.Struct('<4siII7s5x3d')
 ENCAPSULATION = b'\0\1\0\0'
-#: frame_id of warm-up samples and of samples that the sink counts; relays copy it to the Imu.
+#: frame_id of warm-up samples, and of samples that the sink counts; relays copy the frame_id.
 WARM_UP, SAMPLE = b'warmup\0', b'sensor\0'
 
 

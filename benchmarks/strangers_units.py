@@ -438,7 +438,7 @@ def lagged(node: Floats, tau_s: float) -> Floats:
     if not tau_s:
         return node
     decay = np.exp(-STEP_S / tau_s)
-    # `behind`: node temperature less lagged temperature, in a long ramp `tau_s` times the rate.
+    # `behind`: node temperature less lagged temperature; in a long ramp, ramp rate times `tau_s`.
     gain = tau_s / STEP_S * (1.0 - decay)
     behind = lfilter([gain], [1.0, -decay], np.diff(node, prepend=node[0]))
     return np.asarray(node - behind)
