@@ -9,8 +9,9 @@ import pytest
 @pytest.mark.parametrize(
     ('name', 'command'),
     [
-        ('jump from 1970', 'fit'), ('equal stamps', 'replay'),
+        ('equal stamps', 'replay'),
         pytest.param('jump of a year', 'evaluate', marks=pytest.mark.slow),
+        pytest.param('jump from 1970', 'fit', marks=pytest.mark.slow),
         ('reversed stamps', 'fit'), ('stamps of the limits', 'info'), ('one sample', 'fit'),
         ('all zeros', 'fit'), ('readings of one stamp', 'info'),
         pytest.param('all values 1e308', 'report', marks=pytest.mark.slow),

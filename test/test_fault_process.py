@@ -52,6 +52,7 @@ def test_a_restarted_publisher_changes_no_output(node):
     assert second.values['lost'] == '0'
 
 
+@pytest.mark.slow
 def test_a_node_killed_in_a_ramp_restarts_with_larger_covariance(path):
     events = [e for e in bag() if seconds_of(e[1]) < 300.0]
     _, undisturbed = corrected(events)

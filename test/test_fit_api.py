@@ -63,6 +63,7 @@ def test_a_curve_without_a_knee_is_fitted_without_a_knee(monkeypatch):
     assert not [term for term in unit.response if term.group == 'bend']
 
 
+@pytest.mark.slow
 def test_a_thermometer_on_two_topics_is_used_once():
     bags = []
     for copies in (('board',), ('board', 'case')):

@@ -111,6 +111,7 @@ def test_all_units_are_fitted_despite_a_killed_worker_and_only_once(client, flee
     assert {name for name, known in seen.items() if known} == {'A/good'}
 
 
+@pytest.mark.slow
 def test_unreadable_bags_leave_earlier_results_in_place(scheduler, tmp_path):
     # WHY: when bags could not be read, a second run deleted the results of the first run.
     bags = write_unit(tmp_path / 'bags' / 'unit', 1)

@@ -117,6 +117,7 @@ def test_left_out_residuals_of_a_gyroscope_are_near_its_fitted_residuals(fitted)
     assert row.fitted.rms <= row.left_out.rms < 1.05 * FLOOR
 
 
+@pytest.mark.slow
 def test_a_gyroscope_does_not_change_the_accelerometer_s_fit(unit):
     program = parse_cyclogram('20 10min, 35@1.5 10min, 10@1.5 15min')
     stations = [replace(station, program=program) for station in plan('chamber-9', 2)[:2]]

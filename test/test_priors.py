@@ -185,6 +185,7 @@ def test_a_fit_begins_with_the_widest_of_its_priors():
         assert np.linalg.eigvalsh(narrower).min() > -1e-6
 
 
+@pytest.mark.slow
 def test_three_positions_reduce_the_sd_of_an_aged_calibration():
     old = fitted(9).calibration
     later = [source(record) for record in test_of(9, 9, 12)]

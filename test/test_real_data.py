@@ -97,6 +97,7 @@ def test_the_freezer_run_is_refused_for_its_jumps(real_data, work):
     assert [float(size) for _, size in jumps] == pytest.approx([20.0, 17.0, 2.0], abs=4.0)
 
 
+@pytest.mark.slow
 def test_the_bias_slope_of_the_freezer_run_before_its_jumps_is_that_of_the_norm(real_data, work):
     topics = Topics(part=BagPart(47.5, 358.5))
     result = fit(fit_sources([freezer_bag(real_data, work)], topics)[0], OPTIONS)

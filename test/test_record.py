@@ -264,6 +264,7 @@ class TestLive:
             assert len(messages) > 0.95 * len(sent[topic])
         check_fit({**result, 'command': result['command'].replace(str(bags), '.')}, cli, bags)
 
+    @pytest.mark.slow
     def test_imu_messages_under_other_names_are_recorded_until_a_signal(self, play, tmp_path):
         n, force = 2000, 9.81 * UPS[0]
         stamps = START_NS + np.arange(n) * 20_000_000
@@ -285,6 +286,7 @@ class TestLive:
         assert sorted(bags.iterdir()) == numbered_bags(bags)
 
     @pytest.mark.usefixtures('play')
+    @pytest.mark.slow
     def test_a_topic_of_a_wrong_type_is_named(self, tmp_path):
         from geometry_msgs.msg import PointStamped
         from ros_helpers import Peer
