@@ -177,7 +177,8 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | a board temperature that leads the case temperature in ramps (swapped topics) | the covariance is increased, ERROR |
 | counts constant for `stuck_timeout`, on all axes or on one axis while the others change or show their noise; samples of three zeros | dropped, counted, ERROR |
 | counts that come faster than their conversion cycle | dropped, counted, ERROR |
-| a magnitude of the specific force at rest that differs from gravity by more than `gravity_tolerance` | nothing is published, ERROR |
+| a magnitude of the specific force at rest that differs from gravity by more than `gravity_tolerance`, also a smooth acceleration that turns the force by over 3 degrees or follows a rest after over 60 s of motion | nothing is published, ERROR |
+| a constant force along the force at the last rest but larger or smaller, after motion, as in a coordinated turn | published: the platform accelerates |
 | a second publisher of a topic | the topic is not used, ERROR, until one publisher is left or for one second all messages are from one publisher (WARN while the middleware still lists a killed publisher, for 20 s) |
 | a sample without a finite correction | dropped, counted, ERROR |
 | a message of more than 1 kB (a very long `frame_id`) | dropped, counted |

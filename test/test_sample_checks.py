@@ -20,7 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from thermo_comp.online.checks import STUCK_SAMPLES, GravityCheck, StuckCheck
+from thermo_comp.online.checks import SAME_DIRECTION, STUCK_SAMPLES, GravityCheck, StuckCheck
 from thermo_comp.online.compensator import Compensator, CompensatorConfig
 from thermo_comp.unit.calibration import Unit
 
@@ -358,6 +358,26 @@ def test_a_change_by_motion_does_not_refute_the_calibration_at_once(rng):
     # |f| changes by 1 m/s^2 within 0.8 s, as in a lift, and with added noise, as in a shaking car.
     assert steps(rng, offset=1.0, ramp_s=0.8, rate_hz=5.0)[0] > 2.0
     assert steps(rng, offset=1.0, scatter=0.05, rate_hz=5.0)[0] > 2.0
+
+
+@pytest.mark.parametrize(('bank_deg', 'tilt_deg'), [(20.0, 0.0), (60.0, 2.0), (30.0, 5.0)])
+def test_a_smooth_coordinated_turn_is_an_acceleration_and_not_a_wrong_calibration(
+    bank_deg, tilt_deg, rng
+):
+    # WHY: |f| = g / cos(bank) without vibration stopped the output for the whole turn.
+    monitor = GravityCheck(GRAVITY, tolerance=0.5)
+    for k in range(12_000):
+        seconds = 0.01 * k
+        banked = float(np.interp(seconds, [20.0, 26.0, 90.0, 96.0], [0.0, 1.0, 1.0, 0.0]))
+        size = GRAVITY / math.cos(math.radians(bank_deg * banked))
+        attack = math.radians(tilt_deg * banked)
+        force = size * np.array([math.sin(attack), 0.0, math.cos(attack)])
+        force += NOISE_SD * rng.standard_normal(3)
+        monitor.add(round(seconds * 1e9), tuple(force), COVARIANCE, 3 * NOISE_SD**2)
+        if monitor.is_refuted:
+            break
+    # A force that has turned by 5 deg could be that of a wrong axis at rest in another attitude.
+    assert monitor.is_refuted == (tilt_deg > math.degrees(SAME_DIRECTION))
 
 
 def test_a_vibration_of_whole_periods_between_readings_is_no_rest(rng):

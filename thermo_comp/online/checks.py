@@ -61,6 +61,11 @@ REFUTING_WINDOWS: Final = 3
 RESTORING_WINDOWS: Final = 2
 #: Time at rest after a step of |f|, after which the step is judged [ns].
 STEP_NS: Final = 300_000_000
+#: The platform, not the calibration, changes |f| if the force keeps its direction within this
+#: angle [rad] after motion, as in a coordinated turn, and if this time [ns] is not exceeded since
+#: a window agreed: a wrong axis changes |f| with the direction of the force.
+SAME_DIRECTION: Final = 0.05
+LONGEST_MANOEUVRE_NS: Final = 60_000_000_000
 #: A residual of |f| above the tolerance plus this number of its sd refutes the calibration.
 REFUTING_SIGMAS: Final = 5.0
 
@@ -271,6 +276,10 @@ class GravityCheck:
         self._is_resting = False  # whether the last sample agreed with the last still window
         self._begin_ns = self._last_ns = 0
         self._last_mean: list[float] | None = None
+        #: Mean force and stamp [ns] of the last still window in which |f| agreed with gravity or
+        #: in which the platform accelerated; whether a window has not been still since.
+        self._agreed: tuple[list[float], int] | None = None
+        self._has_moved = False
         self._weight = 0.0
         # Residual of |f|, or None before the first still window.
         self.result: GravityResidual | None = None
@@ -352,6 +361,7 @@ class GravityCheck:
         change = LARGEST_CHANGE + 4.0 * math.sqrt(2.0 * noise_variance / (3.0 * n))
         largest = max(abs(a - b) for a, b in zip(mean, last, strict=True))
         if not (scatter <= SCATTER_FACTOR**2 * noise_variance and largest <= change):
+            self._has_moved = True
             self.result = self.result and self.result._replace(is_still=False)
             return
         size = math.hypot(*mean)
@@ -360,6 +370,12 @@ class GravityCheck:
         variance = max(variance_along(mean, covariance) - noise, 0.0) + noise / n
         limit = self._tolerance + REFUTING_SIGMAS * math.sqrt(variance)
         is_against = abs(size - self.gravity) > limit
+        if not is_against:
+            self._agreed, self._has_moved = (mean, self._last_ns), False
+        elif self._is_accelerated(mean, size):
+            self._agreed = (mean, self._last_ns)
+            self.result = self.result and self.result._replace(is_still=False)
+            return
         if is_against == self._is_against:
             self._n_agreeing += 1
         else:
@@ -374,3 +390,12 @@ class GravityCheck:
         residual += gain * (size - self.gravity - residual)
         sd = math.sqrt(sd**2 + gain * (variance - sd**2))
         self.result = GravityResidual(residual, sd, n + 1, is_still=True)
+
+    def _is_accelerated(self, mean: Sequence[float], size: float) -> bool:
+        """Whether the platform's acceleration may explain a wrong |f| of constant force."""
+        if self.is_refuted or self._agreed is None or not self._has_moved:
+            return False
+        agreed, agreed_ns = self._agreed
+        along = sum(a * b for a, b in zip(agreed, mean, strict=True)) / math.hypot(*agreed)
+        is_parallel = along > math.cos(SAME_DIRECTION) * size
+        return is_parallel and self._last_ns - agreed_ns <= LONGEST_MANOEUVRE_NS
