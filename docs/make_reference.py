@@ -169,7 +169,7 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | board temperature outside the calibrated range | curves continue along their tangent for a quarter of the range, and are constant beyond; the covariance is increased, WARN with the distance |
 | gradient or rate outside the calibrated range | the value is limited to the range, the covariance is increased, WARN with the distance |
 | a temperature that is NaN, below -273.15 or above 1000 degC | dropped, counted |
-| a temperature that changes faster than that of any part can | the readings are not used until they are plausible again or the thermometer counts as lost |
+| a temperature that changes faster than that of any part can | the readings are not used until they are plausible again or the thermometer counts as lost; if they stay, the jump adds to the covariance until a jump back, WARN |
 | a temperature that is constant while that of the second thermometer changes | the constant readings are not used: the last used value is held, then the thermometer counts as lost |
 | both temperatures constant over at least 20 readings and 5 s | the temperatures are used with a growing covariance, WARN |
 | case readings that repeat those of the board (one topic for both), ten changed readings in a row | the readings are used; the gradient expected of the case adds to the covariance, WARN |

@@ -123,6 +123,24 @@ def test_a_frozen_sensor_is_detected_by_changes_of_the_second_sensor(sensor, fro
     assert guard.fault == Fault.NONE
 
 
+@pytest.mark.parametrize('sensor', ['board', 'case'])
+def test_a_jump_that_stays_is_claimed_until_the_readings_jump_back(sensor):
+    # WHY: three lags after a jump by 5 K the claimed sd of the temperature had forgotten the jump.
+    tracker = tracker_of(memory=LAG)
+    place = VAR_BOARD if sensor == 'board' else VAR_GRADIENT
+    for second in range(12_000):
+        flicker = 0.004 * (-1) ** second
+        for name in ('board', 'case'):
+            is_wrong = name == sensor and 1000 <= second < 6000
+            tracker.read(name, second * SECOND_NS, 20.0 + flicker + (5.0 if is_wrong else 0.0))
+        if second == 5999:
+            assert tracker.sample(second * SECOND_NS)[place] == pytest.approx(25.0, rel=0.02)
+            assert tracker.checks[sensor].finding == (Fault.SHIFTED, pytest.approx(5.0, abs=0.02))
+    # The square of a jump fades with the time constant of 600 s: 25 K^2 exp(-10) is left.
+    assert tracker.sample(12_000 * SECOND_NS)[place] < 0.1**2
+    assert tracker.checks[sensor].finding[0] is Fault.NONE
+
+
 def test_the_dynamic_regime_does_not_end_because_both_sensors_freeze():
     tracker = tracker_of()
     soak(tracker, seconds=1500)

@@ -324,7 +324,7 @@ class Compensator:
         detector, gravity = tracker.detector, self.gravity
         stamp_ns = tracker.updated_ns if self.now_ns is None else self.now_ns
         ahead_s = 0.0 if stamp_ns is None else thermal.queue.ahead(stamp_ns)
-        faults = {name: (check.fault, check.step) for name, check in tracker.checks.items()}
+        faults = {name: check.finding for name, check in tracker.checks.items()}
         board_ns, case_ns = tracker.board.stamp_ns, tracker.case.stamp_ns
         if stamp_ns is None or (board_ns is None and not thermal.is_unmeasured):
             return CompensatorStatus(stamp_ns, faults, ahead_s)

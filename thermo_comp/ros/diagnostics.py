@@ -63,6 +63,7 @@ _FAULTS = {
     Fault.STILL: 'stands still (equal readings), its standard deviation grows',
     Fault.FROZEN: 'frozen (equal readings) while the other temperature changes: not used',
     Fault.STEP: 'jumped by {:+.2f} K; its readings are not used',
+    Fault.SHIFTED: 'has jumped by {:+.1f} K, included in its standard deviation: sensor loose?',
     Fault.COPY: "repeats the board thermometer's readings: do both read one topic?",
     Fault.LOOSE: 'is {:.1f} K farther from that of the case than in the fit: thermometer loose?',
 }

@@ -77,6 +77,9 @@ class Fault(Enum):
     #: A board temperature that differs from the case's by more than ramp and self-heating explain,
     #: as with a loose thermometer: its readings are used, with a larger variance.
     LOOSE = 'apart'
+    #: Readings, used, since a jump that no part's temperature can make and that no jump back has
+    #: undone: their variance includes the square of the jump.
+    SHIFTED = 'shifted'
     #: Readings, used, that equal the board's, as if both inputs had one topic; the variance of the
     #: gradient then includes the square of the gradient that is expected without the sensor.
     COPY = 'copy of the board'
@@ -90,6 +93,8 @@ class SensorCheck:
 
     def __init__(self, sensor: Thermometer, other: Thermometer, lag_s: float) -> None:
         self.sensor, self._other, self.lag_s = sensor, other, lag_s
+        #: Sum of the impossible jumps [K] after which the readings were used again.
+        self.shift = 0.0
         settings = sensor.settings
         self._quantum = settings.quantum_c
         self._has_cells = settings.has_cells
@@ -114,6 +119,12 @@ class SensorCheck:
         self._seen_ns: int | None = None
         #: The first readings [degC] and their stamps, until the third reading judges the first.
         self._first: list[tuple[int, float]] | None = []
+
+    @property
+    def finding(self) -> tuple[Fault, float]:
+        """The present fault, and the size of its jump [K]."""
+        is_shifted = self.fault is Fault.NONE and abs(self.shift) > LARGEST_STEP
+        return (Fault.SHIFTED, self.shift) if is_shifted else (self.fault, self.step)
 
     def forget_other(self) -> None:
         """Measure the change of the other sensor anew, from the other sensor's next reading on."""
@@ -227,7 +238,7 @@ class SensorCheck:
 
     def extra_variance(self, stamp_ns: int) -> float:
         """Return the variance of a temperature due to constant readings and jumps [K^2]."""
-        return self._jump_at(stamp_ns) + self.still(stamp_ns)[0] ** 2
+        return max(self._jump_at(stamp_ns), self.shift**2) + self.still(stamp_ns)[0] ** 2
 
     def still(self, stamp_ns: int) -> tuple[float, float]:
         """

@@ -156,7 +156,7 @@ class ThermalTracker:
         if check.has_wrong_start(stamp_ns, celsius):
             self._begin_again(name, sensor)
         before_ns, before, n_restarts = sensor.stamp_ns, sensor.temperature, sensor.n_restarts
-        n_before = sensor.n_in_row
+        n_before, has_jumped = sensor.n_in_row, check.fault is Fault.STEP
         is_anew = not check.admits(stamp_ns, celsius)
         if is_anew:
             # Restart the estimate if all readings within the time-out were rejected as steps.
@@ -186,6 +186,7 @@ class ThermalTracker:
                 memory.forget()
             if is_new or not is_gap:
                 change = sensor.temperature - before
+                check.shift += change if is_anew or has_jumped else 0.0
                 check.note_jump(stamp_ns, change)
                 memory.note_jump(change)
         return True
