@@ -67,7 +67,7 @@ class Sets:
 
     @property
     def families(self) -> tuple[TemperatureFunction, TemperatureFunction]:
-        """Families of both curves; the dynamic curve, if shared, has the higher of both orders."""
+        """Families of static and dynamic curve; a shared dynamic curve has the higher order."""
         is_higher = self.is_shared and self.static.n_free > self.dynamic.n_free
         return self.static, self.static if is_higher else self.dynamic
 
@@ -145,7 +145,7 @@ class Model:
 
 class Track(NamedTuple):
     """
-    The thermal states of a tracker over a bag, without lags and plays.
+    The thermal states of a tracker over a bag, without states of lags and of hysteresis.
 
     start_s, step_s: start and step of the time grid [s]
     states: thermal states, shape (n, width); is_known: which states are valid, shape (n,)
@@ -349,8 +349,8 @@ def _windows(
     tilt = np.column_stack((t, gradient, (t + gradient) ** 2))
     tilt_rms = np.sqrt(np.mean(tilt**2, axis=0))
     is_tilting = tilt_rms > 0.0
-    # No weights in the scale: the level of the dynamic set (the relative scale at the reference
-    # temperature is 1 in both regimes), and terms that act on the bias only (not `has_scale`).
+    # The level of the dynamic set has no weight in the scale, as the relative scale is 1 at the
+    # reference temperature in both regimes; terms without `has_scale` act on the bias only.
     in_scale = [True] * n_curves + [c.term.has_scale for c in columns] + [True] * len(sums)
     in_scale[model.sets.level] = False
     start = np.hstack((np.zeros((len(t), n_curves)), rows.start))
