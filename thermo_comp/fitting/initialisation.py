@@ -69,7 +69,7 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     Fit the windows, with or without a prior calibration.
 
     Without a prior, if the positions are whole rests and temperature changes more between than
-    within positions, two fits are made: of the curve to the means of the positions, and to all
+    within positions, the curve is fitted twice: to the means of the positions, and to all
     windows. The fit to the means is returned unless the other fit is better on left-out data.
     """
     if problem.options.prior is not None:

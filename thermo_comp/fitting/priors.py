@@ -116,7 +116,7 @@ def informative_priors(
             'the prior has no covariance: use a calibration that was fitted to bags; an imported '
             'calibration cannot be a prior'
         )
-    # Pairs to try: `ageing`, sd of change of bias [g] and scale factor (0: the user states it); and
+    # Pairs to try: `ageing`, sd of change of bias [g] and scale factor (0: the user states it);
     # `share`, the ratio of an added uncorrelated variance to each variance of the calibration.
     tried = [(0.0, share) for share in (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)]
     # The fit begins with the last, widest prior: in a first fit with a narrow prior, the

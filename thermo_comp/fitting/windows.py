@@ -118,7 +118,7 @@ class Model:
         """
         The powers x, x^2 and x^3 of the temperature x of each axis's part, as sums of columns:
         factors of the m columns of sets and response, shape (9, m), in the order of axes, then of
-        powers; (0, m) without `parts`, if a column is missing, or if the sets share no cubic.
+        powers; (0, m) without `parts`, without a needed column, or if the sets share no cubic.
 
         The temperature of a part less the reference is ``x = t - m``, with the board temperature t
         and the part's lag m. x^p is a sum of t^p, t^(p-1) m, ..., m^p (binomial theorem), so one
