@@ -65,7 +65,7 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     Two rests are compared if the gap between them is at most 30 s or 250 samples, whichever is
     longer, and their directions differ by less than 10 degrees.
     """
-    # Rests are made of whole cells, usually of 30 samples, so a low sample rate makes long gaps.
+    # Rests are whole cells, usually of 30 samples or more, so a low sample rate makes long gaps.
     longest_ns = 1e9 * max(30.0, 250.0 * bag.cycle_s)
     margin_s = max(_MARGIN_S, 120.0 * bag.cycle_s)  # at least 120 samples
     means = [np.average(rest.mean, axis=0, weights=rest.count) for rest in bag.intervals]
