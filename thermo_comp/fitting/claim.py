@@ -63,8 +63,8 @@ def claim_of(fit: Fit, gravity_sd: float = 0.0, known_offset_sd: float = 0.0) ->
     offsets by a prior calibration, or 0 [m/s^2]
     """
     regression, chosen = fit.regression, fit.posterior
-    # All rests of a mounting share an offset, but the regression has an offset for each rest: with
-    # `n_rests` times the variance, the mean over a mounting's rests has the offset's variance.
+    # The rests of a mounting share an offset, but the regression has an offset for each rest: with
+    # its variance times `n_rests`, the mean over a mounting's rests has the variance of the offset.
     mounting = regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
     prior = replace(chosen.prior, offset_sd=chosen.prior.offset_sd * n_rests**0.5)
@@ -244,7 +244,7 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
     share = np.sqrt(np.maximum(is_lag.sum(axis=1, keepdims=True), 1))
     sd = np.where(is_lag, np.minimum(sd, typical / share), sd)
     units = np.array([[1.0], [1.0 / (regression.gravity or 1.0)]])
-    # A column is nearly constant if its `kelvins` are below 1 % of those of column t, the first.
+    # A column is nearly constant if its `kelvins` are below 1 % of the `kelvins` of column t.
     is_constant = kelvins < 0.01 * float(kelvins[0])
     ratio = np.where(is_constant, float(kelvins[0]) / np.maximum(kelvins, 1e-9), 1.0)
     matters = (sd > 0.0) & (sd * ratio > 2.0 * float(np.mean(prior.sigma)) * units)
@@ -332,7 +332,7 @@ def _norm_evidence(
     weight = rows[:, -1]
     along, errors = rows[:, :-2] / weight[:, None], rows[:, -2] / weight
     if prior.informative is None:
-        # The constants have so wide a prior that its mean may be replaced by their fitted values.
+        # The prior of the constants is so wide that their fitted values can replace its mean.
         weights = layout.axis[:, 2:].ravel()
         constants = np.setdiff1d(np.arange(layout.n_unit), weights)
         of_prior = np.hstack((

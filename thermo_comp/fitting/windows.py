@@ -35,9 +35,9 @@ from .unknowns import Windows
 #: Groups of columns: the curve, the difference of the static and dynamic sets, bends (changes of
 #: slope at a temperature), and the curves over the temperatures of parts.
 CURVE, SET, BEND, PART = 'curve', 'set', 'bend', 'part'
-#: Groups of columns linear in a difference of temperatures; groups of the products of such a
-#: difference with temperature, and of its squares. The groups 'board' and `PRODUCTS`, with the
-#: curve, form the curves over a part's temperature.
+#: `LAGS`: groups of columns linear in a difference of temperatures. `PRODUCTS`: groups of the lag
+#: times powers of the temperature, and of the square and cube of the lag. 'board', `PRODUCTS` and
+#: the curve form the curves over a part's temperature.
 LAGS, PRODUCTS = ('gradient', 'board', 'gradient_lag'), ('product', 'square')
 #: Number of windows into which a short rest is divided, to determine the noise of the rest.
 FEWEST_WINDOWS = 20
