@@ -64,7 +64,7 @@ def claim_of(fit: Fit, gravity_sd: float = 0.0, known_offset_sd: float = 0.0) ->
     """
     regression, chosen = fit.regression, fit.posterior
     # The rests of a mounting share an offset, but the regression has an offset for each rest: with
-    # its variance times `n_rests`, the mean over a mounting's rests has the variance of the offset.
+    # its variance times `n_rests`, the mean over a mounting's rests has the right variance.
     mounting = regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
     prior = replace(chosen.prior, offset_sd=chosen.prior.offset_sd * n_rests**0.5)
