@@ -64,8 +64,8 @@ def build_calibration(
     lag_s = known.board_lag_s if known else ranges.usable_board_lag(windows)
     sensors = {*model.sensors[:1], *(column.sensor for column in columns)}
     window_s = windows.typical_count * float(np.median([bag.cycle_s for bag in bags]))
-    # Slow noise that stands for a drift without a column may explain most of the white noise, too:
-    # then differences of windows, in which a drift cancels, give the white noise.
+    # Slow noise fitted to a drift that no column describes may absorb most of the white noise,
+    # too: then differences of windows, in which a drift cancels, give the white noise.
     sigma, least = prior.sigma, white_noise_of(regression.windows, regression.nominal_scale)
     sigma = np.where(sigma < 0.7 * least, least, sigma)
     blank = Calibration(
@@ -227,7 +227,7 @@ def with_parameters(
     """
     Replace the scale factors and the parameters of a calibration.
 
-    `values`: parameters in the order of the posterior; constant errors of scale factors: unused
+    `values`: parameters in the order of the posterior; their scale factor errors are not used
     """
     layout = parameter_layout(calibration)
     levels = values[[bias.static for bias in layout.bias]]

@@ -63,8 +63,8 @@ def claim_of(fit: Fit, gravity_sd: float = 0.0, known_offset_sd: float = 0.0) ->
     offsets by a prior calibration, or 0 [m/s^2]
     """
     regression, chosen = fit.regression, fit.posterior
-    # All rests of a mounting share an offset, but the regression has an offset for each rest: with
-    # `n_rests` times the variance, the mean over a mounting's rests has the offset's variance.
+    # The rests of a mounting share an offset, but the regression has an offset for each rest: with
+    # its variance times `n_rests`, the mean over a mounting's rests has the right variance.
     mounting = regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
     prior = replace(chosen.prior, offset_sd=chosen.prior.offset_sd * n_rests**0.5)
@@ -117,7 +117,7 @@ def _over_offsets(
     n_mountings = int(windows.mounting[-1]) + 1
     is_single = windows.n_turn_ons == 1 < n_mountings
     if scale <= 0.0:
-        # An sd stated by the user is that of mounting and turn-on offsets. In the regression the
+        # An sd stated by the user is that of mounting plus turn-on offset. In the regression the
         # mean of m mounting offsets has the variance sd^2 / m: add the other (1 - 1 / m) sd^2.
         variance = offset_sd**2 * (1.0 - 1.0 / n_mountings) if is_single else 0.0
         return posterior.covariance, offset_sd, variance
@@ -159,8 +159,8 @@ def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Fl
     # `largest`: largest usual offset sd / `scale`, for mountings within a turn-on, for a single
     # turn-on, and ('both') for several turn-ons or mountings that each begin with a turn-on. By
     # data sheets, the bias repeats to 0.3 .. 1 mg over turn-ons of tactical triads and to some mg
-    # over turn-ons of MEMS, 10 to 20 times `scale`. The values of `largest` for turn-ons are
-    # between those of data sheets and of units whose bias repeats perfectly.
+    # over turn-ons of MEMS, 10 to 20 times `scale`. `largest` for turn-ons is between these
+    # 10 to 20 and 0, the ratio of a unit whose bias repeats perfectly.
     largest = {'mounting': 1.0, 'turn-on': 2.0, 'both': 5.0}[kind]
     # The log evidence is smooth over the grid's step, a third of a decade of the sd.
     ratio = 10.0 ** np.linspace(-3.45, 2.25, 19)
@@ -193,7 +193,7 @@ def _widened(
     is_of_means = np.mean(within**2, axis=0) < np.mean((regression.columns - within) ** 2, axis=0)
     weights = np.where(is_of_means, of_means.weights, state.weights)
     other = replace(of_means, weights=weights)
-    # Columns active only in `of_means` get a tiny prior sd, so that the covariance has their rows.
+    # Columns that only `of_means` has get a tiny prior sd, so that the covariance has their rows.
     is_used = other.weights.any(axis=1) & (prior.column_sd == 0.0)
     prior = replace(prior, column_sd=np.where(is_used, 1e-9, prior.column_sd))
     with_unseen = regression.solve(state, prior, n_steps=0)
@@ -208,7 +208,7 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
 
     The weight of an inactive column is consistent with 0, but the data bound it only to ``1 /
     sqrt(S)``, S being the information about the weight given the active columns. The column gets
-    weight 0 and, as sd, the smaller of this bound and the prior sd, if this sd exceeds two sd of a
+    weight 0 and, as sd, the smaller of ``1 / sqrt(S)`` and the prior sd, if it exceeds two sd of a
     window's noise. For the comparison with the noise, the sd of a nearly constant column is scaled
     to the RMS of the board temperature t [K].
     """
@@ -226,7 +226,7 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
     sd[inactive.part, inactive.column] = 1.0 / np.sqrt(np.maximum(information, 1e-300))
     is_of_lags = np.isin(groups, LAGS)
     if not regression.windows.has_drifts:
-        # At constant temperatures only thermometer errors change lags: do not bound their weights.
+        # At constant temperatures only thermometer errors change lags: do not bound lags' weights.
         sd = np.where((sd > 0.0) & (regression.windows.lag >= 0), np.inf, sd)
     sd = np.where(is_of_lags, sd, np.minimum(sd, typical))
     if CURVE in active:
@@ -244,7 +244,7 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
     share = np.sqrt(np.maximum(is_lag.sum(axis=1, keepdims=True), 1))
     sd = np.where(is_lag, np.minimum(sd, typical / share), sd)
     units = np.array([[1.0], [1.0 / (regression.gravity or 1.0)]])
-    # A column is nearly constant if its `kelvins` are below 1 % of those of column t, the first.
+    # A column is nearly constant if its `kelvins` are below 1 % of the `kelvins` of column t.
     is_constant = kelvins < 0.01 * float(kelvins[0])
     ratio = np.where(is_constant, float(kelvins[0]) / np.maximum(kelvins, 1e-9), 1.0)
     matters = (sd > 0.0) & (sd * ratio > 2.0 * float(np.mean(prior.sigma)) * units)
@@ -332,7 +332,7 @@ def _norm_evidence(
     weight = rows[:, -1]
     along, errors = rows[:, :-2] / weight[:, None], rows[:, -2] / weight
     if prior.informative is None:
-        # The constants have so wide a prior that its mean may be replaced by their fitted values.
+        # The prior of the constants is so wide that their fitted values can replace its mean.
         weights = layout.axis[:, 2:].ravel()
         constants = np.setdiff1d(np.arange(layout.n_unit), weights)
         of_prior = np.hstack((
@@ -383,7 +383,7 @@ def _ratios_to_noise(change: Floats, remaining: Floats) -> Floats:
     covariance of the fit of all windows is the unit matrix
     """
     shares, directions = np.linalg.eigh(remaining.T @ remaining)
-    # Use combinations of unknowns about which left-out windows have over 1e-6 of the information.
+    # Use combinations of unknowns for which left-out windows have over 1e-6 of all information.
     is_measured = shares < 1.0 - 1e-6
     shares = np.maximum(shares[is_measured], 1e-12)
     return np.asarray((change @ directions[:, is_measured]) ** 2 * shares / (1.0 - shares))

@@ -80,7 +80,7 @@ def next_direction(covariance: Floats, sd: float, positions: Floats) -> Floats:
 
 
 def farthest(up: Floats) -> tuple[Floats, float]:
-    """Return the direction farthest from its nearest vector in `up`, (n, 3); their angle [deg]."""
+    """Return the direction farthest from all `up`, (n, 3), and the angle to the nearest [deg]."""
     nearest = np.max(_SPHERE @ up.T, axis=1, initial=-1.0)
     chosen = int(np.argmin(nearest))
     return _SPHERE[chosen], float(np.degrees(np.arccos(np.minimum(nearest[chosen], 1.0))))
@@ -97,7 +97,7 @@ def distinct_directions(up: Floats) -> Floats:
 
 
 def directions(means: Floats, centre: Floats) -> Floats:
-    """Return unit vectors from a centre to mean readings (n, 3); NaN if a reading is there."""
+    """Return unit vectors from a centre to mean readings (n, 3); NaN for one at the centre."""
     norms = np.linalg.norm(means - centre, axis=1, keepdims=True)
     return np.asarray((means - centre) / np.where(norms > 0.0, norms, np.nan))
 
@@ -127,7 +127,7 @@ def rough_centre(means: Floats) -> Floats:
     # sphere, because they are almost in a plane.
     if values[0] < 0.02 * values[2]:
         return zero
-    # A sphere about c satisfies |m|^2 = 2 c m + const; subtracting the mean keeps numbers small.
+    # Readings m on a sphere about c satisfy |m|^2 = 2 c m + const; less their mean they are small.
     columns = np.column_stack((2.0 * arms, np.ones(len(arms))))
     centre = np.linalg.lstsq(columns, np.sum(arms**2, axis=1), rcond=None)[0][:3]
     radii = np.linalg.norm(arms - centre, axis=1)
@@ -157,9 +157,9 @@ def best_rests(candidates: list[Floats]) -> int:
     Return the index of the best candidate: a set of n rests, given by mean readings, (n, 3).
 
     The largest sd of a calibration constant follows from the directions of a set's rests and the
-    residuals of |f|. The best set is the first whose largest sd is within 2 % of the smallest of
-    all sets, as earlier sets have longer, quieter rests. The index is 0 if no set has rests in six
-    attitudes.
+    residuals of |f|. The best set is the first whose largest sd is at most 2 % above that of any
+    other set, as earlier sets have longer, quieter rests. The index is 0 if no set has rests in
+    six attitudes.
     """
     counts = [n_directions(means) for means in candidates]
     costs = np.array([

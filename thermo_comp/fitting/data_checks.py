@@ -125,7 +125,7 @@ def _judge_span(windows: ThermalWindows) -> Finding:
 
 
 def _judge_beyond(windows: ThermalWindows, prior: Calibration) -> Finding:
-    # The model of a prior omits windows beyond its range, which the tracks contain.
+    # A fit with a prior omits windows beyond the prior's temperatures; the tracks have them.
     tracks = (track.states[track.is_known, BOARD] for track in windows.tracks)
     temperature = np.concatenate((windows.temperature, *tracks))
     edges = [edge for part in prior.regime_sets() for edge in part.temperature_range_c]
@@ -359,8 +359,8 @@ def judge_result(
     else:
         yield Finding('residual', 'good', text)
     alone = overall.two_sets.rms
-    # Two residuals do not contradict the prior: those by bias shifts of up to 2 sd (2 `slow`), and
-    # those by initial lag states, which the fit estimates, so that its noise `sigma` stays small.
+    # A residual by bias shifts of up to 2 sd (2 `slow`) does not contradict the prior, nor one by
+    # initial lag states, which the fit estimates, so that its noise `sigma` stays small.
     contradiction, sigma = '', float(np.mean(prior.sigma))
     is_above = overall.fitted.rms > np.hypot(1.5 * alone, 2.0 * slow) and sigma > 1.5 * alone
     if options.prior is not None and is_above:

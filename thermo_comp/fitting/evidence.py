@@ -169,7 +169,7 @@ def group_evidence(regression: Regression, posterior: PosteriorMode) -> tuple[Gr
             if of_prior is None:
                 weight_sd = regression.weight_sd(prior)[k][:, used].ravel()
             else:
-                # One sd for all weights: the geometric mean of their prior's principal sds.
+                # All weights get one sd, the geometric mean of the principal sds of their prior.
                 root = of_prior[places]
                 mean_sd = np.exp(np.linalg.slogdet(root @ root.T)[1] / (2.0 * len(root)))
                 weight_sd = np.full(len(places), mean_sd)

@@ -58,7 +58,7 @@ class Inactive:
     Q: Floats
 
     def _in_prior_sd(self, column_sd: Floats, wanted: Bools) -> tuple[Floats, Floats, Ints]:
-        """Return S, Q and column of each weight of `wanted` columns; S and Q are in prior sds."""
+        """Return S and Q for `wanted` columns' weights over prior sds, and their columns."""
         sd = np.repeat(column_sd[self.part, self.column] * wanted[self.column], 3)
         at = np.flatnonzero(sd > 0.0)
         S = self.S[np.ix_(at, at)] * np.outer(sd[at], sd[at])
@@ -67,8 +67,8 @@ class Inactive:
     def gain(self, column_sd: Floats, wanted: Bools) -> float:
         """
         Return the gain in log evidence, at least 0, if the columns in the mask `wanted`, (m,), are
-        added: ``(q (1 + S)^-1 q - log det(1 + S)) / 2``. S and q are for weights in units of prior
-        sds: `column_sd`, (2, m), times the root of the `_SQUARED_FACTORS` element of largest gain.
+        added: ``(Q (1 + S)^-1 Q - log det(1 + S)) / 2``, for weights divided by their prior sds. A
+        prior sd is `column_sd`, (2, m), times the factor of largest gain (`_SQUARED_FACTORS`).
         """
         S, Q, _ = self._in_prior_sd(column_sd, wanted)
         S, along = np.linalg.eigh(S)

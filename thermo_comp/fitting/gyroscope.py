@@ -84,7 +84,7 @@ def add_gyroscope(
     # The positions determine the sd of the offsets well: `claim_of` need not marginalise this sd.
     chosen = replace(fit.posterior, prior=replace(fit.posterior.prior, offset_scale=0.0))
     claim = claim_of(fit._replace(selected=replace(fit.selected, posterior=chosen)))
-    # The variance of the offsets includes that of the Earth's rate, which is no error.
+    # The offsets contain the Earth's rate, which is no error: subtract its variance.
     claim = replace(claim, offset_sd=math.sqrt(max(claim.offset_sd**2 - earth_sd**2, 0.0)))
     triad = build_calibration(fit, claim, bags, calibration.unit)
     needed = {*calibration.sensors, *triad.sensors}

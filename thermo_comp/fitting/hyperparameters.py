@@ -5,8 +5,8 @@ Owns the estimation of prior sds and noises, and the removal of columns of small
 
 Each column has one prior standard deviation of its weights in the bias of all axes and one in the
 scale. Newton's steps move each sd that is not fixed to the mode of log evidence [1]_ plus the log
-of a hyperprior, which is log-normal with centre sd0 and variance tau^2 of log sd. This mode
-satisfies ``effective parameters + log(sd / sd0) / tau^2 = sum w^2 / sd^2``, w being the weights of
+of a hyperprior, which is log-normal with centre sd0 and variance tau^2 of log sd. At this mode
+``effective parameters + log(sd / sd0) / tau^2 = sum w^2 / sd^2``, w being the weights of
 the column on the three axes. Without information about a column its prior sd stays at sd0.
 
 References
@@ -179,7 +179,7 @@ def _toward(
     slope: Floats | float,
     bend: Floats | float,
 ) -> Floats:
-    """Return Newton's step of log sd, within +-2, for ``power / sd^2 = effective + slope``."""
+    """Return Newton's step of log sd, within +-2, to ``power / sd^2 = effective + slope``."""
     ratio = power / (sd * sd)
     gradient = ratio - effective - slope
     curvature = 2.0 * np.minimum(ratio, 2.0 * effective + 1.0) + 0.5 * effective + bend

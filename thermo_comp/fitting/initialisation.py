@@ -69,7 +69,7 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     Fit the windows, with or without a prior calibration.
 
     Without a prior, if the positions are whole rests and temperature changes more between than
-    within positions, two fits are made: of the curve to the means of the positions, and to all
+    within positions, the curve is fitted twice: to the means of the positions, and to all
     windows. The fit to the means is returned unless the other fit is better on left-out data.
     """
     if problem.options.prior is not None:
@@ -81,8 +81,8 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
         windows = replace(windows, data=rests.constant_in(data, is_steady, is_settled))
     if problem.has_pieces or not rests.is_constant(windows, windows.data.position):
         return _regress(windows, problem)
-    # In a soak a lag of unknown size and the remaining drift of the temperature change |f| by
-    # similar amounts, so only the differences of |f| between positions determine the curve.
+    # In a soak the effects of an unknown lag and of the remaining drift of the temperature are of
+    # similar size, so only the differences of |f| between positions determine the curve.
     everywhere = np.ones(windows.data.n_positions, dtype=bool)
     at_rest = replace(windows, data=rests.constant_in(windows.data, everywhere, everywhere))
     # Both regressions report progress from 0.7 to 0.95: map each to its half of this range.
@@ -139,7 +139,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     chosen = selected.posterior
     full_prior = replace(chosen.prior, bias_sd=prior.bias_sd, scale_sd=prior.scale_sd)
     selected = replace(selected, posterior=replace(chosen, prior=full_prior))
-    # The covariance has the full prior sd of slopes of the scale, not halved by `_steepest`.
+    # For the covariance, undo `_steepest`'s halving of the prior sd of the scale factor's slope.
     limits = STEEPEST, _steepest(n_directions)
     full, used = (_typical_slopes(steepness, limit, options.gravity) for limit in limits)
     claimed = candidates.typical * (full / used)[:, np.newaxis]
@@ -272,9 +272,9 @@ def _noise_in_1_hz(windows: ThermalWindows, scale: Floats) -> float:
 def _mounting_scale(noise: float) -> float:
     """Return the prior scale of mounting offsets [m/s^2], from the noise in a 1 Hz bandwidth."""
     # The prior scale of offsets is at least 30 ug, typical of navigation grade, and at most 0.5
-    # mg, of consumer MEMS; the tail of the Student prior allows for larger offsets. With almost no
-    # noise the lower bound is 100 times this noise, because an offset 1e6 times as large as the
-    # noise cannot be estimated in double precision.
+    # mg, of consumer MEMS; the tail of the Student prior allows for larger offsets. For noise
+    # below 0.3 ug the smallest prior scale is 100 times the noise, because an offset 1e6 times as
+    # large as the noise cannot be estimated in double precision.
     least, most = max(min(3e-4, 100.0 * noise), 1e-7), 5e-3
     return float(np.clip(3.0 * noise, least, most))
 

@@ -129,10 +129,10 @@ def _intervals(parts: Sequence[ReducedBag]) -> tuple[StillInterval, ...]:
 
 def _is_one_rest(before: StillInterval, after: StillInterval, window_s: float) -> bool:
     """
-    Whether a rest continues in the next part. The gap between the parts is at most three windows
-    long. On each axis the step over the gap is at most five times the RMS, or twice the largest,
-    of the steps between successive windows of the 20 before and the 20 after the gap (most steps
-    may be 0 by rounding). With fewer than 10 steps between these windows the result is False.
+    Whether a rest continues in the next part: the gap between the parts is at most three windows
+    long, and on each axis the step over the gap is at most five times the RMS, or twice the
+    largest (most may be 0 by rounding), of the steps between successive windows, up to 20 windows
+    on each side of the gap. With fewer than 10 such steps the result is False.
     """
     gap_s = 1e-9 * (after.start_ns - before.end_ns)
     means = before.mean[: before.n_whole][-20:], after.mean[:20]

@@ -5,9 +5,9 @@ Owns the detection of jumps: steps in the reading of an accelerometer at rest.
 
 The reading of a sensor can step within one sample, if a die relaxes or a piece slips. The
 temperature does not step, so no function of temperature describes a jump, and a fit to data across
-a jump gives a wrong curve. A jump differs from a rotation of the unit in two ways. The samples
-before and after a jump scatter no more than at rest. A jump changes the norm of the reading, which
-is almost constant in a rotation, or a gyroscope measures no rotation during the jump.
+a jump gives a wrong curve. A jump differs from a rotation of the unit in two ways: the samples
+before and after a jump scatter no more than at rest; and either the norm of the reading, which is
+almost constant in a rotation, changes, or a gyroscope measures no rotation during the jump.
 
 If a sensor has a low-pass filter, neighbouring samples have a correlation r, and the slow noise of
 the samples hides a step. The noise of the differences ``a_i - r a_(i-1)`` is white (generalised
@@ -65,7 +65,7 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     Two rests are compared if the gap between them is at most 30 s or 250 samples, whichever is
     longer, and their directions differ by less than 10 degrees.
     """
-    # Rests are made of whole cells, usually of 30 samples, so a low sample rate makes long gaps.
+    # Rests are whole cells, usually of 30 samples or more, so a low sample rate makes long gaps.
     longest_ns = 1e9 * max(30.0, 250.0 * bag.cycle_s)
     margin_s = max(_MARGIN_S, 120.0 * bag.cycle_s)  # at least 120 samples
     means = [np.average(rest.mean, axis=0, weights=rest.count) for rest in bag.intervals]
@@ -164,7 +164,7 @@ def _examine(
 
 
 def _correlation(residual: Floats, sd: Floats) -> Floats:
-    """Return the ratio, >= 1, of the sd of a mean residual to that by white noise `sd`, (3,)."""
+    """Return the sd of a mean residual over its sd for white noise `sd`, at least 1, (3,)."""
     # A lag-1 correlation r of the means of 40 pieces multiplies the variance of the mean of all
     # pieces by (1 + r) / (1 - r).
     size = max(len(residual) // 40, 1)
@@ -216,8 +216,8 @@ def _place_of_step(time: Floats, accel: Floats, quiet_sd: Floats, r: float) -> i
     residual = residual - trend @ (trend.T @ residual)
     candidates = np.arange(_FEWEST_SAMPLES, n - _FEWEST_SAMPLES + 1)
     # A unit step at sample k, whitened for the lag-1 correlation r, is 1 at k and 1 - r after k:
-    # its product with a residual is a sum over the residuals from sample k on. Subtraction
-    # of the trend lowers the sum of squares of the step by its squared products with the trend.
+    # its product with a residual is a sum over the residuals from sample k on. Without its
+    # trend, the unit step has a sum of squares smaller by its squared products with the trend.
     tail = _sums_behind(residual, r)[candidates]
     trend_tail = _sums_behind(trend, r)[candidates]
     square = 1.0 + (1.0 - r) ** 2 * (n - candidates - 1) - (trend_tail**2).sum(axis=1)
@@ -254,7 +254,7 @@ def _trend(time: Floats, r: float) -> Floats:
 
 
 def _turn(time: Floats, gyro: Floats, at: int) -> float:
-    """Return the rotation within 1 s of a step [rad], by rates less the median of each side."""
+    """Return the rotation within 1 s of a step [rad], by rates less their median on each side."""
     about_level = [side - np.median(side, axis=0) for side in (gyro[:at], gyro[at:])]
     angles = np.concatenate(about_level)[1:] * np.diff(time)[:, None]
     return float(np.linalg.norm(angles[np.abs(time[1:] - time[at]) <= 1.0].sum(axis=0)))

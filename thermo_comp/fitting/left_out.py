@@ -13,7 +13,7 @@ does not depend on the attitude) and, if the other positions determine |f|, ``|f
 
 Model A is better than B if the error of A is smaller by more than the standard error over folds,
 both for positions and for sections of the program; `gain` lists exceptions. A model that describes
-only one recording fails on left-out positions; a model of only one program, on left-out sections.
+only one recording fails on left-out positions; one of a single program fails on left-out sections.
 
 References
 ----------
@@ -80,9 +80,9 @@ class Folds:
         (positive if `other` is better), and the standard error of the log ratio, over the folds
         that are scored for both models; None without such folds.
 
-        The result is the more significant of two estimates, or 0 if their signs differ. The mean
-        of the log ratios of the folds is robust to few folds of large errors; the log ratio of the
-        sums of squares over the folds (with a jackknife error), to folds of small errors.
+        The result is the more significant of two estimates of the log ratio, or 0 if their signs
+        differ: the mean over the folds, which few folds of large errors hardly change; and the log
+        ratio of sums of squares (jackknife error), which folds of small errors hardly change.
         """
         known = np.isfinite(self.square) & np.isfinite(other.square)
         n = int(known.sum())
@@ -178,7 +178,7 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     left-out halves of the chamber program, a sign of too many columns, exclude a gain. Larger
     errors of left-out |f| exclude a gain; so does a larger expected error of the bias at settled
     temperatures, unless noise explains the drift. A drift that noise explains need not
-    decrease, because the drift of left-out soaks contains no effects of ramps.
+    decrease for a gain, because the drift of left-out soaks contains no effects of ramps.
     """
     *drifts, norms = _beyond_thermometer(before, after)
     drift = [gain for gain in drifts if gain]
@@ -211,8 +211,8 @@ def is_worse_by_norms(before: Score, after: Score) -> bool:
 def is_undecided(before: Score, after: Score) -> bool:
     """
     Whether left-out data do not decide between two models, given that `after` is not better: the
-    drifts agree to 5 %, and errors of |f| are smaller in `after` by more than one standard error,
-    or no fold has an error of |f| for both models.
+    drifts agree to 5 %, and errors of |f| are smaller in `after` by more than one standard error
+    or cannot be compared (no fold has both, or a coarse thermometer explains them).
     """
     *drift, norms = _beyond_thermometer(before, after)
     is_equal = all(abs(gain[0]) < _NEGLIGIBLE_LOG_RATIO for gain in drift if gain)
@@ -369,7 +369,7 @@ def _by_sections(
     is_within: bool = False,
 ) -> tuple[Folds, Floats]:
     """
-    Score the drift of left-out sections about the mean of the position's windows in the fit. Each
+    Score left-out sections by their drift about the mean of the position's remaining windows. Each
     fit without sections is `n_steps` Gauss-Newton steps from the fit of all data.
 
     `folds`: sections of each fold; `is_within`: score only temperatures that occur in the fit

@@ -185,7 +185,7 @@ class _TermFits:
         return self.score(used - dropped).norms.gain_of(self.score(used).norms) or (0.0, 0.0)
 
     def is_determined(self, used: _Active, at: int) -> bool:
-        """Whether the data determine a nonlinear coefficient, averaged over the axes."""
+        """Whether the data determine a nonlinear coefficient, on average over the three axes."""
         posterior = self.posterior(used)
         share = posterior.determined[posterior.layout.nonlinear[:, at]]
         return bool(share.mean() > _DETERMINED_SHARE)

@@ -175,8 +175,8 @@ def _family(name: str, lower: float, upper: float) -> TemperatureFunction:
     if name == 'exponential':
         # Exponentials that grow e-fold in 15 K (leakage currents, which double in 10 K) and 30 K.
         return Exponential(-2.0, (1.0, 1.0), (15.0, 30.0))
-    # The spline has five equidistant knots, and a knot at the reference temperature, which
-    # replaces the equidistant knots near the reference temperature.
+    # The spline has a knot at the reference temperature, and five equidistant knots without those
+    # within 0.3 intervals of the reference temperature.
     knots = np.linspace(lower, upper, 5)
     step = max((upper - lower) / 4, 1.0)
     kept = sorted([0.0, *(float(k) for k in knots if abs(k) > 0.3 * step)])

@@ -89,7 +89,7 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> list[Part
 
     Returns [] if the model with one lag per axis does not explain the drift of all axes, or if the
     data do not determine a time constant. If the residual exceeds the noise for all shapes of the
-    curves, a second stage may only describe slow noise or a tilt of the support. The result then
+    curves, a second stage might just describe slow noise or a tilt of the support: the result then
     begins with lags of one stage, if they at least halve the RMS residual of each axis.
     """
     data, columns = windows.data, windows.model.columns

@@ -49,8 +49,8 @@ def prior_model(calibration: Calibration) -> Model:
     """
     Return the model of a calibration, with one curve for each regime.
 
-    More than 1 K beyond the temperatures of the calibration of the same unit, the windows would
-    change its effects of temperature by extrapolated columns, so they are not used.
+    Windows more than 1 K beyond the temperature range of a calibration of the same unit are not
+    used: they would change its effects of temperature by extrapolated columns.
     """
     regimes = calibration.regime_sets()
     static, dynamic = (regime.x.bias_function for regime in regimes)
@@ -116,7 +116,7 @@ def informative_priors(
             'the prior has no covariance: use a calibration that was fitted to bags; an imported '
             'calibration cannot be a prior'
         )
-    # Pairs to try: sd of bias [g] and of scale factor due to ageing (0: as the user states); and
+    # Pairs to try: `ageing`, sd of change of bias [g] and scale factor (0: the user states it);
     # `share`, the ratio of an added uncorrelated variance to each variance of the calibration.
     tried = [(0.0, share) for share in (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)]
     # The fit begins with the last, widest prior: in a first fit with a narrow prior, the

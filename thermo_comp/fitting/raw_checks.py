@@ -280,8 +280,8 @@ def judge_missing(bags: Sequence[ReducedBag], windows: ThermalWindows) -> Iterat
 
 def _missing(bag: ReducedBag, track: Track) -> tuple[float, float, float]:
     """
-    Return numbers of a bag's samples at rest: all; before the board temperature is accurate; and
-    later ones without a known temperature, while all thermometers are recorded.
+    Return three numbers of samples at rest: of all; of those before the board temperature is
+    accurate; and of later ones without a known temperature while all thermometers are recorded.
     """
     read = [readings.stamp_ns for readings in bag.temperatures.values() if len(readings.stamp_ns)]
     begin_s = 1e-9 * (max(stamp_ns[0] for stamp_ns in read) - bag.start_ns)

@@ -198,8 +198,8 @@ def reduce_source(
     3 s, or at least 1 or 2 s if these shorter rests determine bias and scale better. The largest
     variance allowed in a rest is chosen so that rests determine bias and scale best. If the user
     or the bag states |f|, the limit of the variance is fixed, and `min_rest_s` is by default 3 s.
-    At a low sample rate, cells of the usual number of samples are so long that drifts look like
-    motions and short rests are lost: cells of 10 or 5 samples are tried.
+    At a low sample rate, cells of the usual 30 samples are so long that drifts look like motions
+    and short rests are lost: cells of 10 or 5 samples are tried.
     """
 
     def reduced(least: int) -> tuple[ReducedBag, float]:
@@ -320,8 +320,8 @@ def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
 @np.errstate(invalid='ignore')
 def is_spike(value: Floats) -> Bools:
     """Return which readings are over 10 K from the median of five readings about them, (n,)."""
-    # A thermometer with a loose contact reads -127 or 85 degC for a moment. The sd of its noise is
-    # estimated without such spikes, so that the tracker rejects the spikes as outliers.
+    # A thermometer with a loose contact reads -127 or 85 degC for a moment. Estimates of its noise
+    # leave out these spikes, so that the tracker rejects the spikes as outliers.
     far = np.zeros(len(value), dtype=bool)
     if len(value) > 4:
         middle = np.median(sliding_window_view(value, 5), axis=1)
@@ -427,7 +427,7 @@ def rounding_sd(variance: Floats, drift: Floats, quantum: Floats) -> Floats:
 
     `variance`: median variance of the rounded samples in a cell; above 0, the noise of the
     samples averages the rounding error to 0.
-    `drift`: range of the means; a range of n steps divides the sd of the rounding error by n + 1.
+    `drift`: range of the windows' means; a range of n converter steps divides the sd by n + 1.
     """
     steps = np.divide(drift, quantum, where=quantum > 0.0, out=np.zeros(3))
     return np.asarray(np.where(variance > 0.0, 0.0, quantum / 12.0**0.5 / (1.0 + steps)))

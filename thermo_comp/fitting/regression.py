@@ -111,7 +111,7 @@ class Point:
         of_data = float((each + self.regression.noise_determinant).sum())
         of_prior = float(self.precision @ self.deviation**2)
         if self.prior.informative is not None:
-            # `precision` is 0 for unknowns with an informative prior, whose term is added here.
+            # `precision` is 0 for unknowns with an informative prior: add this prior's term.
             root = self.prior.informative.root
             of_prior += float(np.sum((root @ self.deviation[: self.layout.n_unit]) ** 2))
         if self._common_variance:

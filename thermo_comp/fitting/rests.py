@@ -37,8 +37,8 @@ def is_bench(windows: ThermalWindows, up: Floats) -> bool:
 
 def _is_heated(windows: ThermalWindows) -> Bools:
     """
-    Return which positions were heated or cooled, shape (n_positions,); all if none was: the
-    temperature in the position changes, or its mean differs from the positions' median, by over a
+    Return which positions were heated or cooled, shape (n_positions,), or all if none was. In a
+    heated one the temperature changes, or its mean differs from the positions' median, by over a
     tenth of the whole span. Drifts of short rests in a room hardly separate bias and scale.
     """
     t, edges, weight = windows.temperature, windows.data.edges[:-1], windows.data.weight

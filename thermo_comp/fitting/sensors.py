@@ -110,7 +110,7 @@ def quantum_of(values: Floats) -> float:
 
 
 def _noise_of(recorded: Sequence[Readings], quantum: float) -> float:
-    # Second differences of readings contain no linear ramp; white noise of sd s has sd s sqrt(6).
+    # Second differences contain no linear ramp; those of white noise of sd s have sd s sqrt(6).
     second = np.concatenate([np.diff(readings.value, 2) for readings in recorded])
     if not quantum:
         return 1.4826 * float(np.median(np.abs(second))) / float(np.sqrt(6.0))
@@ -136,7 +136,7 @@ def _flicker(recorded: Sequence[Readings]) -> float:
         first = np.flatnonzero(np.diff(edges, prepend=np.nan))
         count = np.diff(np.append(first, len(edges)))
         edge, at_s = edges[first], time[changed[first]]
-        # Leave out an edge where the temperature turns back, because it passes this edge twice.
+        # Leave out an edge (between two rounded values) where the temperature turns back.
         step, apart_s = edge[2:] - edge[:-2], at_s[2:] - at_s[:-2]
         passes = np.abs(step) > 1e-9
         moves += float(np.sum(count[1:-1][passes] ** 2 - 1)) * float(np.median(np.diff(time))) ** 2

@@ -151,7 +151,7 @@ class Whitener:
 
 
 def _vertex(values: Floats, at: int) -> float:
-    """Return the minimum of a parabola through three values, as index less `at`, or 0."""
+    """Return where a parabola through values `at - 1`..`at + 1` is least, less `at`; or 0."""
     if not 0 < at < len(values) - 1:
         return 0.0
     before, here, after = values[at - 1 : at + 2].tolist()

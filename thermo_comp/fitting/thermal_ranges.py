@@ -38,8 +38,7 @@ def valid_range(values: Floats, smallest_margin: float, order: int = 0) -> Range
     """
     Return the valid range of a quantity that is proportional to a power (`order`) of a heat flow,
     and so of the rate of a ramp: the range of its values with a margin, extended by the factor
-    2^order to ramps of twice the rate. With `order` 0, as for temperatures,
-    only the margin is added.
+    2^order to ramps of twice the rate. A range of temperatures (`order` 0) gets only the margin.
     """
     ratio = 2.0**order
     lower, upper = float(np.min(values)), float(np.max(values))
@@ -83,8 +82,8 @@ def rest_gradient_range(
     Return the valid range of the first sensor's gradient at rate 0, ``gradient - lag_s * rate``.
 
     The range of a prior calibration, `known`, is included. The windows have no range without the
-    sensor, without ramps (which determine the lag), or if a value exceeds 100 K, as in bags that
-    are too short for a rate. The result is None if neither prior nor windows have a range.
+    sensor, without ramps (which determine the lag), or if the range exceeds +-100 K, as in bags
+    that are too short for a rate. The result is None if neither prior nor windows have a range.
     """
     lower, upper = valid_range(windows.gradient - lag_s * windows.rate, 0.01)
     is_small = max(-lower, upper) < 100.0
@@ -106,7 +105,7 @@ def _has_gradients(windows: ThermalWindows) -> bool:
 
 
 def usable_board_lag(windows: ThermalWindows) -> float:
-    """Return the lag of the board behind the case [s], or a usual lag if not in 1..1e5 s."""
+    """Return the lag of the board behind the case [s]; a usual lag if it is not in 1..1e5 s."""
     lag = slope_of_gradient(windows.gradient, windows.rate)
     return lag if 1.0 <= lag <= 1e5 else USUAL_BOARD_LAG_S
 

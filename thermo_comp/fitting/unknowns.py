@@ -187,7 +187,7 @@ class Noise(NamedTuple):
 
     @property
     def variance(self) -> float:
-        """Ratio of the variance of all processes to the white-noise variance, as in `ratio`."""
+        """Variance of the sum of the processes, divided by the white-noise variance of `ratio`."""
         return self.ratio * self.n_times
 
     @property

@@ -35,9 +35,9 @@ from .unknowns import Windows
 #: Groups of columns: the curve, the difference of the static and dynamic sets, bends (changes of
 #: slope at a temperature), and the curves over the temperatures of parts.
 CURVE, SET, BEND, PART = 'curve', 'set', 'bend', 'part'
-#: Groups of columns linear in a difference of temperatures; groups of the products of such a
-#: difference with temperature, and of its squares. The groups 'board' and `PRODUCTS`, with the
-#: curve, form the curves over a part's temperature.
+#: `LAGS`: groups of columns linear in a difference of temperatures. `PRODUCTS`: groups of the lag
+#: times powers of the temperature, and of the square and cube of the lag. 'board', `PRODUCTS` and
+#: the curve form the curves over a part's temperature.
 LAGS, PRODUCTS = ('gradient', 'board', 'gradient_lag'), ('product', 'square')
 #: Number of windows into which a short rest is divided, to determine the noise of the rest.
 FEWEST_WINDOWS = 20
@@ -67,7 +67,7 @@ class Sets:
 
     @property
     def families(self) -> tuple[TemperatureFunction, TemperatureFunction]:
-        """Families of both curves; the dynamic curve, if shared, has the higher of both orders."""
+        """Families of static and dynamic curve; a shared dynamic curve has the higher order."""
         is_higher = self.is_shared and self.static.n_free > self.dynamic.n_free
         return self.static, self.static if is_higher else self.dynamic
 
@@ -118,7 +118,7 @@ class Model:
         """
         The powers x, x^2 and x^3 of the temperature x of each axis's part, as sums of columns:
         factors of the m columns of sets and response, shape (9, m), in the order of axes, then of
-        powers; (0, m) without `parts`, if a column is missing, or if the sets share no cubic.
+        powers; (0, m) without `parts`, without a needed column, or if the sets share no cubic.
 
         The temperature of a part less the reference is ``x = t - m``, with the board temperature t
         and the part's lag m. x^p is a sum of t^p, t^(p-1) m, ..., m^p (binomial theorem), so one
@@ -145,7 +145,7 @@ class Model:
 
 class Track(NamedTuple):
     """
-    The thermal states of a tracker over a bag, without lags and plays.
+    The thermal states of a tracker over a bag, without states of lags and of hysteresis.
 
     start_s, step_s: start and step of the time grid [s]
     states: thermal states, shape (n, width); is_known: which states are valid, shape (n,)
@@ -349,8 +349,8 @@ def _windows(
     tilt = np.column_stack((t, gradient, (t + gradient) ** 2))
     tilt_rms = np.sqrt(np.mean(tilt**2, axis=0))
     is_tilting = tilt_rms > 0.0
-    # No weights in the scale: the level of the dynamic set (the relative scale at the reference
-    # temperature is 1 in both regimes), and terms that act on the bias only (not `has_scale`).
+    # The level of the dynamic set has no weight in the scale, as the relative scale is 1 at the
+    # reference temperature in both regimes; terms without `has_scale` act on the bias only.
     in_scale = [True] * n_curves + [c.term.has_scale for c in columns] + [True] * len(sums)
     in_scale[model.sets.level] = False
     start = np.hstack((np.zeros((len(t), n_curves)), rows.start))
