@@ -47,10 +47,10 @@ def build_calibration(
     bags: Sequence[ReducedBag],
     unit: Unit,
     residuals: Sequence[ResidualRow] = (),
-    known: Calibration | None = None,
+    earlier: Calibration | None = None,
     nonlinearity: Nonlinearity | None = None,
 ) -> Calibration:
-    """Make a fit's calibration, with valid ranges that include those of the prior `known`."""
+    """Make a fit's calibration, with valid ranges that include those of the prior `earlier`."""
     (windows, regression, *_), posterior = fit, fit.posterior
     model, prior, state, layout = windows.model, posterior.prior, posterior.state, claim.layout
     # The response columns that have rows in the covariance; their weights may be 0.
@@ -59,9 +59,9 @@ def build_calibration(
     to_file = file_jacobian(regression, layout, state, model, used, kinds)
     values = to_file @ as_vector(state, layout)[: layout.n_unit]
     values[-3:] = np.linalg.inv(state.inverse)[[1, 2, 2], [0, 0, 1]]
-    static, dynamic = _regime_sets(fit, claim, known)
-    columns = _valid_columns(windows, state, used, known)
-    lag_s = known.board_lag_s if known else ranges.usable_board_lag(windows)
+    static, dynamic = _regime_sets(fit, claim, earlier)
+    columns = _valid_columns(windows, state, used, earlier)
+    lag_s = earlier.board_lag_s if earlier else ranges.usable_board_lag(windows)
     sensors = {*model.sensors[:1], *(column.sensor for column in columns)}
     window_s = windows.typical_count * float(np.median([bag.cycle_s for bag in bags]))
     # Slow noise fitted to a drift that no column describes may absorb most of the white noise,
@@ -81,14 +81,14 @@ def build_calibration(
         sensors=tuple(name for name in model.sensors if name in sensors),
         response=blank_terms(columns),
         board_lag_s=lag_s,
-        rest_gradient_range_k=ranges.rest_gradient_range(windows, lag_s, known),
-        soak_gradient_k=ranges.soak_gradient(windows, known),
+        rest_gradient_range_k=ranges.rest_gradient_range(windows, lag_s, earlier),
+        soak_gradient_k=ranges.soak_gradient(windows, earlier),
         detector=model.detector,
         provenance=_provenance(fit, bags, residuals),
         evidence=group_evidence(regression, posterior) if windows.was_measured else (),
         nonlinearity=nonlinearity,
     )
-    if known is not None and not (known.needs_temperature or windows.has_temperature):
+    if earlier is not None and not (earlier.needs_temperature or windows.has_temperature):
         # Without a thermometer, the dependence on temperature is a rounding error: remove it.
         places = parameter_layout(blank)
         for block in (*places.bias, *places.scale):
@@ -99,7 +99,7 @@ def build_calibration(
     return with_parameters(blank, state.kappa * regression.nominal_scale, values, covariance)
 
 
-def _regime_sets(fit: Fit, claim: Claim, known: Calibration | None) -> list[RegimeSet]:
+def _regime_sets(fit: Fit, claim: Claim, earlier: Calibration | None) -> list[RegimeSet]:
     """Return the static and the dynamic set with valid ranges, and all free coefficients 0."""
     windows, prior = fit.windows, fit.posterior.prior
     temperatures = ranges.temperature_range(windows)
@@ -108,23 +108,23 @@ def _regime_sets(fit: Fit, claim: Claim, known: Calibration | None) -> list[Regi
     slow = np.sqrt(claim.offset_sd**2 + prior.sigma**2 * prior.noise.variance).tolist()
     lacks: Sequence[tuple[LackOfFit, ...]] = ((), ())
     if fit.regression.gravity:
-        lacks = ranges.with_unseen_axes(fit, lack_of_fit(fit, claim), known)
+        lacks = ranges.with_unseen_axes(fit, lack_of_fit(fit, claim), earlier)
     result = []
     for k, (family, lack) in enumerate(zip(windows.model.sets.families, lacks, strict=True)):
         zero = (0.0,) * family.n_free
         bias, scale = (family.with_free(zero, reference) for reference in (0.0, 1.0))
         x, y, z = (AxisSet(bias, scale, residual_sd_m_s2=sd) for sd in slow)
-        earlier = [known.regime_sets()[k]] if known else []
+        prior_sets = [earlier.regime_sets()[k]] if earlier else []
         valid = (
-            ranges.union((temperatures, *(regime.temperature_range_c for regime in earlier))),
-            ranges.union((rates, *(regime.rate_range_k_min for regime in earlier))),
+            ranges.union((temperatures, *(regime.temperature_range_c for regime in prior_sets))),
+            ranges.union((rates, *(regime.rate_range_k_min for regime in prior_sets))),
         )
         result.append(RegimeSet(*valid, x, y, z, lack_of_fit=lack))
     return result
 
 
 def _valid_columns(
-    windows: ThermalWindows, state: State, used: Sequence[int], known: Calibration | None
+    windows: ThermalWindows, state: State, used: Sequence[int], earlier: Calibration | None
 ) -> list[Column]:
     """Return the response columns in use with their valid ranges."""
     lower, upper = ranges.temperature_range(windows)
@@ -151,7 +151,7 @@ def _valid_columns(
             valid = ranges.union((valid, (-valid[1], -valid[0])))
         # A response column that only curves over part temperatures use is of group `part`.
         group = PART if k in weighed and not alone[k] else column.group
-        valid = valid if known is None else ranges.union((valid, column.range))
+        valid = valid if earlier is None else ranges.union((valid, column.range))
         result.append(replace(column, group=group, range=valid))
     return result
 

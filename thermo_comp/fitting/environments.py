@@ -52,13 +52,16 @@ def contradicting_bag(fit: Fit) -> list[int]:
     the median left-out drift exceeds five times the noise, this bag is suspect.
     """
     square = _square_of_bags(fit)
-    known = np.isfinite(square)
-    if known.sum() < 4:
+    is_scored = np.isfinite(square)
+    if is_scored.sum() < 4:
         # At least four bags are needed to decide that one bag contradicts the majority.
         return []
-    usual, noise = float(np.median(square[known])), float(np.mean(fit.posterior.prior.sigma**2))
-    if (~known).sum() == 1 and _is_far_above(usual, noise):
-        return [int(np.argmin(known))]
+    usual, noise = (
+        float(np.median(square[is_scored])),
+        float(np.mean(fit.posterior.prior.sigma**2)),
+    )
+    if (~is_scored).sum() == 1 and _is_far_above(usual, noise):
+        return [int(np.argmin(is_scored))]
     worst = int(np.nanargmax(square))
     return [worst] if _is_far_above(square[worst], max(usual, noise)) else []
 
@@ -66,8 +69,8 @@ def contradicting_bag(fit: Fit) -> list[int]:
 def is_better_without(whole: Fit, rest: Fit, bag: int) -> bool:
     """Whether excluding `bag` more than halves the other bags' mean square left-out drift."""
     before, after = np.delete(_square_of_bags(whole), bag), _square_of_bags(rest)
-    known = np.isfinite(before) & np.isfinite(after)
-    return bool(known.any() and before[known].mean() > 2.0 * after[known].mean())
+    is_scored = np.isfinite(before) & np.isfinite(after)
+    return bool(is_scored.any() and before[is_scored].mean() > 2.0 * after[is_scored].mean())
 
 
 def _square_of_bags(fit: Fit) -> Floats:
@@ -78,21 +81,21 @@ def _square_of_bags(fit: Fit) -> Floats:
 
 
 def contradiction(
-    windows: ThermalWindows, known: Calibration, options: FitOptions
+    windows: ThermalWindows, earlier: Calibration, options: FitOptions
 ) -> tuple[list[int], bool]:
     """
-    Return the indices of the bags whose drift the calibration `known` of their unit does not
+    Return the indices of the bags whose drift the calibration `earlier` of their unit does not
     explain with any initial lag states; all bags if these are more than half of the bags. Also
-    return whether the bags can update `known`: ``|f| - g`` shows a change of bias or scale (it far
-    exceeds the drift and the published sd of |f|), or the bags have the six attitudes that
+    return whether the bags can update `earlier`: ``|f| - g`` shows a change of bias or scale (it
+    far exceeds the drift and the published sd of |f|), or the bags have the six attitudes that
     determine bias and scale.
     """
     data = replace(windows.data, tilt=windows.data.tilt[:, :0])
-    regression, state = _at_calibration(known, data, options.gravity)
-    first = next(informative_priors(known, regression, state, windows.model, options))
+    regression, state = _at_calibration(earlier, data, options.gravity)
+    first = next(informative_priors(earlier, regression, state, windows.model, options))
     # Length of a typical window [s], and the white noise of its mean [m/s^2].
-    window_s = windows.typical_count * known.unit.cycle_time_s
-    sigma = np.array(known.noise_density_m_s2_sqrt_hz) / np.sqrt(window_s)
+    window_s = windows.typical_count * earlier.unit.cycle_time_s
+    sigma = np.array(earlier.noise_density_m_s2_sqrt_hz) / np.sqrt(window_s)
     prior = Prior(
         column_sd=data.parts.astype(np.float64),
         # Only drifts are compared: bias offsets of 1 mg, by turn-ons or ageing, are allowed.
@@ -105,13 +108,13 @@ def contradiction(
     drift = within_positions(regression.residual(fitted.state, fitted.layout), data.position)
     inverse = np.linalg.inv(first.root)
     claimed = drift_variance(regression, state, fitted.layout, inverse @ inverse.T)
-    lacks = [point.sd_m_s2 for regime in known.regime_sets() for point in regime.lack_of_fit]
+    lacks = [point.sd_m_s2 for regime in earlier.regime_sets() for point in regime.lack_of_fit]
     lack = np.square(lacks).max(axis=0) if lacks else np.zeros(3)
     ratio = np.sum(drift**2, axis=1) / np.sum(claimed + prior.sigma**2 + lack, axis=1)
     mean = np.bincount(data.bag, ratio) / np.maximum(np.bincount(data.bag), 1)
     norm = _norm_errors(regression, state)
     along = regression.at(state, prior).norms_by_unit @ inverse
-    usual = np.mean(drift**2) + np.mean(np.sum(along**2, axis=1)) + offset_sd_of(known) ** 2
+    usual = np.mean(drift**2) + np.mean(np.sum(along**2, axis=1)) + offset_sd_of(earlier) ** 2
     may_update = bool(_is_far_above(float(np.mean(norm**2)), usual))
     is_far = _is_far_above(mean, 1.0)
     if np.mean(is_far) > 0.5:

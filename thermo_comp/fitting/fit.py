@@ -151,10 +151,10 @@ def find_offset(bags: Sequence[ReducedBag], options: FitOptions) -> Floats:
     if options.input != 'counts':
         return np.zeros(3)
     if options.prior is not None:
-        known = constants_of(options.prior)
+        constants = constants_of(options.prior)
         # If a bias exceeds 0.5 g, the three biases are taken for the codes at zero force.
-        is_far = np.abs(known.bias / known.scale).max() > 0.5 * options.gravity
-        return np.asarray(np.rint(known.bias) * is_far)
+        is_far = np.abs(constants.bias / constants.scale).max() > 0.5 * options.gravity
+        return np.asarray(np.rint(constants.bias) * is_far)
     middle = max(bag.middle for bag in bags)
     if middle:
         return np.full(3, middle)
@@ -192,12 +192,14 @@ def _fit_one_environment(
 ) -> FitResult:
     """Fit the bags, without bags recorded in another thermal environment, see `environments`."""
     first = _fit(bags, options, progress)
-    known = options.prior
+    earlier = options.prior
     excluded, may_update = [], False
-    if known is None:
+    if earlier is None:
         excluded = contradicting_bag(first.fit)
-    elif known.unit.serial == first.calibration.unit.serial and not first.fit.windows.data.forces:
-        excluded, may_update = contradiction(first.fit.windows, known, options)
+    elif (
+        earlier.unit.serial == first.calibration.unit.serial and not first.fit.windows.data.forces
+    ):
+        excluded, may_update = contradiction(first.fit.windows, earlier, options)
     if not excluded:
         return _refined(first, bags, options, progress)
     kept = [bag for k, bag in enumerate(bags) if k not in excluded]
@@ -205,15 +207,15 @@ def _fit_one_environment(
     is_updated = may_update and not kept
     if kept:
         refit = _fit(kept, options, progress)
-        if known is None and not is_better_without(first.fit, refit.fit, excluded[0]):
+        if earlier is None and not is_better_without(first.fit, refit.fit, excluded[0]):
             return _refined(first, bags, options, progress)
         refit = _refined(refit, kept, options, progress)
-    elif known is not None and not is_updated:
+    elif earlier is not None and not is_updated:
         # All bags contradict the prior's effects of temperature and may not update them: the bags
         # count as recorded in another environment, and the prior is kept.
         provenance = first.calibration.provenance
-        refit = replace(first, calibration=replace(known, provenance=provenance))
-    others = 'the other bags' if known is None else 'the prior'
+        refit = replace(first, calibration=replace(earlier, provenance=provenance))
+    others = 'the other bags' if earlier is None else 'the prior'
     left_out = [bags[k] for k in excluded]
     calibration, finding = with_excluded_error(
         refit.calibration, left_out, others, is_updated=is_updated
@@ -273,11 +275,11 @@ def _fit(
     if options.prior and windows.data.forces and options.prior.nonlinearity is None:
         options = replace(options, prior=with_blank(options.prior, options))
         windows = with_forces(windows, options)
-    known = options.prior
-    start = initial_triad(windows, options) if known is None else constants_of(known)
+    earlier = options.prior
+    start = initial_triad(windows, options) if earlier is None else constants_of(earlier)
     up = start.directions(windows.data)
     has_case = all(len(bag.case.value) for bag in bags)
-    findings += enforce(data_checks.judge_windows(windows, up, has_case, known), options)
+    findings += enforce(data_checks.judge_windows(windows, up, has_case, earlier), options)
     findings += raw_checks.judge_missing(bags, windows)
     progress(0.7)
     fit = regressed(
@@ -286,7 +288,7 @@ def _fit(
     data_checks.check_scale(fit)
     selected, terms = choose(fit.regression, fit.selected, options)
     fit = fit._replace(selected=selected)
-    offset_sd = 0.0 if known is None else offset_sd_of(known)
+    offset_sd = 0.0 if earlier is None else offset_sd_of(earlier)
     claim = claim_of(fit, options.gravity_sd, offset_sd)
     residuals, in_sample, left_out = residual_rows(fit)
     findings += enforce(data_checks.judge_constants(fit, residuals[-1].raw.rms, options), options)
@@ -295,10 +297,10 @@ def _fit(
     try:
         nonlinearity = of_file(fit.regression, terms, options)
         calibration = build_calibration(
-            fit, claim, bags, _unit(bags, options), residuals, known, nonlinearity
+            fit, claim, bags, _unit(bags, options), residuals, earlier, nonlinearity
         )
         rates: tuple[RateRow, ...] = ()
-        if known is not None or not is_beyond(fit.windows):
+        if earlier is not None or not is_beyond(fit.windows):
             calibration, rates = add_gyroscope(calibration, fit.windows, bags, options)
         elif fit.windows.angular_rate.shape[1]:
             text = 'the stated |f| differs between rests: no bias of the gyroscope was fitted'
@@ -308,7 +310,7 @@ def _fit(
     least = least_known(calibration, fit.posterior.state.up)
     findings += data_checks.judge_coverage(least)
     findings += judge_terms(calibration)
-    findings += judge_unseen_axes(fit, known)
+    findings += judge_unseen_axes(fit, earlier)
     return FitResult(
         calibration=calibration,
         fit=fit,

@@ -100,11 +100,11 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
 def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = False) -> Fit:
     """Fit the windows; `is_at_rest`: whether the columns are set constant in each position."""
     data, options, start = windows.data, problem.options, problem.start
-    known, n_directions = options.prior, problem.n_directions
+    earlier, n_directions = options.prior, problem.n_directions
     # With a prior calibration, drifts in one heated attitude do separate bias and scale.
-    is_bench = known is None and rests.is_bench(windows, problem.up)
+    is_bench = earlier is None and rests.is_bench(windows, problem.up)
     has_poses = n_directions < POSITIONS_NEEDED and rests.is_constant(windows, data.position)
-    if (has_poses or n_directions == 1) and known is None and data.forces is None:
+    if (has_poses or n_directions == 1) and earlier is None and data.forces is None:
         data = replace(data, pose=rests.poses_of(windows, problem.up))
     if options.model == 'golovach' or is_bench or n_directions == 1 or data.n_poses:
         # No tilts are fitted: a tilt of the support is not separable from a drift of the unit in
@@ -112,7 +112,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
         # would absorb errors of the static and the dynamic set.
         data = replace(data, tilt=data.tilt[:, :0])
     settled = data.settled if problem.is_by_settled else None
-    data = replace(data, has_prior=known is not None, settled=settled)
+    data = replace(data, has_prior=earlier is not None, settled=settled)
     regression = Regression(data, options.gravity, start.scale)
     state = initial_state(regression, start, problem.up)
     prior = _initial_prior(windows, problem)
@@ -121,9 +121,9 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
         prior = _with_faces(prior, problem.up)
     steepness = _steepness(windows, problem, is_at_rest=is_at_rest)
     candidates = _candidates(windows, problem, steepness, is_bench=is_bench)
-    if known is not None:
-        state = with_terms(with_calibration(known, regression, state), known)
-        prior, others = _updating_priors(known, windows, options, regression, state, prior)
+    if earlier is not None:
+        state = with_terms(with_calibration(earlier, regression, state), earlier)
+        prior, others = _updating_priors(earlier, windows, options, regression, state, prior)
         fixed = replace(candidates, fixed=np.ones_like(candidates.fixed))
         return Fit(windows, regression, fit_all(regression, state, prior, fixed, others))
     if options.model == 'golovach':
@@ -147,7 +147,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
 
 
 def _updating_priors(
-    known: Calibration,
+    earlier: Calibration,
     windows: ThermalWindows,
     options: FitOptions,
     regression: Regression,
@@ -160,23 +160,23 @@ def _updating_priors(
     """
     data, noise = regression.windows, _noise_in_1_hz(windows, regression.nominal_scale)
     *others, widest = informative_priors(
-        known, regression, state, windows.model, options, LARGE_OFFSETS * _mounting_scale(noise)
+        earlier, regression, state, windows.model, options, LARGE_OFFSETS * _mounting_scale(noise)
     )
     # Few windows may be fitted exactly: assume at least half of the prior calibration's noise.
-    window_s = windows.typical_count * known.unit.cycle_time_s
-    least = 0.5 * float(np.min(known.noise_density_m_s2_sqrt_hz)) / window_s**0.5
+    window_s = windows.typical_count * earlier.unit.cycle_time_s
+    least = 0.5 * float(np.min(earlier.noise_density_m_s2_sqrt_hz)) / window_s**0.5
     prior = replace(
         prior,
         column_sd=data.parts.astype(np.float64),
         informative=widest,
         least_sigma=max(least, prior.least_sigma),
     )
-    if prior.offset_scale and (known_sd := offset_sd_of(known)):
+    if prior.offset_scale and (repeated_sd := offset_sd_of(earlier)):
         # The scale of the prior of offset sds is at most twice the offset sd of the prior
         # calibration, so that larger changes of |f| count as ageing of the unit.
-        scale = min(prior.offset_scale, 2.0 * known_sd)
-        offset_sd = prior.offset_sd if data.has_turn_ons else known_sd
-        prior = replace(prior, offset_sd=offset_sd, turn_on_sd=known_sd, offset_scale=scale)
+        scale = min(prior.offset_scale, 2.0 * repeated_sd)
+        offset_sd = prior.offset_sd if data.has_turn_ons else repeated_sd
+        prior = replace(prior, offset_sd=offset_sd, turn_on_sd=repeated_sd, offset_scale=scale)
     return prior, others
 
 
@@ -375,9 +375,9 @@ def initial_triad(windows: ThermalWindows, options: FitOptions) -> ConstantCalib
         )
     scale = float(np.median(norms / gravity))
     if len(distinct_directions(means / norms[:, None])) >= POSITIONS_NEEDED:
-        known = options.gravity if windows.data.forces is None else gravity
+        sizes = options.gravity if windows.data.forces is None else gravity
         noise = _noise_in_1_hz(windows, np.full(3, scale))
-        return constant_calibration(means, known, misalignment_scale(noise))
+        return constant_calibration(means, sizes, misalignment_scale(noise))
     if options.input == 'm/s^2':
         if abs(scale - 1.0) > 0.2:
             raise FitError(

@@ -60,19 +60,19 @@ class Folds:
     @classmethod
     def of(cls, square: Floats, windows: Floats, fold: Ints) -> Folds:
         """Average mean square errors of positions, (p,), over each fold's positions; skip NaN."""
-        known = np.isfinite(square)
-        count = np.bincount(fold, np.where(known, windows, 0.0))
-        total = np.bincount(fold, np.where(known, square * windows, 0.0))
+        is_scored = np.isfinite(square)
+        count = np.bincount(fold, np.where(is_scored, windows, 0.0))
+        total = np.bincount(fold, np.where(is_scored, square * windows, 0.0))
         square = total / np.where(count > 0.0, count, np.nan)
         return cls(square, np.bincount(fold, windows).astype(np.float64))
 
     @property
     def rms(self) -> float:
         """RMS error over all windows of the folds [m/s^2]; NaN without folds."""
-        known = np.isfinite(self.square)
-        if not known.any():
+        is_scored = np.isfinite(self.square)
+        if not is_scored.any():
             return np.nan
-        return float(np.sqrt(np.average(self.square[known], weights=self.windows[known])))
+        return float(np.sqrt(np.average(self.square[is_scored], weights=self.windows[is_scored])))
 
     def gain_of(self, other: Folds) -> tuple[float, float] | None:
         """
@@ -84,11 +84,13 @@ class Folds:
         differ: the mean over the folds, which few folds of large errors hardly change; and the log
         ratio of sums of squares (jackknife error), which folds of small errors hardly change.
         """
-        known = np.isfinite(self.square) & np.isfinite(other.square)
-        n = int(known.sum())
+        is_scored = np.isfinite(self.square) & np.isfinite(other.square)
+        n = int(is_scored.sum())
         if not n:
             return None
-        before, after = ((folds.square * folds.windows)[known] + 1e-300 for folds in (self, other))
+        before, after = (
+            (folds.square * folds.windows)[is_scored] + 1e-300 for folds in (self, other)
+        )
         of_sums = float(np.log(before.sum() / after.sum()))
         if n == 1:
             # One fold gives no standard error: return the largest log ratio that counts as equal.
@@ -104,8 +106,8 @@ class Folds:
 
     def is_noise(self, other: Folds, noise: float) -> bool:
         """Whether white noise explains the errors in the folds that `self` and `other` score."""
-        known = np.isfinite(self.square) & np.isfinite(other.square)
-        square = np.average(self.square[known], weights=self.windows[known])
+        is_scored = np.isfinite(self.square) & np.isfinite(other.square)
+        square = np.average(self.square[is_scored], weights=self.windows[is_scored])
         return bool(square <= (_NOISE_RATIO * noise) ** 2)
 
 
@@ -393,9 +395,9 @@ def _by_sections(
             if len(out) and len(stayed) >= _FEWEST_WINDOWS:
                 level = np.average(force[stayed], axis=0, weights=share[stayed])
                 drift[out] = force[out] - level
-        known = judged & np.isfinite(drift[:, 0])
-        if known.any():
-            square = np.mean(drift[known] ** 2, axis=1)
-            squares[k] = np.average(square, weights=share[known])
-            counts[k] = known.sum()
+        is_scored = judged & np.isfinite(drift[:, 0])
+        if is_scored.any():
+            square = np.mean(drift[is_scored] ** 2, axis=1)
+            squares[k] = np.average(square, weights=share[is_scored])
+            counts[k] = is_scored.sum()
     return Folds(squares, counts), drift

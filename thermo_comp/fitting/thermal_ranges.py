@@ -55,13 +55,13 @@ def temperature_range(windows: ThermalWindows) -> Range:
     return valid_range(windows.temperature, 0.5 if windows.was_measured else 50.0)
 
 
-def soak_gradient(windows: ThermalWindows, known: Calibration | None) -> Range | None:
+def soak_gradient(windows: ThermalWindows, earlier: Calibration | None) -> Range | None:
     """
     Return the gradient of the first sensor in soaks and its robust scatter [K], both by the prior
-    calibration `known` if it has them, else by the windows; None without the sensor or a soak.
+    calibration `earlier` if it has them, else by the windows; None without the sensor or a soak.
     """
-    if known is not None and known.soak_gradient_k is not None:
-        return known.soak_gradient_k
+    if earlier is not None and earlier.soak_gradient_k is not None:
+        return earlier.soak_gradient_k
     rate = 60.0 * np.abs(windows.rate)
     # If the rate is noisy, the tenth of the windows with the smallest rates counts as soak.
     slowest = max(0.2 * RAMP_K_MIN, float(np.quantile(rate, 0.1)))
@@ -76,20 +76,20 @@ def soak_gradient(windows: ThermalWindows, known: Calibration | None) -> Range |
 
 
 def rest_gradient_range(
-    windows: ThermalWindows, lag_s: float, known: Calibration | None
+    windows: ThermalWindows, lag_s: float, earlier: Calibration | None
 ) -> Range | None:
     """
     Return the valid range of the first sensor's gradient at rate 0, ``gradient - lag_s * rate``.
 
-    The range of a prior calibration, `known`, is included. The windows have no range without the
+    The range of a prior calibration, `earlier`, is included. The windows have no range without the
     sensor, without ramps (which determine the lag), or if the range exceeds +-100 K, as in bags
     that are too short for a rate. The result is None if neither prior nor windows have a range.
     """
     lower, upper = valid_range(windows.gradient - lag_s * windows.rate, 0.01)
     is_small = max(-lower, upper) < 100.0
     ranges = [(lower, upper)] if _has_gradients(windows) and is_small else []
-    if known is not None and known.rest_gradient_range_k is not None:
-        ranges.append(known.rest_gradient_range_k)
+    if earlier is not None and earlier.rest_gradient_range_k is not None:
+        ranges.append(earlier.rest_gradient_range_k)
     return union(ranges) if ranges else None
 
 
@@ -111,17 +111,17 @@ def usable_board_lag(windows: ThermalWindows) -> float:
 
 
 def with_unseen_axes(
-    fit: Fit, lacks: Sequence[tuple[LackOfFit, ...]], known: Calibration | None
+    fit: Fit, lacks: Sequence[tuple[LackOfFit, ...]], earlier: Calibration | None
 ) -> list[tuple[LackOfFit, ...]]:
     """
     Add the error of extrapolated scale factors to the lack of fit of each regime, `lacks`.
 
-    `known`: calibration used as prior, or None. At temperatures at which no position of the
+    `earlier`: calibration used as prior, or None. At temperatures at which no position of the
     bags determines the scale of an axis, the lack of fit of the axis is at least the prior's.
     """
-    (lower, upper), (new_lower, new_upper) = _known_ranges(fit, known), _seen(fit, None)
+    (lower, upper), (new_lower, new_upper) = _determined_ranges(fit, earlier), _seen(fit, None)
     slope = _unknown_slope(fit) * fit.regression.gravity
-    ends = _ends(fit, known)
+    ends = _ends(fit, earlier)
     # The variance of an extrapolated scale factor grows with the square of the distance [K], but
     # is interpolated linearly between stated temperatures, so it is stated at five temperatures.
     between = [
@@ -131,7 +131,7 @@ def with_unseen_axes(
     ]
     result = []
     for k, lack in enumerate(lacks):
-        of_prior = known.regime_sets()[k].lack_of_fit if known else ()
+        of_prior = earlier.regime_sets()[k].lack_of_fit if earlier else ()
         points = [point.temperature_c for point in (*lack, *of_prior)]
         at = np.unique(np.concatenate((*between, points)))[:, np.newaxis]
         is_new = (new_lower <= at) & (at <= new_upper)
@@ -144,10 +144,10 @@ def with_unseen_axes(
     return result
 
 
-def judge_unseen_axes(fit: Fit, known: Calibration | None) -> list[Finding]:
+def judge_unseen_axes(fit: Fit, earlier: Calibration | None) -> list[Finding]:
     """Advise a position where a scale factor is extrapolated over more than 2 K."""
     findings = []
-    (lower, upper), (first, last) = _known_ranges(fit, known), _ends(fit, known)
+    (lower, upper), (first, last) = _determined_ranges(fit, earlier), _ends(fit, earlier)
     below, above = lower > first + 2.0, upper < last - 2.0
     for where, end, edge, is_unseen in (
         ('below', first, lower[below].max(initial=first), below),
@@ -164,20 +164,20 @@ def judge_unseen_axes(fit: Fit, known: Calibration | None) -> list[Finding]:
     return findings
 
 
-def _known_ranges(fit: Fit, known: Calibration | None) -> Floats:
+def _determined_ranges(fit: Fit, earlier: Calibration | None) -> Floats:
     """
     Return the range of board temperature of each axis without an added error of its scale factor,
     shape (2, 3) [degC]. The range of an axis along which no position has gravity is infinite: the
     prior sd of its scale factor includes the error of extrapolation.
     """
-    lower, upper = _seen(fit, known)
+    lower, upper = _seen(fit, earlier)
     # The temperature ranges of the positions of one test differ by about a tenth of the range.
     reach = 0.1 * (upper - lower)
     is_seen = lower <= upper
     return np.where(is_seen, (lower - reach, upper + reach), [[-np.inf], [np.inf]])
 
 
-def _seen(fit: Fit, known: Calibration | None) -> Floats:
+def _seen(fit: Fit, earlier: Calibration | None) -> Floats:
     """
     Return the lowest and the highest board temperature of the positions with gravity along each
     axis, and of a prior calibration, shape (2, 3) [degC]; (inf, -inf) if there are none.
@@ -188,16 +188,16 @@ def _seen(fit: Fit, known: Calibration | None) -> Floats:
     is_seen = is_along[fit.windows.data.position]
     lower = np.where(is_seen, temperature, np.inf).min(axis=0)
     upper = np.where(is_seen, temperature, -np.inf).max(axis=0)
-    for regime in known.regime_sets() if known else ():
+    for regime in earlier.regime_sets() if earlier else ():
         lower = np.minimum(lower, regime.temperature_range_c[0])
         upper = np.maximum(upper, regime.temperature_range_c[1])
     return np.array((lower, upper))
 
 
-def _ends(fit: Fit, known: Calibration | None) -> Range:
+def _ends(fit: Fit, earlier: Calibration | None) -> Range:
     """Return the lowest and the highest board temperature of all windows and of a prior [degC]."""
     temperature = fit.windows.temperature
-    ranges = [regime.temperature_range_c for regime in known.regime_sets()] if known else []
+    ranges = [regime.temperature_range_c for regime in earlier.regime_sets()] if earlier else []
     return union([(float(temperature.min()), float(temperature.max())), *ranges])
 
 
