@@ -136,8 +136,8 @@ def layout(head: str, delimiter: str | None = None) -> tuple[str, int]:
 
 
 def _most_frequent(numbers: Sequence[int]) -> tuple[int, int]:
-    most = max(set(numbers), key=numbers.count, default=0)
-    return most, numbers.count(most)
+    commonest = max(set(numbers), key=numbers.count, default=0)
+    return commonest, numbers.count(commonest)
 
 
 def _is_comment(cell: str) -> bool:

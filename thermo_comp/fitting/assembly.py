@@ -50,7 +50,7 @@ def build_calibration(
     earlier: Calibration | None = None,
     nonlinearity: Nonlinearity | None = None,
 ) -> Calibration:
-    """Make a fit's calibration, with valid ranges that include those of the prior `earlier`."""
+    """Make a fit's calibration, valid also where the prior calibration `earlier` is."""
     (windows, regression, *_), posterior = fit, fit.posterior
     model, prior, state, layout = windows.model, posterior.prior, posterior.state, claim.layout
     # The response columns that have rows in the covariance; their weights may be 0.
@@ -66,8 +66,8 @@ def build_calibration(
     window_s = windows.typical_count * float(np.median([bag.cycle_s for bag in bags]))
     # Slow noise fitted to a drift that no column describes may absorb most of the white noise,
     # too: then differences of windows, in which a drift cancels, give the white noise.
-    sigma, least = prior.sigma, white_noise_of(regression.windows, regression.nominal_scale)
-    sigma = np.where(sigma < 0.7 * least, least, sigma)
+    sigma, white = prior.sigma, white_noise_of(regression.windows, regression.nominal_scale)
+    sigma = np.where(sigma < 0.7 * white, white, sigma)
     blank = Calibration(
         format_version=FORMAT_VERSION,
         unit=unit,
@@ -143,8 +143,8 @@ def _valid_columns(
             if k not in weighed:
                 # A column with zero weight contributes only to the covariance, so all values that
                 # the temperature range allows are valid.
-                most = (upper - lower) ** order
-                valid = ranges.union((valid, (-most, most)))
+                largest = (upper - lower) ** order
+                valid = ranges.union((valid, (-largest, largest)))
         if k in of_parts and column.term.order % 2:
             # A part lags both in cooling and in heating: the range of an odd power of its lag is
             # extended to the same values of opposite sign.

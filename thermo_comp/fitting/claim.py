@@ -155,7 +155,7 @@ def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Fl
         return known_sd * ratio, log_student(np.log(ratio) / np.log(1.5))
     # `least`: smallest usual offset sd / `scale`. By data sheets, the bias of navigation-grade
     # triads repeats to 10 ug at best between turn-ons, better between mountings of a turn-on.
-    least = 0.01 if kind == 'mounting' else min(1e-4 / scale, 1.0)
+    smallest_ratio = 0.01 if kind == 'mounting' else min(1e-4 / scale, 1.0)
     # `largest`: largest usual offset sd / `scale`, for mountings within a turn-on, for a single
     # turn-on, and ('both') for several turn-ons or mountings that each begin with a turn-on. By
     # data sheets, the bias repeats to 0.3 .. 1 mg over turn-ons of tactical triads and to some mg
@@ -164,7 +164,7 @@ def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Fl
     largest = {'mounting': 1.0, 'turn-on': 2.0, 'both': 5.0}[kind]
     # The log evidence is smooth over the grid's step, a third of a decade of the sd.
     ratio = 10.0 ** np.linspace(-3.45, 2.25, 19)
-    small = np.minimum(np.log(ratio / least), 0.0)
+    small = np.minimum(np.log(ratio / smallest_ratio), 0.0)
     return scale * ratio, log_student(ratio / largest) + small
 
 

@@ -225,14 +225,14 @@ def _judge_positions(up: Floats) -> Finding:
     return Finding('positions', 'good', f'{n} positions')
 
 
-def judge_coverage(least: LeastKnown | None) -> Iterator[Finding]:
+def judge_coverage(axis: LeastKnown | None) -> Iterator[Finding]:
     """Advise a position if the sd of |f| in an attitude is >= 3 times the positions' median."""
-    if least is not None and least.sd_m_s2 >= 3.0 * least.seen_sd_m_s2:
+    if axis is not None and axis.sd_m_s2 >= 3.0 * axis.seen_sd_m_s2:
         yield advice(
             'unseen',
-            f'{least.away_deg:.0f} deg away from every position the standard deviation of |f| is '
-            f'{ug_text(least.sd_m_s2)}, against {ug_text(least.seen_sd_m_s2)} in the positions: '
-            f'record a position with {direction_text(np.array(least.up))}',
+            f'{axis.away_deg:.0f} deg away from every position the standard deviation of |f| is '
+            f'{ug_text(axis.sd_m_s2)}, against {ug_text(axis.seen_sd_m_s2)} in the positions: '
+            f'record a position with {direction_text(np.array(axis.up))}',
         )
 
 

@@ -307,8 +307,8 @@ def _fit(
             findings.append(advice('rate', text))
     except ValueError as error:
         raise _unusable(error, fit.posterior.state.up) from error
-    least = least_known(calibration, fit.posterior.state.up)
-    findings += data_checks.judge_coverage(least)
+    least_known_axis = least_known(calibration, fit.posterior.state.up)
+    findings += data_checks.judge_coverage(least_known_axis)
     findings += judge_terms(calibration)
     findings += judge_unseen_axes(fit, earlier)
     return FitResult(
@@ -317,7 +317,7 @@ def _fit(
         residuals=residuals,
         positions=position_reports(fit, in_sample, left_out),
         findings=tuple(findings),
-        least_known=least,
+        least_known=least_known_axis,
         bags=tuple(bags),
         rates=rates,
     )

@@ -232,12 +232,14 @@ def white_noise(regression: Regression, posterior: PosteriorMode) -> Floats:
     sigma = np.sqrt(posterior.square / np.maximum(n - spent, 0.05 * n))
     # The samples of an axis may be constant, without noise. The noise of an axis is at least a
     # hundredth of the noise of the noisiest axis.
-    least = np.full(3, max(posterior.prior.least_sigma, 0.01 * float(sigma.max())))
+    least_sigma = np.full(3, max(posterior.prior.least_sigma, 0.01 * float(sigma.max())))
     if not regression.windows.has_drifts:
         # If no column changes within a position, slow noise may explain the whole residual: the
         # white noise is at least the noise of differences of windows, which contain no drift.
-        least = np.maximum(least, white_noise_of(regression.windows, regression.nominal_scale))
-    return np.asarray(np.maximum(sigma, least))
+        least_sigma = np.maximum(
+            least_sigma, white_noise_of(regression.windows, regression.nominal_scale)
+        )
+    return np.asarray(np.maximum(sigma, least_sigma))
 
 
 def with_slow_noise(
@@ -317,11 +319,11 @@ def _pruned(regression: Regression, posterior: PosteriorMode, candidates: Candid
         used = column_sd > 0.0
         is_last = (used & is_product).any(axis=1) & ((used & is_lag).sum(axis=1) == 1)
         gains[(used & is_lag & is_last[:, np.newaxis])[part, column]] = np.inf
-        least = int(np.argmin(gains))
-        if gains[least] >= LEAST_GAIN:
+        weakest = int(np.argmin(gains))
+        if gains[weakest] >= LEAST_GAIN:
             break
-        column_sd[tuple(droppable.pop(least))] = 0.0
-        at = places[least]
+        column_sd[tuple(droppable.pop(weakest))] = 0.0
+        at = places[weakest]
         gain = np.linalg.solve(covariance[np.ix_(at, at)], covariance[at])
         mode = mode - gain.T @ mode[at]
         covariance -= covariance[:, at] @ gain

@@ -164,12 +164,12 @@ def _updating_priors(
     )
     # Few windows may be fitted exactly: assume at least half of the prior calibration's noise.
     window_s = windows.typical_count * earlier.unit.cycle_time_s
-    least = 0.5 * float(np.min(earlier.noise_density_m_s2_sqrt_hz)) / window_s**0.5
+    least_sigma = 0.5 * float(np.min(earlier.noise_density_m_s2_sqrt_hz)) / window_s**0.5
     prior = replace(
         prior,
         column_sd=data.parts.astype(np.float64),
         informative=widest,
-        least_sigma=max(least, prior.least_sigma),
+        least_sigma=max(least_sigma, prior.least_sigma),
     )
     if prior.offset_scale and (repeated_sd := offset_sd_of(earlier)):
         # The scale of the prior of offset sds is at most twice the offset sd of the prior
@@ -192,8 +192,8 @@ def _initial_prior(windows: ThermalWindows, problem: Problem) -> Prior:
     data, start, options = windows.data, problem.start, problem.options
     drift = within_positions(data.mean / start.scale, data.position)
     # Smallest initial sd of mounting offsets, and of white noise: 1 ug [m/s^2].
-    least = 1e-5
-    sigma = max(float(np.sqrt(np.mean(drift**2))), least)
+    small_sd = 1e-5
+    sigma = max(float(np.sqrt(np.mean(drift**2))), small_sd)
     noise = _noise_in_1_hz(windows, start.scale)
     # If samples have no noise, rounding shifts the mean of a position as a mounting offset does.
     roundings = [interval.rounding_sd / start.scale for _, interval in windows.rests]
@@ -204,7 +204,7 @@ def _initial_prior(windows: ThermalWindows, problem: Problem) -> Prior:
         scale_sd=SCALE_SD,
         misalignment_sd=misalignment_sd,
         column_sd=np.zeros((2, len(data.groups))),
-        offset_sd=max(least, rounding_sd),
+        offset_sd=max(small_sd, rounding_sd),
         sigma=np.full(3, sigma),
         # The three axes of a sensor have similar scale factors: the prior mean of each axis is the
         # geometric mean of the three.

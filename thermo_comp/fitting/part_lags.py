@@ -96,7 +96,7 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> list[Part
     if not windows.has_temperature or not any(column.group == 'board' for column in columns):
         return []
     noise = np.hypot(white_noise_of(data, start.scale), thermometer_error_of(data, start.scale))
-    best, least = None, np.inf
+    best, least_ratio = None, np.inf
     for shape in _SHAPES:
         if shape.has_gradient and not windows.gradient.any():
             continue
@@ -113,12 +113,12 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> list[Part
         is_explained = ratio <= shape.most_noise
         if not is_explained and min(map(subset.reduction, lags, range(3))) < 4.0:
             continue
-        if ratio < least:
-            best, least = parts, ratio
+        if ratio < least_ratio:
+            best, least_ratio = parts, ratio
         if ratio <= _EXPLAINED_RATIO:
             break
     accepted = [] if best is None else [best]
-    if least > _SHAPES[-1].most_noise:
+    if least_ratio > _SHAPES[-1].most_noise:
         curves = _PartCurves(windows, start, _SHAPES[0], 500)
         lags = [curves.one_stage(axis) for axis in range(3)]
         if min(map(curves.reduction, lags, range(3))) > 2.0:

@@ -137,21 +137,21 @@ class Growth:
             # columns: begin with a small sd of attitudes and, unless stated, of mounting offsets.
             prior = replace(prior, pose_sd=0.1 * POSE_SD)
             if prior.offset_scale > 0.0:
-                least = float(min(prior.offset_sd, prior.sigma.mean()))
-                prior = replace(prior, offset_sd=least)
+                small_sd = float(min(prior.offset_sd, prior.sigma.mean()))
+                prior = replace(prior, offset_sd=small_sd)
         posterior = settle(self.regression, state, prior, candidates, 6)
         posterior = pruned_fit(self.regression, posterior, candidates, 8)
         return Trial(groups, score_of(self.regression, posterior), posterior, typical)
 
     def extended(
-        self, before: Trial, groups: tuple[str, ...] = (), most: Floats | None = None
+        self, before: Trial, groups: tuple[str, ...] = (), largest_sd: Floats | None = None
     ) -> Trial:
         """
-        Fit the model `before` plus groups of columns, beginning from the fit of `before`. `most`:
-        largest typical prior sd of the new columns, (2, m); None for the typical sd of `before`
+        Fit the model `before` plus groups of columns, beginning from the fit of `before`.
+        `largest_sd`: largest typical prior sd of new columns, (2, m); None: as in `before`
         """
         regression, posterior, typical = self.regression, before.posterior, before.typical
-        if most is not None:
+        if largest_sd is not None:
             kelvins, state = regression.windows.kelvins, posterior.state
             square = float(np.mean(regression.residual(state, posterior.layout) ** 2))
             if state.pose.size:
@@ -162,7 +162,7 @@ class Growth:
             # The typical weight of a new column is that with which it alone explains the residual.
             slope = np.sqrt(square) / (float(kelvins[0]) or 1.0)
             units = np.array([[1.0], [1.0 / (regression.gravity or 1.0)]])
-            new = np.minimum(slope * units * kelvins, most)
+            new = np.minimum(slope * units * kelvins, largest_sd)
             typical = np.where(np.isin(self._names, groups), new, typical)
         return self.fit((*before.groups, *groups), posterior.state, posterior.prior, typical)
 

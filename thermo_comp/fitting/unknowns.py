@@ -150,8 +150,8 @@ class Windows:
         a single turn-on is part of the bias. On average, two or more mountings per turn-on are
         needed to separate turn-on offsets from mounting offsets.
         """
-        least = 1 if self.has_prior else 2
-        return least <= self.n_turn_ons <= (int(self.mounting[-1]) + 1) / 2
+        fewest = 1 if self.has_prior else 2
+        return fewest <= self.n_turn_ons <= (int(self.mounting[-1]) + 1) / 2
 
     @property
     def inner(self) -> Ints:

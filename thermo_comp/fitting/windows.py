@@ -424,8 +424,8 @@ def _part_kelvins(values: Floats) -> Floats:
     """Return the RMS of each power x^p in `Model.part_sums` over its largest slope [K], (9,)."""
     power = np.tile((1, 2, 3), values.shape[1] // 3)
     # The largest slope of x^p is p |x|^(p - 1) at the largest |x|.
-    most = np.repeat(np.abs(values[:, ::3]).max(axis=0, initial=0.0), 3)
-    steepest = power * most ** (power - 1)
+    largest = np.repeat(np.abs(values[:, ::3]).max(axis=0, initial=0.0), 3)
+    steepest = power * largest ** (power - 1)
     return np.asarray(np.sqrt(np.mean(values**2, axis=0)) / np.maximum(steepest, 1e-300))
 
 

@@ -96,8 +96,8 @@ def fit_fleet(
             rows = {unit.name: row for unit in some if (row := results.look_up(unit, how))}
             missing = [unit for unit in some if unit.name not in rows]
             if missing and client is None:
-                most = min(n_workers or os.cpu_count() or 1, len(some))
-                client = stack.enter_context(connected(scheduler, most))
+                n_used = min(n_workers or os.cpu_count() or 1, len(some))
+                client = stack.enter_context(connected(scheduler, n_used))
             progress(len(rows), len(some))
             for unit, outcome in run(client, storage.address, missing, how) if missing else ():
                 rows[unit.name] = results.store(unit, how, outcome)

@@ -165,12 +165,12 @@ class StuckCheck:
                 here = slice(max(begin, 0), end)
                 equal = np.arange(here.start - begin, end - begin)
                 is_long = (equal >= STUCK_SAMPLES) & (stamps[here] - begun[0][3] > self.limit_ns)
-                most, n_noisy, step = self._changes(begun, columns, here, equal, axis)
+                moved, n_noisy, step = self._changes(begun, columns, here, equal, axis)
                 is_noisy = (n_noisy >= NOISY_CHANGES) & (step <= self._visible[axis])
                 are_long[axis, here] = is_long
-                is_stuck[here] |= is_long & ((most > self.motion) | is_noisy)
+                is_stuck[here] |= is_long & ((moved > self.motion) | is_noisy)
                 runs[axis] = (
-                    begun[0], end - 1 - begin, most.item(-1), n_noisy.item(-1), step.item(-1)
+                    begun[0], end - 1 - begin, moved.item(-1), n_noisy.item(-1), step.item(-1)
                 )  # fmt: skip
         self.last, self.runs = (*samples[-1].tolist(), int(stamps[-1])), tuple(runs)
         is_stuck |= are_long.all(axis=0)
@@ -193,13 +193,13 @@ class StuckCheck:
         with np.errstate(invalid='ignore'):
             moved_by = np.abs(values[:, 1:].T - np.take(first[:3], [axis - 2, axis - 1]))
             changes = np.abs(np.diff(values))
-        most = np.fmax.accumulate(np.append(moved, moved_by.min(axis=1)))[1:]
+        most_moved = np.fmax.accumulate(np.append(moved, moved_by.min(axis=1)))[1:]
         # Like `_continued`, ignore changes up to the `STUCK_SAMPLES`th repeat of a reading.
         changes[:, equal <= STUCK_SAMPLES] = 0.0
         noisy = np.take(self._noisy, [axis - 2, axis - 1])[:, np.newaxis]
         counts = n_noisy + np.cumsum(np.sum(changes >= noisy, axis=0))
         steps = np.where(changes > 0.0, changes, math.inf).min(axis=0)
-        return most, counts, np.minimum.accumulate(np.append(step, steps))[1:]
+        return most_moved, counts, np.minimum.accumulate(np.append(step, steps))[1:]
 
 
 def _begun(sample: tuple[float, float, float, int]) -> tuple[Run, ...]:

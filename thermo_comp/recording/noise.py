@@ -44,11 +44,11 @@ def is_glitch(samples: Floats, quantum: Floats) -> Bools:
         return result
     # Noise and norm are estimated from at most 4000 samples, to save time.
     every = slice(None, None, max(len(samples) // 2000, 1))
-    least = _LEAST * float(np.median(np.linalg.norm(samples[every], axis=1)))
+    smallest = _LEAST * float(np.median(np.linalg.norm(samples[every], axis=1)))
     x = np.ascontiguousarray(samples.T)
     bend = np.abs(x[:, 1:-1] - 0.5 * (x[:, 2:] + x[:, :-2]))
     noise = np.maximum(np.median(bend[:, every], axis=1) / 0.6745, quantum)
-    limit = np.maximum(_SDS * noise, least)[:, np.newaxis]
+    limit = np.maximum(_SDS * noise, smallest)[:, np.newaxis]
     is_moving = np.pad((bend > limit / 3.0).any(axis=0), 1)
     is_far = bend > limit
     if is_far.any():

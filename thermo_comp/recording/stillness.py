@@ -206,9 +206,11 @@ class CellAccumulator:
             is_regular = np.mean(np.abs(gaps - usual) < 0.2 * usual) > 0.9
             if is_regular and usual < 5e9:
                 step, between = float(steps.mean()), 2.0 * usual
-        least = max(self._asked_cell_s * 1e9, self._least * step, between, 1.0)
-        least = min(least, _LONGEST_CELL_NS)
-        self._cell_ns = round(least if self._window_s is None else _part_of(self._window_s, least))
+        cell_ns = max(self._asked_cell_s * 1e9, self._least * step, between, 1.0)
+        cell_ns = min(cell_ns, _LONGEST_CELL_NS)
+        self._cell_ns = round(
+            cell_ns if self._window_s is None else _part_of(self._window_s, cell_ns)
+        )
         self._start_ns = int(stamp_ns[0])
         self._shift = samples[0].copy()
 
@@ -247,13 +249,13 @@ def widened(full_scale: float, samples: Floats) -> float:
     return next(2.0**bits - 1.0 for bits in _LONGER if np.median(size) < 2.0**bits or bits == 31)
 
 
-def _part_of(window_s: float, least: float) -> float:
-    """Return a cell length [ns] of which a multiple is 1 to 60 windows, or else `least`."""
+def _part_of(window_s: float, smallest_ns: float) -> float:
+    """Return a cell length [ns] of which a multiple is 1 to 60 windows, or else `smallest_ns`."""
     for stretch in STRETCHES:
-        n_cells = int(stretch * window_s * 1e9 / least * (1.0 + 1e-6))
+        n_cells = int(stretch * window_s * 1e9 / smallest_ns * (1.0 + 1e-6))
         if n_cells:
             return stretch * window_s * 1e9 / n_cells
-    return least
+    return smallest_ns
 
 
 def _quantum_of(samples: Floats, few: list[Floats]) -> Floats:
@@ -350,9 +352,9 @@ def why_restless(cells: Cells, still_sd: float = STILL_SD) -> str:
     """Describe why a bag has no rests."""
     full, under = _is_full(cells), is_under(cells, still_sd)
     if full.any() and not (full & under).any():
-        least = np.sqrt(np.min(cells.variance[full].max(axis=1))) / _one_g(cells)
+        quietest = np.sqrt(np.min(cells.variance[full].max(axis=1))) / _one_g(cells)
         return (
-            f'the samples scatter by at least {1e3 * least:.3g} mg (sd), the limit at rest is '
+            f'the samples scatter by at least {1e3 * quietest:.3g} mg (sd), the limit at rest is '
             f'{1e3 * still_sd:.3g} mg (--still-sd): was the unit worn, driven or shaken?'
         )
     if (full & under & _is_turning(cells)).sum() > 0.5 * full.sum():

@@ -240,14 +240,14 @@ def draw_positions(evidence: Evidence) -> Figure:
     """Draw the directions of the positions on the sphere, and the residual of each."""
     figure = style.new_figure(3.0)
     up, down = figure.subplots(1, 2)
-    least = evidence.least_known
+    axis = evidence.least_known
     judged = LEFT_OUT if evidence.left_out else next(reversed(evidence.residuals), RAW)
     for side, axes, name in ((1, up, 'z up'), (-1, down, 'z down')):
         _draw_hemisphere(axes, evidence.positions, side, judged)
-        if least is not None and (least.up[2] >= 0.0) == (side > 0):
-            place = equal_area(least.up, side)
+        if axis is not None and (axis.up[2] >= 0.0) == (side > 0):
+            place = equal_area(axis.up, side)
             axes.plot(*place, 'x', markersize=7.0, color=style.RED, mew=1.6)
-            text = '±' + ug_text(least.sd_m_s2).replace('ug', 'µg')
+            text = '±' + ug_text(axis.sd_m_s2).replace('ug', 'µg')
             # Shift the label towards the centre of the disc, as axis names are outside the disc.
             by = (0.0, 6.0 if place[1] < 0.0 else -12.0)
             _note(axes, text, place, by, ha='center', color=style.RED)

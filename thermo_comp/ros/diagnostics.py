@@ -108,8 +108,8 @@ class Reporter:
         findings = [*self._findings(), *findings_of(loaded, status, new, rate, silence_s)]
         # Vehicle accelerations give no warning: without nonlinearity in the calibration, warnings
         # begin at 2.01 g, where the unknown square term has an sd of 0.1 mg.
-        least = 0.0 if loaded.calibration.nonlinearity else STANDARD_GRAVITY
-        if (over := self._force_excess()) > least:
+        allowance = 0.0 if loaded.calibration.nonlinearity else STANDARD_GRAVITY
+        if (over := self._force_excess()) > allowance:
             text = f'|f| {over:.3g} m/s^2 above the largest |f| of the fit: the covariance grows'
             findings.append((_WARN, text))
         findings.sort(key=lambda finding: -finding[0])

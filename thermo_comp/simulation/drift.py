@@ -107,10 +107,12 @@ class FlowEffect(Effect):
         at = [history.nodes.index(part) for part in (self.hot, self.cold)]
         at_rest = history.origin[at[:1]] - history.origin[at[1:]]
         difference = history.deviation[:, at[0]] - history.deviation[:, at[1]] + at_rest
-        flow, least = ((np.abs(d) / self.knee) ** self.exponent for d in (difference, at_rest))
+        flow, flow_at_rest = (
+            (np.abs(d) / self.knee) ** self.exponent for d in (difference, at_rest)
+        )
         if self.is_limited:
-            flow, least = flow / (1.0 + flow), least / (1.0 + least)
-        first = (flow - least) * history.of(self.cold) ** self.power
+            flow, flow_at_rest = flow / (1.0 + flow), flow_at_rest / (1.0 + flow_at_rest)
+        first = (flow - flow_at_rest) * history.of(self.cold) ** self.power
         return first, first * history.of(self.cold)
 
 

@@ -335,8 +335,8 @@ class LeadCheck:
             self.extra_variance = 0.0
         elif slow > DOUBTFUL_RATE_SHARE * fast:
             self.extra_variance = lead * lead
-        least = max(self._margin + noise, LEAD_SHARE * max(abs(by_case), abs(by_board)))
-        if slow <= LEAD_RATE_SHARE * fast or abs(lead) <= least:
+        smallest_lead = max(self._margin + noise, LEAD_SHARE * max(abs(by_case), abs(by_board)))
+        if slow <= LEAD_RATE_SHARE * fast or abs(lead) <= smallest_lead:
             return
         is_against = lead < 0.0
         self._n_alike = self._n_alike + 1 if is_against == self._is_against else 1

@@ -219,11 +219,11 @@ class Correction:
         )
         between = grown(slow[9:N_ROWS], growth)
         # The largest force that each axis can measure [m/s^2], and the error variance there.
-        most = (self._full_scale + np.abs(both[0, :, 0])) / np.abs(both[1, :, 0])
+        largest_force = (self._full_scale + np.abs(both[0, :, 0])) / np.abs(both[1, :, 0])
         tilts = misalignment_variances(between).max(axis=0)
-        variance = v[:, 0] + most * (np.abs(v[:, 1]) + most * (v[:, 2] + tilts))
-        least = _LEAST_SHARE * variance.max(axis=0)
-        v[:, 0] += np.maximum(self._noise * (1.0 + np.asarray(noise_excess)), least)
+        variance = v[:, 0] + largest_force * (np.abs(v[:, 1]) + largest_force * (v[:, 2] + tilts))
+        smallest = _LEAST_SHARE * variance.max(axis=0)
+        v[:, 0] += np.maximum(self._noise * (1.0 + np.asarray(noise_excess)), smallest)
         beyond = np.empty((0, n))
         if self.of_force is not None:
             v[:, 2] += slow[N_ROWS::5]

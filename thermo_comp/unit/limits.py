@@ -40,8 +40,8 @@ _AROUND = f'range and, on each side, along the tangent for {TANGENT_SPANS:g} of 
 def check_limits(calibration: Calibration, layout: ParameterLayout) -> None:
     """Raise ValueError, with the key's name, if a part of a calibration exceeds its limits."""
     reference, sets = calibration.reference_temperature_c, calibration.regime_sets()
-    most = FULL_SCALES * calibration.unit.full_scale
-    _check_axes(calibration, most)
+    limit = FULL_SCALES * calibration.unit.full_scale
+    _check_axes(calibration, limit)
     edges = [[edge - reference for edge in part.temperature_range_c] for part in sets]
     outermost = min(map(min, edges)), max(map(max, edges))
     if calibration.nonlinearity is not None:
@@ -53,8 +53,8 @@ def check_limits(calibration: Calibration, layout: ParameterLayout) -> None:
     sizes = [u * farthest_k**term.power for u, term in zip(largest, response, strict=True)]
     for k, (term, size) in enumerate(zip(response, sizes, strict=True)):
         effect = size * max(map(abs, term.bias))
-        if not effect <= WORST * most:
-            rule = f'keep the largest effect of the column within {WORST * most:g} input units'
+        if not effect <= WORST * limit:
+            rule = f'keep the largest effect of the column within {WORST * limit:g} input units'
             raise broken(f'response[{k}].bias', rule, effect)
     for regime, part, ends in zip(('static', 'dynamic'), sets, edges, strict=True):
         at_work = [term.during in ('always', regime) for term in response]
@@ -64,14 +64,14 @@ def check_limits(calibration: Calibration, layout: ParameterLayout) -> None:
             _check_scale(f'{regime}.{name}', _extremes(axis.scale_function, ends), gain)
         for name, at, axis in zip('xyz', calibration.axes, part.axes(), strict=True):
             reached = _extremes(axis.bias_function, ends)
-            _check_bias(f'{regime}.{name}', at.bias + axis.delta, reached, most)
+            _check_bias(f'{regime}.{name}', at.bias + axis.delta, reached, limit)
     if calibration.posterior is None:
         return
     calibration.posterior.check_size(layout.n_parameters)
     variances = (calibration.posterior.matrix**2).sum(axis=1) + calibration.posterior.variances
     for k, axes in enumerate(zip(*(part.axes() for part in sets), strict=True)):
         for block, functions, bound in (
-            (layout.bias[k], [axis.bias_function for axis in axes], most),
+            (layout.bias[k], [axis.bias_function for axis in axes], limit),
             (layout.scale[k], [axis.scale_function for axis in axes], LARGEST_RELATIVE_SCALE),
         ):
             sd = np.sqrt(variances[block.rows])
@@ -82,10 +82,10 @@ def check_limits(calibration: Calibration, layout: ParameterLayout) -> None:
                 raise broken('posterior.factor', rule, worst)
 
 
-def _check_axes(calibration: Calibration, most: float) -> None:
+def _check_axes(calibration: Calibration, limit: float) -> None:
     for name, axis in zip('xyz', calibration.axes, strict=True):
-        if abs(axis.bias) > most:
-            rule = f'be within twice unit.full_scale, {most:g}'
+        if abs(axis.bias) > limit:
+            rule = f'be within twice unit.full_scale, {limit:g}'
             raise broken(f'axes.{name}.bias', rule, float(axis.bias))
         force = calibration.unit.full_scale / abs(axis.scale_factor)
         if fault := QUANTITIES['full-scale force'].fault(force):
@@ -95,16 +95,16 @@ def _check_axes(calibration: Calibration, most: float) -> None:
             )
 
 
-def _check_bias(key: str, level: float, reached: tuple[float, float], most: float) -> None:
-    if abs(level) > most:
-        rule = f'keep bias plus delta within {most:g} input units'
+def _check_bias(key: str, level: float, reached: tuple[float, float], limit: float) -> None:
+    if abs(level) > limit:
+        rule = f'keep bias plus delta within {limit:g} input units'
         raise broken(f'{key}.delta', rule, float(level))
-    least, largest = reached
-    if not math.isfinite(largest - least):
+    smallest, largest = reached
+    if not math.isfinite(largest - smallest):
         raise ValueError(f'`{key}.bias_function` must be finite over its {_AROUND}')
-    if max(-least, largest) > most:
+    if max(-smallest, largest) > limit:
         raise ValueError(
-            f'`{key}.bias_function` must stay within {most:g} input units over its {_AROUND}, '
+            f'`{key}.bias_function` must stay within {limit:g} input units over its {_AROUND}, '
             f'reaches {max(reached, key=abs):g}'
         )
 
