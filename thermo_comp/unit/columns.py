@@ -301,7 +301,7 @@ class ColumnTable:
         return hold(raw, *self._range)
 
     def excess(self, raw: Floats) -> Floats:
-        """Return (1 + e)^(1 / n) - 1; u, of order n in T, is e half ranges outside its range."""
+        """Return (1 + e)^(1 / n) - 1 for u of order n in T at e half ranges from its range."""
         lower, upper = self._range
         excess = np.asarray(np.abs(raw - self.held(raw)) / ((upper - lower) / 2.0))
         for order in {*self._orders.tolist()} - {1}:
@@ -325,8 +325,8 @@ class ColumnTable:
 
     def slopes(self, states: Floats) -> tuple[Floats, Floats | None]:
         """
-        Differentiate each column's u, without its limits, by the quantity that determines u and,
-        at constant lag, by T_board (None if no column is a function of t - lag).
+        Differentiate each column's u, without limits, w.r.t. the state quantity of the column and,
+        at constant lag, w.r.t. T_board (None if no column is a function of t - lag).
         """
         slopes, scaled = np.ones((len(self._places), states.shape[1])), self._scaled(states)
         for rows, term in self._terms:
