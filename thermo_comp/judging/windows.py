@@ -261,7 +261,7 @@ def _correct(calibration: Calibration, bag: ReducedBag, sums: _Table) -> None:
     # The checks for stuck samples and gravity do not apply to means of samples.
     config = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
     compensator = Compensator(calibration, config)
-    # Accept any forward step of the stamps: a partial sum has the mean time of many samples.
+    # Accept any forward step of the stamps, because a partial sum spans many samples.
     compensator.leap_ns = np.iinfo(np.int64).max
     thermal = compensator.thermal
     readings = iter(readings_in_order(bag, thermal.inputs))

@@ -117,7 +117,7 @@ class SensorCheck:
         self._expected = 0.0
         self._moved = 0.0
         self._seen_ns: int | None = None
-        #: The first readings [degC] and their stamps, until the third reading judges the first.
+        #: Stamps and values [degC] of the first two readings; None once the third has judged them.
         self._first: list[tuple[int, float]] | None = []
 
     @property

@@ -162,7 +162,7 @@ class _Watch:
         self._mean = 0.0
 
     def is_calm(self, stamp_ns: int, sensor: Thermometer | None, lead_swing: float) -> bool:
-        """Update a sensor's mean rate; return True if the rate is low or no reading is fresh."""
+        """Update a sensor's mean rate; return True if the rate is low or no reading is recent."""
         seen_ns = None if sensor is None else sensor.stamp_ns
         if sensor is None or seen_ns is None or stamp_ns - seen_ns > self._stale_ns:
             return True

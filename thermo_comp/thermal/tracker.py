@@ -284,7 +284,7 @@ class ThermalTracker:
     def _gradient(
         self, name: str, stamp_ns: int, board: float, rate: float
     ) -> tuple[float, float]:
-        """Return a sensor's temperature less the board's, and the sensor's variance."""
+        """Return sensor less board temperature, and the variance of the sensor's temperature."""
         sensor = self.thermometers[name]
         if self.is_live(stamp_ns, sensor):
             celsius, _, variance = sensor.at(stamp_ns)

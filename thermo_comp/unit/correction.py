@@ -280,7 +280,7 @@ class Correction:
             columns_out = columns_out.max(axis=1, initial=0.0)
             # Outside the calibrated range the curves are extrapolated, with two errors: slope of
             # the curves at the edge of the range times the board's distance from the edge; sd of
-            # the slopes times the largest distance of the board or a part from the range.
+            # the slopes in the range times the largest distance of board or part from the range.
             v += self._spread(shares * excess * excess, slopes)
             bent = shares * np.maximum(excess * excess, parts_out * parts_out)
             bends = np.broadcast_to(self._bends, (4, *slopes.shape[1:]))

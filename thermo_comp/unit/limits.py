@@ -110,7 +110,7 @@ def _check_bias(key: str, level: float, reached: tuple[float, float], most: floa
 
 
 def _check_scale(key: str, reached: tuple[float, float], gain: float) -> None:
-    """Refuse curves of the relative scale that, plus or minus `gain`, leave the limits."""
+    """Refuse a curve of the relative scale that leaves the limits with the columns' `gain`."""
     for word, value, is_kept, limit in (
         ('above', reached[0] - gain, operator.gt, SMALLEST_RELATIVE_SCALE),
         ('below', reached[1] + gain, operator.lt, LARGEST_RELATIVE_SCALE),
