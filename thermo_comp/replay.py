@@ -91,7 +91,7 @@ def topics_for(calibration: Calibration, topics: Topics | None) -> Topics:
 
 
 def needed_roles(*calibrations: Calibration) -> tuple[Role, ...]:
-    """Return the needed inputs: samples, and board if a calibration depends on temperature."""
+    """Return the needed inputs: samples; board temperature if a calibration depends on it."""
     needs_board = any(calibration.needs_temperature for calibration in calibrations)
     return ('accel', 'board') if needs_board else ('accel',)
 

@@ -19,7 +19,7 @@ from .windows import JudgedWindows
 
 #: Largest ratio of RMS error to claimed RMS of a valid calibration, if no tolerance is given.
 LARGEST_RATIO = 2.0
-#: Ratio of claimed RMS to raw RMS above which, without a tolerance, a valid calibration is WIDE.
+#: Without a tolerance, a valid calibration is WIDE if claimed RMS / raw RMS exceeds this ratio.
 WIDE_PART = 0.5
 # Smallest number of windows of a regime that is judged separately.
 _FEWEST_WINDOWS = 6
@@ -165,13 +165,13 @@ def judge_rates(windows: JudgedWindows, calibration: Calibration) -> RateJudgeme
     triad = rate_triad(calibration)
     claims, claimed = triad.has_uncertainty, np.full_like(corrected, np.nan)
     if claims:
-        # The claimed variance of the changes from a rest's mean follows from the claimed variance
+        # Derive the claimed variance of a rate less its mean in the rest from the claimed variance
         # of one message's rate.
         correction = Correction(triad, Correction(calibration).memory)
         bias, change = SlowUncertainty(triad, correction).of_bias(windows.gyro[:, 9:], mean_of)
         slow = np.square([axis.residual_sd_m_s2 for axis in triad.static.axes()])
-        # Thermometer noise and unknown initial lag states hardly change the mean of a rest, so the
-        # change from this mean has the whole variance of the errors due to them.
+        # Errors due to thermometer noise and unknown initial lag states hardly change the mean of
+        # a rest, so a rate less this mean has the whole variance of these errors.
         of_thermometers = np.maximum(variance - np.array(correction.noise) - slow - bias, 0.0)
         white = np.square(triad.noise_density_m_s2_sqrt_hz) / windows.window_s
         noise = white * (1.0 - 1.0 / np.maximum(counts, 1.0))[:, None]

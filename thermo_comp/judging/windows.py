@@ -30,8 +30,8 @@ from ..unit.nonlinearity import AT_REST
 
 #: Default duration of a window of a judgement [s].
 WINDOW_S = 60.0
-# A window up to this far outside the calibrated ranges counts as inside, because of thermometer
-# noise: sum of the distances from the ranges of temperature, rate, worst column [half ranges].
+# A window counts as inside the calibrated ranges up to this sum of its distances from the ranges
+# of temperature, rate and worst column [half ranges], because thermometers have noise.
 _RANGE_TOLERANCE = 0.02
 # A partial sum is used if it has at least this share of the median number of samples.
 _LEAST_FILLED = 0.9
@@ -84,12 +84,12 @@ class JudgedWindows:
 
     @cached_property
     def raw_residual(self) -> Floats:
-        """|f| with the constants at the reference temperature, less `size`, (n,) [m/s^2]."""
+        """|f| with the constants at T_ref, less the known |f|, shape (n,) [m/s^2]."""
         return norm_residual(self.raw, self.size)
 
     @cached_property
     def residual(self) -> Floats:
-        """|f| with the calibration, less `size`, shape (n,) [m/s^2]."""
+        """|f| with the calibration, less the known |f|, shape (n,) [m/s^2]."""
         return norm_residual(self.force, self.size)
 
     @property
@@ -261,7 +261,7 @@ def _correct(calibration: Calibration, bag: ReducedBag, sums: _Table) -> None:
     # The checks for stuck samples and gravity do not apply to means of samples.
     config = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
     compensator = Compensator(calibration, config)
-    # Accept any forward step of the stamps: a partial sum has the mean time of many samples.
+    # Accept any forward step of the stamps, because a partial sum spans many samples.
     compensator.leap_ns = np.iinfo(np.int64).max
     thermal = compensator.thermal
     readings = iter(readings_in_order(bag, thermal.inputs))

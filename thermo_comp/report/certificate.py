@@ -35,7 +35,7 @@ _MOST_TEMPERATURES = 8
 
 
 class Program(NamedTuple):
-    """A soak, or a ramp from a soak at one end of a set's temperatures to the other end."""
+    """A soak, or a ramp from a soak at one end of a regime's temperature range to the other."""
 
     name: str  # soak, heating or cooling
     regime: RegimeSet
@@ -107,7 +107,7 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
     claimed = noise
     if calibration.has_uncertainty:
         x, y, z = (windows.force / np.linalg.norm(windows.force, axis=1, keepdims=True)).T
-        # Derivatives of |f| by M[1][0], M[2][0] and M[2][1] at |f| = g.
+        # Derivatives of |f| w.r.t. M[1][0], M[2][0] and M[2][1] at |f| = g.
         by_element = np.stack((x * y, x * z, y * z)) * windows.gravity
         attitude = _rms(np.linalg.norm(by_element.T * calibration.misalignment_sd, axis=1))
         claimed = _rms(windows.claimed_sd)
@@ -206,8 +206,8 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
         value, sd = evaluate(calibration, program, at)[2:]
         off = value - np.outer(at - calibration.reference_temperature_c, slope)
         value[:, :3] += bias_0 / MICRO_G
-        # If gravity has no stated sd, value and deviation are rounded by the uncertainty without
-        # gravity; if the calibration states no uncertainty, the largest values have 4 digits.
+        # Bias, scale and deviations are rounded by the uncertainty without gravity if gravity has
+        # no stated sd; if the calibration states no uncertainty, the largest have 4 digits.
         largest = np.maximum(np.abs(value).max(axis=0), 1e-3)
         four_digits = 10.0 ** (np.floor(np.log10(largest)) - 2.0)
         digits = np.where(known * sd > 0.0, known * sd, four_digits)
@@ -290,7 +290,7 @@ def evaluate(calibration: Calibration, program: Program, temperature: Floats) ->
 
 
 def curves(calibration: Calibration) -> list[Curve]:
-    """Evaluate soak and ramps over the temperature range of their sets."""
+    """Evaluate soak and ramps, each over the calibrated temperatures of its regime."""
     return [
         evaluate(calibration, program, np.linspace(*program.regime.temperature_range_c, _N_CURVE))
         for program in programs(calibration)

@@ -52,7 +52,7 @@ _MOST_POINTS = 4000
 
 @dataclass(frozen=True)
 class Position:
-    """A still position: force direction in the output frame, RMS of |f| - g by correction."""
+    """A still position: force direction in the output frame, RMS of |f| - g of each correction."""
 
     number: int
     bag: int
@@ -72,7 +72,7 @@ class Stretch(NamedTuple):
 
 @dataclass(frozen=True)
 class ShownBag:
-    """A bag's regimes, temperature rates and second derivative (NaN until settled) [K, s]."""
+    """A bag's regimes; temperature rates [K/s], second derivative [K/s^2], NaN until settled."""
 
     index: int
     bag: ReducedBag
@@ -333,7 +333,7 @@ def span_of(bag: ReducedBag) -> tuple[int, float]:
 def widest(bags: Sequence[ReducedBag]) -> int:
     """Return the index of the bag with the widest range of T_board; if several, the longest."""
     spans = [float(np.ptp(bag.board.value)) if len(bag.board.value) else 0.0 for bag in bags]
-    # T_board ranges within 5 % count as equal, as do durations within 1 min: the first bag wins.
+    # Ranges within 5 % and durations equal in whole minutes count as equal: take the first bag.
     candidates = [i for i, span in enumerate(spans) if span >= 0.95 * max(spans)]
     return max(candidates, key=lambda i: (round((bags[i].end_ns - bags[i].start_ns) / 60e9), -i))
 

@@ -135,7 +135,7 @@ def draw_gravity(evidence: Evidence) -> Figure:
 def _panels(
     evidence: Evidence, heights: Sequence[float], *, more: float = 0.0, is_flagged: bool = False
 ) -> tuple[Figure, list[Axes], ShownBag, float]:
-    """Return figure, panels over time (dynamic regime grey), shown bag, unit of time axis [s]."""
+    """Return a figure, its panels over time, the bag that they show, unit of the time axis [s]."""
     shown = required(evidence.shown)
     unit, name = style.time_unit(shown.duration_s)
     figure = style.new_figure(more + sum(heights))

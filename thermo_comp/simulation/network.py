@@ -96,7 +96,7 @@ class ThermalNetwork:
         return A, b, p
 
     def convection(self, state: Floats, air: float) -> Floats:
-        """Return what exponents of heat paths other than 1 add to ``dx/dt``, shape (k,)."""
+        """Return the part of ``dx/dt`` due to exponents of heat paths other than 1, shape (k,)."""
         index, at = self._places, np.append(state, air)
         flow = np.zeros(len(at))
         for link in self.links:
@@ -108,7 +108,7 @@ class ThermalNetwork:
         return flow[:-1]
 
     def settled(self, air: float, power: Floats | None = None) -> Floats:
-        """Return the state after an endless soak, shape (k,); `power` replaces p of `system`."""
+        """Return the state after an endless soak, shape (k,); `power` replaces p in ``dx/dt``."""
         A, b, p = self.system()
         drive = p if power is None else power
         state = np.linalg.solve(A, -b * air - drive)

@@ -99,8 +99,8 @@ def _thermostatted(draw: Specimen) -> UnitModel:
         thermostat=Thermostat('oven', 55.0, 20.0, 0.08, 25.0),
     )  # fmt: skip
     drift = (
-        # The reference current determines the scale of all axes; the curvature is that of a
-        # bandgap reference.
+        # The reference current determines the scale of all axes, with the curvature over
+        # temperature of a bandgap reference.
         PartEffect('reference', scale=draw.axes(40.0, 0.15), scale_curvature=draw.axes(0.02, 0.5)),
         # Each axis' potted integrator has dielectric absorption and charge injection; the leakage
         # of the integrator's switches, with positive curvature, is on the board.
@@ -131,8 +131,8 @@ def _bare_quartz(draw: Specimen) -> UnitModel:
         PartEffect('magnet', scale=draw.axes(48.0, 0.01), scale_curvature=draw.axes(0.31, 0.02)),
         PartEffect('reference', scale=draw.axes(29.5, 0.01)),
         PartEffect('pendulum', bias=draw.signed(0.3, 5.0), bias_curvature=draw.normal(0.005)),
-        # The shunt that compensates the magnet's tempco and the coil on the pendulum have
-        # different temperatures in a ramp: effects that cancel in a soak do not cancel in a ramp.
+        # In a ramp the coil on the pendulum and the shunt that compensates the magnet's tempco
+        # have different temperatures: their effects, which cancel in a soak, do not cancel.
         PartEffect('head', 'pendulum', scale=draw.axes(-115.0, 0.2), bias=draw.normal(15.0)),
         # Stress acts through the joint to the mounting ring, which is heavy, slow and bolted to
         # the case.

@@ -40,8 +40,8 @@ class ChangeDetector:
     """
     Baseline, swing and departure of the rate of change of one sensor's temperature.
 
-    `rate` [K/s] is the output of the filter with the longer memory, or of `Thermometer` if the
-    sensor has wide cells. `swing` [K/s]: amplitude of the oscillation of the rate in a soak.
+    `rate` [K/s] is the output of the filter with the longer memory, or of `Thermometer` if noise
+    never changes a reading. `swing` [K/s]: amplitude of the oscillation of the rate in a soak.
     """
 
     def __init__(
@@ -62,8 +62,8 @@ class ChangeDetector:
             TUNING * math.pow(sqrt(self._noise) / (share * onset), 0.4) for share in BEND_SHARES
         ]
         self._powers = [self._noise / memory**4 for memory in memories]
-        # False alarms per second at a threshold of h sd: acos(rho) / (2 pi dt) exp(-h^2 / 2) for
-        # each filter and sign, rho the correlation of the noise of rates dt apart.
+        # False alarms per second of each filter and sign at a threshold of h sd: acos(rho) / (2 pi
+        # dt) exp(-h^2 / 2), with rho the correlation of the noise of two rates at times dt apart.
         self._log_crossings = -log(2.0 * pi * false_alarms / (2.0 * len(self._powers)))
         self._by_edges = sensor.has_wide_cells
         self._stamp_ns: int | None = None
@@ -71,7 +71,7 @@ class ChangeDetector:
         self.rate = 0.0
         self.swing = self._ripple_rate
         self._baseline = 0.0
-        # Largest error of the baseline [K/s]: its first rate may be at a crest of the ripple.
+        # Largest error of the baseline [K/s]: the first rate may be at a crest of the ripple.
         self._baseline_error = self.swing
         self._trend = 0.0
         self._is_above = False
@@ -89,7 +89,7 @@ class ChangeDetector:
         return self._stamp_ns == stamp_ns and self._age_s > 0.0
 
     def is_back(self) -> bool:
-        """Whether |rate - baseline| is below the swing plus the error of the baseline."""
+        """Whether the rate is near the baseline: within the swing plus the baseline's error."""
         return abs(self.rate - self._baseline) < self.swing + self._baseline_error
 
     def update(self, stamp_ns: int, sensor: Thermometer, pace: float) -> int:
@@ -143,7 +143,7 @@ class ChangeDetector:
         self._reading = sensor.reading
 
     def _tune(self, dt: float) -> None:
-        """Compute each filter's threshold of (rate beyond the limits)^2 / variance of the rate."""
+        """Compute each filter's threshold for (rate beyond its limit)^2 / variance of the rate."""
         self._dt = dt
         self._thresholds: list[float] = []
         for power in self._powers[::-1]:
@@ -228,8 +228,8 @@ class ChangeDetector:
             self._peak = max(self._peak, abs(apart))
             return
         if self._age_s - self._turned_s < LONGEST_HALF_SWING_S:
-            # Take the smaller peak of two half periods: at the onset or end of a ramp the rate
-            # deviates far on one side of the trend only.
+            # Take the smaller of the rate's peaks on the two sides of the trend: at the onset or
+            # end of a ramp the rate deviates far on one side only.
             noise = SWING_SIGMAS * sqrt(self._noise_share * self._filters[0][4])
             swing = SWING_MARGIN * min(self._peak, self._peak_before) - noise
             self.swing = max(self.swing, min(swing, self._largest_swing))

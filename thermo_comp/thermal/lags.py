@@ -7,8 +7,8 @@ A lag L of an input u obeys ``dL/dt = (u - L) / tau``. The stored state is ``m =
 less the lag. For two stages in series, of time constants ``tau_1 > tau_2``, and a lead theta, m is
 a weighted sum of the m of two first-order lags,
 ``m = ((tau_1 - theta) m_1 - (tau_2 - theta) m_2) / (tau_1 - tau_2)``. A part between the board and
-a sensor s lags the temperature ``T + v G``, with ``G = T_s - T``, so that ``m = T - L(T + v G)``,
-which is ``T - L(T)`` less v times ``L(G)``. docs/theory.md explains the model ("Parts").
+a sensor s lags the temperature ``T + v G``, with the gradient ``G = T_s - T`` and its share v, so
+``m = T - L(T + v G)`` is ``T - L(T)`` less ``v L(G)``. docs/theory.md explains the model (Parts).
 """
 
 import math
@@ -26,8 +26,8 @@ BOARD_INPUT: Final = 'board'
 #: Relative jitter on the diagonal of the start covariance: lags of similar time constants are
 #: almost collinear, and their covariance would not be invertible.
 START_JITTER: Final = 3e-4
-#: Prior sd of a lag's initial state [K]: for lags of the board temperature, and for lags of a
-#: gradient, both with the time constant `START_TAU_S` [s].
+#: Prior sd [K] of the initial state of a lag with the time constant `START_TAU_S` [s]: for a lag
+#: of the board temperature, and for a lag of a gradient.
 START_TAU_S: Final = 3600.0
 BOARD_START_SD: Final = 3.0
 GRADIENT_START_SD: Final = 1.0
@@ -39,7 +39,7 @@ class Quantity:
     input: str
     #: Largest magnitude of the quantity that a calibration may contain.
     largest: ClassVar[float] = QUANTITIES['temperature span'].at_most or 0.0
-    #: Typical change of the quantity per kelvin of temperature change.
+    #: Typical change of a quantity of this class per kelvin of temperature change.
     per_kelvin: ClassVar[float] = 1.0
     #: Whether the quantity depends on a part's lag behind the board (0 s for the board itself).
     is_of_part: ClassVar[bool] = True
@@ -103,7 +103,7 @@ class Lag(_Lag, Quantity):
         return (tau - lead) / (tau - second), (lead - second) / (tau - second) if second else 0.0
 
     def remaining_share(self, age_s: Any, exp: Any = math.exp) -> Any:
-        """Return the share (RMS, 1 to 0) of a lag's initial state that is left after `age_s`."""
+        """Return the share, 1 to 0, of the sd of a lag's initial state that is left at `age_s`."""
         first = exp(-age_s / self.tau_s)
         if not self.second_tau_s:
             return first
@@ -182,13 +182,13 @@ def start_covariance(lags: Sequence[tuple[Any, ...]]) -> Floats:
 
 def start_root(lags: Sequence[tuple[Any, ...]]) -> Floats:
     """
-    Return a factor of the covariance of `start_covariance`, which is the factor times its
-    transpose, shape (n, number of first-order lags) [K].
+    Return a matrix whose product with its transpose is `start_covariance`, shape (n, number of
+    first-order lags) [K]. The covariance may be singular, as of two nearly equal lags.
 
-    The factor is also computed for a singular covariance, as of two nearly equal lags. The
-    input before the first reading is modelled as a random walk with ``D = 2 sd^2 / START_TAU_S``
-    [K^2/s]: lags k, l of one input have the covariance ``P_kl = D tau_k tau_l / (tau_k + tau_l)``,
-    lags of different inputs 0. P_kl falls in s seconds by a factor ``exp(-s/tau_k - s/tau_l)``.
+    The input before the first reading is modelled as a random walk with ``D = 2 sd^2 /
+    START_TAU_S`` [K^2/s]: lags k, l of one input have the covariance ``P_kl = D tau_k tau_l /
+    (tau_k + tau_l)``, lags of different inputs 0. The covariance P_kl of lags k and l falls in s
+    seconds by a factor ``exp(-s/tau_k - s/tau_l)``.
     """
     all_lags = [Lag(*lag) for lag in lags]
     terms = first_order_lags(all_lags)

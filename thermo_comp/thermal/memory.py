@@ -4,8 +4,8 @@
 Owns the thermal memory: the states of lags and play operators, updated with each reading, or
 computed on a uniform grid of times.
 
-The state m of a lag (see `lags`) with the input u obeys ``dm/dt = du/dt - m / tau``. With u linear
-between two readings (first-order hold) the exact step of m over dt is
+The state m of a lag (see `lags`) with the input u obeys ``dm/dt = du/dt - m / tau``. If the
+input u is linear between two readings (first-order hold), the state m becomes, after dt, exactly
 ``m' = m e + (u' - u) (tau / dt) (1 - e)``, ``e = exp(-dt / tau)``.
 """
 
@@ -82,7 +82,7 @@ class LagBank:
         self.extra = [variance + change * change for variance in self.extra]
 
     def at(self, stamp_ns: int, value: float) -> tuple[list[float], list[float]]:
-        """Return each ``u - L`` [K] at u = `value`; its variance without the initial state's."""
+        """Return each ``u - L`` [K] at u = `value`, and its variance less the start variance."""
         seen_ns = self.stamp_ns
         if seen_ns is None or stamp_ns <= seen_ns or not self.taus:
             return self.lagging, self.extra
@@ -117,7 +117,7 @@ class ThermalMemory:
         terms = sorted(first_order_lags(spec.lags), key=lambda term: spec.inputs.index(term[0]))
 
         def weights(lag: Lag) -> list[tuple[int, float]]:
-            """Return index in `terms` and weight of each first-order lag in the sum `lag`."""
+            """Return index in `terms` and weight of each first-order lag that `lag` contains."""
             return [(terms.index(term), w) for term, w in lag.first_order_weights.items()]
 
         #: The first-order lags of each input, by the input's name.
@@ -244,7 +244,7 @@ def memory_on_grid(
     """
     Compute the results of `ThermalMemory.at`, except for rounding, on a uniform grid of times.
 
-    Returns (n, 2 * n_lags + n_plays): each lag [K] and its variance 0, then plays less inputs [K].
+    Returns (n, 2 * n_lags + n_plays): each lag [K] and the variance 0; then play less input [K].
     """
     inputs = dict(zip(spec.inputs, (board, *gradients), strict=True))
     first_order: dict[tuple[str, float], Floats] = {}

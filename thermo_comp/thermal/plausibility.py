@@ -38,7 +38,7 @@ STILL_PROBABILITY: Final = 1e-9
 #: Number of equal readings in a row that are doubtful if the quantum is not far above the noise.
 DOUBTFUL_READINGS: Final = 4
 #: A sensor with constant readings counts as frozen if the other sensor's temperature changes by
-#: more than noise, quanta and this margin [K]; the second margin is for a quantum far above noise.
+#: more than its noise, the quanta and this margin [K]; the second: if quantum far exceeds noise.
 OTHER_MOVED: Final = 0.3
 OTHER_MOVED_BEYOND_CELL: Final = 0.7
 #: Largest assumed error of a sensor with constant readings [K].
@@ -117,7 +117,7 @@ class SensorCheck:
         self._expected = 0.0
         self._moved = 0.0
         self._seen_ns: int | None = None
-        #: The first readings [degC] and their stamps, until the third reading judges the first.
+        #: Stamps and values [degC] of the first two readings; None once the third has judged them.
         self._first: list[tuple[int, float]] | None = []
 
     @property
@@ -142,7 +142,7 @@ class SensorCheck:
         (first_ns, wrong), (second_ns, second) = first
         step, after = second - wrong, celsius - second
         possible = LARGEST_RATE * (second_ns - first_ns) * 1e-9 + 2.0 * self._quantum
-        # If the step is due to a ramp: the change from the second to the third reading [K].
+        # Change from the second to the third reading [K] if a ramp caused the step.
         continued = abs(step) * (stamp_ns - second_ns) / (second_ns - first_ns)
         is_step = abs(step) > possible + _NOISE_SDS * self.sensor.settings.noise_sd_c
         return is_step and abs(after) < CONTINUED_SHARE * min(abs(step), continued)

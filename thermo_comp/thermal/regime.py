@@ -79,8 +79,8 @@ class RegimeDetector:
         is_calm = self._case.is_calm(stamp_ns, case, change.swing)
         is_calm = self._board.is_calm(stamp_ns, board, change.swing) and is_calm
         if is_dynamic and not self._is_grown:
-            # A ramp's onset is detected at a low rate. Until the rate exceeds 1.5 times the
-            # relaxed rate, the dynamic state can only end when the rate is back at the baseline.
+            # The onset of a ramp is detected while the rate is low. Until the rate exceeds 1.5
+            # times the relaxed rate, the dynamic state only ends at a rate near the baseline.
             self._is_grown = abs(lead.rate) > OBVIOUS_SHARE * self._relaxed_rate
             is_calm = is_calm and change.is_back()
         if not is_calm:
@@ -90,8 +90,8 @@ class RegimeDetector:
 
         if not is_dynamic:
             speed = OBVIOUS_SHARE * self._relaxed_rate
-            # A sensor with wide cells that crosses two cells in one direction is in a ramp, even
-            # if the regime is unknown.
+            # If noise never changes a reading, two successive changes in one direction prove a
+            # ramp, even if the regime is unknown.
             if departure and (
                 is_static or (lead.settings.has_wide_cells and departure * lead.rate > speed)
             ):
@@ -162,7 +162,7 @@ class _Watch:
         self._mean = 0.0
 
     def is_calm(self, stamp_ns: int, sensor: Thermometer | None, lead_swing: float) -> bool:
-        """Update a sensor's mean rate; return True if the rate is low or no reading is fresh."""
+        """Update a sensor's mean rate; return True if the rate is low or no reading is recent."""
         seen_ns = None if sensor is None else sensor.stamp_ns
         if sensor is None or seen_ns is None or stamp_ns - seen_ns > self._stale_ns:
             return True

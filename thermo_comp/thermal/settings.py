@@ -127,8 +127,8 @@ class ThermalConfig:
     #: Age of the board temperature after which nothing is published, unless the correction is
     #: constant; also the time for which board readings after an impossible step are refused.
     temperature_timeout_s: Positive = 60.0
-    #: Age of the case temperature at which the board temperature decides the regime [s]; also the
-    #: time for which the readings of other sensors after an impossible step are refused.
+    #: Age of the case temperature after which the board temperature decides the regime [s]; also
+    #: the time for which the readings of other sensors after an impossible step are refused.
     case_timeout_s: Positive = 30.0
 
     def __post_init__(self) -> None:

@@ -31,8 +31,8 @@ OUTLIER_LIMITS: Final = 5.0  # innovation / outlier limit, beyond which a readin
 RESTART_READINGS: Final = 4  # number of consecutive outliers of equal sign for a restart
 # Mean time in the quiet mode [s]; the mean time in the bending mode is the lag of the sensor.
 SOAK_S: Final = 900.0
-# Sd of the process noise of the temperature's second derivative in the quiet filter, divided by
-# that in the bending filter; `CELL_SHARE`: for a sensor with wide cells.
+# Sd of the noise that drives the temperature's second derivative: quiet filter / bending filter.
+# `CELL_SHARE`: if the quantum is so large that noise alone never changes a reading.
 QUIET_SHARE: Final = 5e-3
 CELL_SHARE: Final = 0.2
 _ROOT_HALF: Final = 0.7071067811865476  # 1 / sqrt(2)
@@ -59,9 +59,9 @@ class Thermometer:
     they are NaN with infinite variances. `changed_ns`: stamp of the last change of the reading;
     `interval_s`: typical interval between readings; `n_in_row`: number of readings since the
     filter last started; `n_restarts`: starts after a gap or a step; `is_ready`: `n_in_row` is 2 or
-    more, which gives a rate. `measured` and its variance: the last reading, or for quantized cells
-    the equivalent Gaussian measurement (infinite variance: no information). `bending`: probability
-    of the bending mode, in which the acceleration changes.
+    more, which gives a rate. `measured` and its variance: the last reading or, if the quantum far
+    exceeds the noise, a Gaussian measurement of equal information (none: infinite variance).
+    `bending`: probability of the bending mode, in which the acceleration changes.
     """
 
     def __init__(self, settings: ThermometerSettings) -> None:
@@ -270,7 +270,7 @@ class Thermometer:
         noise = self._noise
         if variance < 4.0 * noise:
             # The sd of the prediction is less than twice the noise: match the moments of the
-            # prediction truncated to the cell. Flickering readings show the edge between cells.
+            # prediction truncated to the reading's cell. Alternating readings show a cell's edge.
             spread = variance + noise
             sd = sqrt(spread)
             low = (reading - half - expected) / sd
@@ -295,8 +295,8 @@ class Thermometer:
         box = half * half / 3.0
         if variance > box:
             return reading, variance * box / (variance - box)
-        # An estimate outside the reading's cell is corrected to the cell's edge. The readings
-        # taken while the predicted temperature changes by one sd count as one measurement.
+        # A prediction outside the reading's cell (one quantum wide) is corrected to the edge; all
+        # readings taken while the prediction changes by its sd count as one measurement.
         if abs(expected - reading) > half:
             edge = reading + (half if expected > reading else -half)
             return edge, variance * max(1.0, sqrt(variance) / (abs(move) + 1e-30))
@@ -304,7 +304,7 @@ class Thermometer:
 
 
 def mix(state: State, other: State, share: float) -> State:
-    """Return mean and covariance of a mixture of `other`, with weight `share`, and `state`."""
+    """Return mean and covariance of a mixture of `state` and, with the weight `share`, `other`."""
     t, v, a, p00, p01, p02, p11, p12, p22 = state
     u, w, b, r00, r01, r02, r11, r12, r22 = other
     dt, dv, da = u - t, w - v, b - a

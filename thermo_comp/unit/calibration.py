@@ -143,7 +143,7 @@ class RegimeSet:
     lack_of_fit: Annotated[
         tuple[LackOfFit, ...],
         'Error on data left out of the fit, beyond the sd of the posterior; includes the error of '
-        'scale factors at temperatures at which no position had the axis along gravity. The '
+        'scale factors at temperatures at which no position had the axis along gravity. The error '
         'variance is linear between the temperatures of entries, and constant outside them.',
     ] = ()
 
@@ -218,7 +218,7 @@ class Calibration:
     ] = 900.0
     rest_gradient_range_k: Annotated[
         tuple[_Kelvin, _Kelvin] | None,
-        'Range in the bags of T_s - T_board - board_lag_s * dT_board/dt of the first sensor s; '
+        'Range of T_s - T_board - board_lag_s * dT_board/dt of the first sensor s in the bags; '
         'null: unknown. Far outside the range (loose sensor) the sd of T_board is increased.',
     ] = None
     soak_gradient_k: Annotated[

@@ -43,7 +43,7 @@ EVEN_WIDTHS: Final = (0.375, 0.75, 1.5, 3.0, 6.0)
 PLAY_WIDTHS: Final = (0.4, 0.8, 1.6, 3.2, 6.4)
 PLAY_TAUS: Final[tuple[float, ...]] = (0.0, 450.0, 900.0, 1800.0)
 #: Kind bend: time constants [s]; least span of board temperatures per knee (change of slope) [K];
-#: most knees per lag; most knees per lag if `bank` gets `parts` (with a third of the least span).
+#: most knees per lag without and with the argument `parts` of `bank` (with: a third of the span).
 BEND_TAUS: Final = (0.0, *FINE_TAUS[4:11])
 LEAST_KNEE_K, MOST_KNEES, MOST_PART_KNEES = 1.0, 20, 60
 
@@ -301,7 +301,7 @@ class ColumnTable:
         return hold(raw, *self._range)
 
     def excess(self, raw: Floats) -> Floats:
-        """Return (1 + e)^(1 / n) - 1; u, of order n in T, is e half ranges outside its range."""
+        """Return (1 + e)^(1 / n) - 1 for u of order n in T at e half ranges from its range."""
         lower, upper = self._range
         excess = np.asarray(np.abs(raw - self.held(raw)) / ((upper - lower) / 2.0))
         for order in {*self._orders.tolist()} - {1}:
@@ -325,8 +325,8 @@ class ColumnTable:
 
     def slopes(self, states: Floats) -> tuple[Floats, Floats | None]:
         """
-        Differentiate each column's u, without its limits, by the quantity that determines u and,
-        at constant lag, by T_board (None if no column is a function of t - lag).
+        Differentiate each column's u, without limits, w.r.t. the state quantity of the column and,
+        at constant lag, w.r.t. T_board (None if no column is a function of t - lag).
         """
         slopes, scaled = np.ones((len(self._places), states.shape[1])), self._scaled(states)
         for rows, term in self._terms:

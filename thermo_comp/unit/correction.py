@@ -8,7 +8,7 @@ n thermal states are the columns of an array of shape (width, n), whose rows are
 states, so a stream and a batch get the same bits. Results for three axes stand in rows: the bias
 of x, y, z, then the scale of x, y, z. The notation is that of `calibration`; x is the specific
 force of an axis before the misalignment, and its error variance is ``v(x) = a + b x + c x^2``
-[m^2/s^4]. `covariance` adds errors of the misalignment, and covariances between the axes.
+[m^2/s^4]. The module `covariance` adds misalignment errors and covariances between axes.
 """
 
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ from .nonlinearity import ForceCorrection, beyond_force
 #: faster transition is lengthened, by a factor of at most `LONGEST_TRANSITION`.
 GENTLE_RATE = MICRO_G
 LONGEST_TRANSITION = 10.0
-#: Number of board temperatures at which slopes and dynamic less static curves are evaluated.
+#: Number of board temperatures at which the slopes and the difference of the sets are evaluated.
 _GAP_TEMPERATURES = 33
 #: Variance of rounding [counts^2]: twice 1/12, as the converter adds the remainder to the next
 #: cycle.
@@ -111,7 +111,7 @@ class Correction:
         self.n_slow = N_ROWS if self.of_force is None else N_ROWS + 15
 
     def _find_columns_of_pairs(self) -> None:
-        """For each quantity of the state with a variance find the columns that depend on it."""
+        """Find the columns that depend on each quantity of the state that has a variance."""
         self.layout = layout = StateLayout(self.memory)
         pair = np.array([layout.pairs.get(c.source, -1) for c in self.table.columns], np.int64)
         columns = np.argsort(pair, kind='stable')
@@ -190,10 +190,10 @@ class Correction:
         Evaluate the correction in segments of 1 s, linear in time between the states at the ends.
 
         `slow` is the slowly varying error covariance, shape (n_slow, n), see
-        `SlowUncertainty.at`. Returns (52,) or (52, n): by axis bias, change of the bias over the
+        `SlowUncertainty.at`. Returns (52,) or (52, n): for each axis bias, its change over the
         segment, scale and its change; then the coefficients for `covariance.covariance_at`, noise
         of a sample included. With a nonlinearity `slow` has 15 more rows, and the result ends with
-        K2, Kq, K3 by axis and the coefficients of x^3 to x^6 in the variance of each axis.
+        K2, Kq, K3 of each axis and the coefficients of x^3 to x^6 in the variance of each axis.
         """
         ends = np.array((start, end), dtype=np.float64)
         n = ends[0, 0].size
@@ -244,11 +244,11 @@ class Correction:
     ) -> tuple[Floats, Floats]:
         """
         Evaluate a, b, c of each axis' error variance ``a + b x + c x^2``, (3, 3, n), without
-        sample noise, and the factor (3, n) by which it grows outside the calibrated ranges.
+        sample noise, and the factor (3, n) of this variance outside the calibrated ranges.
 
         The difference of dynamic and static set (`gap`) is added as an error while the sets are
-        blended, outside the calibrated ranges, and while the regime is unknown. While the regime
-        is unknown, the variance is the sum of the variances of both sets.
+        blended, outside the calibrated ranges, and while the regime is unknown. In an unknown
+        regime the variances due to T_board, residual and lack of fit are sums over both sets.
         """
         board, weight, unknown = states[BOARD], states[WEIGHT], states[UNKNOWN]
         static_weight, beyond_range = 1.0 - weight, raw - held
@@ -261,7 +261,7 @@ class Correction:
         variances = (shares * states[VAR_BOARD], states[self.layout.variances])
         by_source, direct = self.table.slopes(states)
         by_pair = self.by_pairs(by_source * factors[0])
-        # Derivative of the columns by T_board, through t^power, gradients and lags.
+        # Derivative of the columns w.r.t. T_board, through t^power, gradients and lags.
         on_board = raw * factors[1]
         if direct is not None:
             on_board = on_board + direct * factors[0]
@@ -280,7 +280,7 @@ class Correction:
             columns_out = columns_out.max(axis=1, initial=0.0)
             # Outside the calibrated range the curves are extrapolated, with two errors: slope of
             # the curves at the edge of the range times the board's distance from the edge; sd of
-            # the slopes times the largest distance of the board or a part from the range.
+            # the slopes in the range times the largest distance of board or part from the range.
             v += self._spread(shares * excess * excess, slopes)
             bent = shares * np.maximum(excess * excess, parts_out * parts_out)
             bends = np.broadcast_to(self._bends, (4, *slopes.shape[1:]))
@@ -302,8 +302,8 @@ class Correction:
 
     def _spread(self, variances: Floats, moved: Floats) -> Floats:
         """
-        Return a, b, c of each axis' variance, (3, 3, n), due to p independent errors of variances
-        (p, n); `moved`, (p, 6, n): derivatives of bias and relative scale w.r.t. these errors.
+        Return a, b, c of each axis' variance ``a + b x + c x^2``, (3, 3, n), due to p independent
+        errors with `variances` (p, n); `moved`, (p, 6, n): bias and relative scale per unit error.
         """
         variance, bias, scale = variances[:, np.newaxis], moved[:, :3] / self.K, moved[:, 3:]
         parts = np.empty((*bias.shape[:2], 3, bias.shape[2]))

@@ -42,7 +42,7 @@ _TERMS: Final = [
     [(i, j) for i, j in combinations_with_replacement(range(4), 2) if i < first and j < second]
     for first, second in combinations_with_replacement((2, 3, 4), 2)
 ]
-#: Number of coefficients of all six polynomials; indices of the constants of xx, yy, zz.
+#: Number of coefficients of the polynomials xx to zz; indices of the constants of xx, yy, zz.
 N_COEFFICIENTS: Final = sum(map(len, _TERMS))
 CONSTANTS: Final = tuple(sum(map(len, _TERMS[:element])) for element in (0, 3, 5))
 
@@ -66,7 +66,7 @@ class CovarianceMap:
             sums[place] = products + np.tril(products, -1).T
         u, w = np.array([*_OF_AXES, *BETWEEN]).T
         factors = sums[:, u, w]
-        # The row b of an axis is twice the covariance of its constant error and its scale error.
+        # Row b of an axis is twice the covariance of its constant error and its scale error.
         factors[:, 1:9:3] /= 2.0
         # Coefficients of xx, ..., zz are sums of few rows of the covariance of u: keep only these.
         n = int((factors != 0.0).sum(axis=1).max())

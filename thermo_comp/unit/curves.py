@@ -18,24 +18,23 @@ class Curves:
     """
     Bias and scale of the static set (row 0) and the dynamic set over the board temperature.
 
-    Where only one set is within its range, the difference of the two sets is constant. Beyond both
-    ranges the curves of the set whose range extends farther follow tangents for `TANGENT_SPANS`
-    times the width of the range, then are constant; the other set's curves run parallel to them.
+    Where only one set is within its range, the other set's curves run parallel to its curves.
+    Beyond both ranges the set whose range extends farther follows tangents for `TANGENT_SPANS`
+    times the width of its range, then is constant; the other set's curves run parallel.
     """
 
     def __init__(self, calibration: Calibration) -> None:
         self._reference = calibration.reference_temperature_c
         sets = calibration.regime_sets()
         edges = np.array([(part.temperature_range_c, part.rate_range_k_min) for part in sets])
-        # Edges of each set's range, shape (2, 2, 1): the lower edges, then the upper edges.
+        # Edges of the ranges of both regimes, shape (2, 2, 1): lower edges, then upper edges.
         self._t_range = (edges[:, 0].T - self._reference)[:, :, np.newaxis]
         self._rate_range = (edges[:, 1].T / 60.0)[:, :, np.newaxis]
         self._rows = [
             [axis.bias_function for axis in axes] + [axis.scale_function for axis in axes]
             for axes in (part.axes() for part in sets)
         ]
-        # For the lower, then the upper end of the ranges: index of the set whose tangent each set
-        # follows, shape (2, 2).
+        # Index of the regime whose tangent each regime follows, below and above the ranges.
         regimes, (lower, upper) = np.arange(2), self._t_range[:, :, 0]
         self._leads = np.where([lower > lower.min(), upper < upper.max()], 1 - regimes, regimes)
         self._ends = lower.min(), upper.max()
@@ -45,7 +44,7 @@ class Curves:
         self._levels = np.add(biases, deltas)[:, :, np.newaxis]
         residuals = [[axis.residual_sd_m_s2**2 for axis in part.axes()] for part in sets]
         self._residuals = np.array(residuals)[:, :, np.newaxis]
-        # For each set with a lack of fit: the temperatures of its points, then its variances.
+        # For each regime with a lack of fit: temperatures of its entries, variances of the axes.
         lacks = (
             [(p.temperature_c, *np.square(p.sd_m_s2)) for p in part.lack_of_fit] for part in sets
         )
@@ -73,7 +72,7 @@ class Curves:
         return result
 
     def _evaluate(self, t: Floats, what: str = 'value') -> Floats:
-        """Evaluate curves or slopes of each set at its row of t [K from T_ref], (2, n)."""
+        """Evaluate curves or slopes of each regime at its row of t [K from T_ref], (2, n)."""
         pairs = zip(self._rows, t, strict=True)
         return np.array([[getattr(function, what)(at) for function in row] for row, at in pairs])
 
@@ -83,18 +82,18 @@ class Curves:
         return hold(t - lower, -below, 0.0), hold(t - upper, 0.0, above)
 
     def unexplained(self, board: Floats) -> Floats:
-        """Evaluate residual plus lack-of-fit variance by set and axis, (2, 3, n)."""
+        """Evaluate the variance of residual and lack of fit by regime and axis, (2, 3, n)."""
         return self._residuals + self.lack_of_fit(board)
 
     def lack_of_fit(self, board: Floats) -> Floats:
-        """Evaluate the variance of the lack of fit by set and axis [m^2/s^4], shape (2, 3, n)."""
+        """Evaluate the variance of the lack of fit by regime and axis [m^2/s^4], (2, 3, n)."""
         result = np.zeros((2, 3, len(board)))
         for regime, (at, *variances) in self._lacks.items():
             result[regime] = [np.interp(board, at, variance) for variance in variances]
         return result
 
     def slopes(self, board: Floats) -> Floats:
-        """Differentiate bias and scale of both sets by T_board [per K], shape (2, 6, n)."""
+        """Differentiate bias and scale of both regimes w.r.t. T_board [per K], shape (2, 6, n)."""
         held = hold(board - self._reference, *self._t_range)
         return self._evaluate(held, 'slope')
 
@@ -116,8 +115,8 @@ class Curves:
         return result
 
     def _followed(self, regime: int, place: int, t: Floats, shares: Floats) -> Floats:
-        """Differentiate bias or scale beyond the ranges by free coefficients, (n_free, n)."""
-        # Beyond its range a curve is a constant plus a tangent, or plus the other set's curve.
+        """Differentiate bias or scale beyond the ranges w.r.t. free coefficients, (n_free, n)."""
+        # Beyond its range a curve is a constant plus a tangent, or plus the other regime's curve.
         function = self._rows[regime][place]
         own_range, other_range = self._t_range[:, regime], self._t_range[:, 1 - regime]
         bases = (function.basis(hold(at, *own_range)) for at in (t, hold(t, *other_range)))

@@ -25,11 +25,11 @@ from .schema import broken
 if TYPE_CHECKING:
     from .calibration import Calibration
 
-#: Limits of the relative scale: curve less, and plus, the largest effect of all columns.
+#: Limits of the relative scale, that is of its curve minus and plus the effects of all columns.
 SMALLEST_RELATIVE_SCALE, LARGEST_RELATIVE_SCALE = 0.1, 10.0
 #: Largest bias / full scale; samples in an offset code have a bias of half of their range.
 FULL_SCALES = 2.0
-#: Largest accepted effect of a column or of a parameter's sd / limit of the bias or scale.
+#: Largest accepted ratio: effect of a column or of a parameter's sd / limit of bias or scale.
 WORST = 1e6
 #: Number of temperatures at which a function of temperature is checked.
 _GRID = 513
@@ -110,7 +110,7 @@ def _check_bias(key: str, level: float, reached: tuple[float, float], limit: flo
 
 
 def _check_scale(key: str, reached: tuple[float, float], gain: float) -> None:
-    """Refuse curves of the relative scale that, plus or minus `gain`, leave the limits."""
+    """Refuse a curve of the relative scale that leaves the limits with the columns' `gain`."""
     for word, value, is_kept, limit in (
         ('above', reached[0] - gain, operator.gt, SMALLEST_RELATIVE_SCALE),
         ('below', reached[1] + gain, operator.lt, LARGEST_RELATIVE_SCALE),
@@ -142,7 +142,7 @@ def _extremes(function: TemperatureFunction, edges: Sequence[float]) -> tuple[fl
 def _regressors(
     functions: Sequence[TemperatureFunction], edges: Sequence[Sequence[float]]
 ) -> list[float]:
-    """Return each function's largest |derivative| by value at T_ref and by each coefficient."""
+    """Return each function's largest |derivative| w.r.t. its value at T_ref and coefficients."""
     pairs = zip(functions, edges, strict=True)
     both = [function.basis(np.array(ends)) for function, ends in pairs]
     return [size for basis in both for size in (1.0, *(float(np.abs(v).max()) for v in basis))]

@@ -61,7 +61,7 @@ class NonlinearTerm:
         float, QUANTITIES['number'], 'Effective number of coefficients determined by the data.'
     ] = 0.0
     log_evidence_change: Annotated[
-        float, QUANTITIES['log evidence'], 'Loss of log evidence if the term is removed.'
+        float, QUANTITIES['log evidence'], 'Loss of log evidence without this nonlinear term.'
     ] = 0.0
     left_out_gain: Annotated[
         float,
@@ -124,8 +124,8 @@ def unit_of(kind: Kind) -> float:
 def linearised(x: Real, k2: Real, kq: Real, k3: Real) -> Real:
     """
     Solve ``x = f + k2 f^2 + kq |f| f + k3 f^3`` for f by one step of Halley's method from x. The
-    error of f is about (k^2 - k3) (x - f)^3 with k = k2 + kq sign(f): at f = 10 g 1e-14 g for
-    k2 = 100 ug/g^2, 1e-11 g for k3 = 10 ug/g^3.
+    error of f is about (k^2 - k3) (x - f)^3 with k = k2 + kq sign(f). At f = 10 g the error of f
+    is 1e-14 g for k2 = 100 ug/g^2, and 1e-11 g for k3 = 10 ug/g^3.
     """
     r = k3 * x * x
     s = k2 * x + kq * abs(x) + r
@@ -221,7 +221,7 @@ class ForceCorrection:
         return np.asarray(linearised(x.T, k2, kq, k3).T)
 
     def regressors(self, force: Floats, board: Floats) -> Floats:
-        """Differentiate readings w.r.t. the k coefficients, then per_kelvin, shape (n, 3, 2 k)."""
+        """Differentiate readings w.r.t. k coefficients, then their slopes in T, (n, 3, 2 k)."""
         size = np.abs(force)
         each = {'square': force**2, 'odd_square': size * force, 'cube': force**3}
         values = [each[term.kind] / unit_of(term.kind) for term in self._of.terms]
@@ -230,8 +230,8 @@ class ForceCorrection:
 
     def rows(self, board: Floats, slow: Floats) -> Floats:
         """
-        Return K2, Kq, K3 by axis, then the variance's coefficients of x^3 to x^6 by axis, (21, n).
-        `slow`: by axis the coefficients of x^2 to x^6 in the variance of the force, (15, n).
+        Return K2, Kq, K3 of each axis, then the coefficients of x^3 to x^6 in the variance of each
+        axis, (21, n). `slow`: coefficients of x^2 to x^6 in the variance of each axis, (15, n).
         """
         k = self._of.coefficients(self.held(board)).swapaxes(0, 1)
         higher = slow.reshape(3, 5, -1)[:, 1:]
@@ -244,10 +244,10 @@ class ForceCorrection:
         Return the contribution of the nonlinear terms to the coefficients of x^2 to x^6 in the
         error variance of an axis, (5, n); `t`: T_board - T_ref, (n,) [K].
 
-        The covariance of the coefficients of k terms has the factor `rows`, (2 k, rank), and the
-        variances `rest` added to its diagonal; `on_bias`, `on_scale`, (rank, n): bias and relative
-        scale due to each column of the factor. The covariances of Kq with other parameters are
-        omitted: most are negative, so in most cases the result is too large.
+        The covariance of the coefficients of the k terms is ``rows @ rows.T + diag(rest)``, with
+        the shape (2 k, rank) of `rows`; `on_bias`, `on_scale`, (rank, n): bias and relative scale
+        due to each column of `rows`. The covariances of Kq with other parameters are omitted: most
+        of them are negative, so in most cases the result is too large.
         """
         k = len(self._of.terms)
         kinds = [list(POWERS).index(term.kind) for term in self._of.terms]

@@ -83,8 +83,8 @@ class Posterior:
 class Block(NamedTuple):
     """
     Indices of the parameters of an axis' bias or scale in the posterior. `static`, `dynamic`:
-    index of the regime's value at T_ref, which its other coefficients follow. `response`:
-    index of the first weight of the columns; `end`: index after the last weight of the columns.
+    index of the value at T_ref in the regime, before the other coefficients of the regime.
+    `response`: index of the first weight of the columns; `end`: index after the last weight.
     """
 
     static: int

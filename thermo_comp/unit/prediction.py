@@ -200,7 +200,7 @@ def bias_scale_and_sd(
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """
     Return bias [m/s^2], its sd, scale [input units per m/s^2] and its relative sd at thermal
-    states, shapes (n, 3). The sds include that of the self-heating gradient in a soak. The lack of
+    states, shapes (n, 3). The sds include the error of the self-heating gradient. The lack of
     fit of an axis at 1 g may be an error of the bias or of the scale, so both sds include it.
     """
     correction = Correction(calibration)
@@ -246,7 +246,7 @@ def ramp_states(
 
 
 def _add_gradient(states: Floats, calibration: Calibration, change_k: float) -> None:
-    """Add `change_k` to the first sensor's gradient and its lags in thermal states, in place."""
+    """Add `change_k` in thermal states to the first sensor's gradient and the gradient's lags."""
     layout = StateLayout(memory_of_unit(calibration))
     for quantity, place in layout.places.items():
         if isinstance(quantity, Gradient) and quantity.input == calibration.sensors[0]:

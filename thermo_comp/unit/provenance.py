@@ -19,7 +19,7 @@ class GroupEvidence:
 
     group: Annotated[str, 'Name of the group, as in the key `response`.']
     part: Annotated[Literal['bias', 'scale'], 'Quantity that the group corrects.']
-    explains_m_s2: Annotated[_Error, "RMS of the group's correction in the fitted data."]
+    explains_m_s2: Annotated[_Error, 'RMS of the correction by the columns, in the fitted data.']
     effective_parameters: Annotated[
         float, QUANTITIES['number'], 'Effective number of weights determined by the data.'
     ]

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class Form(NamedTuple):
-    """A function of x, and its derivative: the bits of a result depend only on that x."""
+    """A function of x and its derivative; the bits of each result depend on its own x only."""
 
     value: Callable[[Floats], Floats]
     slope: Callable[[Floats], Floats]
@@ -76,11 +76,11 @@ class Term:
     has_scale: bool = True
 
     def centre(self, column: Column) -> float:
-        """Return a column's centre of n, a quantity of the state: ``x = (n - centre) / width``."""
+        """Return the centre in a column's ``x = (n - centre) / width`` (see this module's top)."""
         return float(getattr(column, self.centre_key, 0.0))
 
     def width(self, column: Column) -> float:
-        """Return a column's width of n, a quantity of the state: ``x = (n - centre) / width``."""
+        """Return the width in a column's ``x = (n - centre) / width`` (see this module's top)."""
         return float(getattr(column, self.width_key, 1.0))
 
     def largest(self, column: Column) -> float:
@@ -90,7 +90,7 @@ class Term:
         return (column.source.largest + abs(self.centre(column))) ** self.order
 
     def steepest(self, column: Column, raw: Floats, flow_k: float) -> float:
-        """Return the largest change of a column's value u per kelvin; `flow_k`: RMS gradient."""
+        """Return the largest slope of a column's value u [1/K]; for bounded u 1 / RMS gradient."""
         if self.bounds is not None:
             return 1.0 / flow_k
         largest = float(np.abs(raw).max(initial=0.0)) ** (1.0 / self.order)
@@ -165,11 +165,11 @@ GROUPS: Final = {
     'gradient': 'heat flow (case − board)',
     'rate': 'rate of the board temperature',
     'board': 'parts that lag the board',
-    # A curve of group `part` is a sum of the curve over the board temperature and of columns of
-    # `board`, `product` and `square`, for each axis.
+    # For each axis the curve of group `part` is the sum of the curve over the board temperature
+    # and of columns of the groups `board`, `product` and `square`.
     'part': 'curve of the part of each axis',
     'gradient_lag': 'parts between case and board',
-    # `product` and `gradient_x_temperature`: the effect of a lag or gradient changes with t.
+    # `product`, `gradient_x_temperature`: the effect of a lag or gradient changes with T_board.
     'product': 'lags, with effects that change with temperature',
     'gradient_x_temperature': 'heat flow, with an effect that changes with temperature',
     'square': 'curves of parts that lag',
