@@ -36,7 +36,7 @@ def leaves(probe: RestSeries, process: Process, bound: float, rng: np.random.Gen
     """Return the times [days] at which the RMS of |f| - g exceeds `bound` in 200 futures."""
     size = np.repeat([process.bias, process.scale * G], 3) / np.sqrt(3.0)
     error, levels = np.full(N_FUTURES, np.inf), np.zeros((N_FUTURES, 6))
-    # RMS of |f| - g over the probes: length of `root` @ (1, changes of bias and scale `levels`).
+    # The norm of `root` @ (1, changes `levels` of bias and scale) is the RMS of |f| - g.
     joined = np.column_stack((probe.residual, probe.by_level)) / np.sqrt(len(probe))
     root = np.asarray(np.linalg.qr(joined, mode='r'))
     for step in range(3 * 3650):
