@@ -6,7 +6,7 @@ Measures verdicts and forecasts of the drift watch on simulated units (`field_un
     python benchmarks/field_watch.py [--units 20] [--days 30]
 
 Units with attitudes of five kinds age by random walks of known sd and log rests. For each unit 200
-continuations of the random walk are drawn, until the RMS of |f| - g over random attitudes of this
+continuations of the random walk are drawn, until the RMS of |f| - g over random attitudes of its
 kind, with the scatter of turn-ons, exceeds a tolerance of 200 ug. The figures of a forecast are
 the percentage of the drawn times in the forecast's 10 to 90 % interval, and the forecast's median
 divided by the median drawn time. A second part of the benchmark gives a verdict every five days on
