@@ -87,8 +87,8 @@ def worse(after: list, new: Calibration, kalman: Floats) -> tuple[bool, bool]:
     Return whether the RMS of |f| - g on the rests of a day is larger than with the laboratory's
     calibration, for the updated calibration and for the Kalman filter.
 
-    An RMS counts as larger if it exceeds the laboratory's by more than the standard error of an
-    RMS over n turn-ons, the claimed sd / sqrt(2 n).
+    An RMS counts as larger if it exceeds that with the laboratory's calibration by more than
+    claimed sd / sqrt(2 n), the standard error of an RMS over n turn-ons.
     """
     old, updated = (series_of(after, given) for given in (LABORATORY, new))
     counts = np.array([rest.mean for _, rest in after]) / K
@@ -199,7 +199,7 @@ def simulated(kind: str, n_units: int, days: int) -> None:
     print(f'  error / claimed sd of |f| {ratio:.2f} (goal 0.7 .. 1.4)')
     days_after = np.array([pair for result in results for pair in result[1]])
     print(
-        f'  error with the update larger by a standard error than without on '
+        f'  error larger with the update than without, by over a standard error, on '
         f'{days_after[:, 0].sum()} (filter: {days_after[:, 1].sum()}) of {len(days_after)} days'
     )
     print(f'  time of an update: {max(result[2] for result in results):.1f} s at most')

@@ -6,7 +6,7 @@ Measures verdicts and forecasts of the drift watch on simulated units (`field_un
     python benchmarks/field_watch.py [--units 20] [--days 30]
 
 Units with attitudes of five kinds age by random walks of known sd and log rests. For each unit 200
-continuations of the random walk are drawn, until the RMS of |f| - g over random attitudes of this
+continuations of the random walk are drawn, until the RMS of |f| - g over random attitudes of its
 kind, with the scatter of turn-ons, exceeds a tolerance of 200 ug. The figures of a forecast are
 the percentage of the drawn times in the forecast's 10 to 90 % interval, and the forecast's median
 divided by the median drawn time. A second part of the benchmark gives a verdict every five days on
@@ -36,7 +36,7 @@ def leaves(probe: RestSeries, process: Process, bound: float, rng: np.random.Gen
     """Return the times [days] at which the RMS of |f| - g exceeds `bound` in 200 futures."""
     size = np.repeat([process.bias, process.scale * G], 3) / np.sqrt(3.0)
     error, levels = np.full(N_FUTURES, np.inf), np.zeros((N_FUTURES, 6))
-    # RMS of |f| - g over the probes: length of `root` @ (1, changes of bias and scale `levels`).
+    # The norm of `root` @ (1, changes `levels` of bias and scale) is the RMS of |f| - g.
     joined = np.column_stack((probe.residual, probe.by_level)) / np.sqrt(len(probe))
     root = np.asarray(np.linalg.qr(joined, mode='r'))
     for step in range(3 * 3650):

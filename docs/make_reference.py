@@ -96,8 +96,8 @@ BOUNDS = """\
 Each number in a calibration is one of the quantities in the table. The bounds are wider than any instrument needs; a
 calibration within them gives finite results and a positive definite covariance. The bias at the reference temperature, and
 its change over temperature, must each be within twice the full scale of the unit. The relative scale, plus or minus the sum
-of the largest effects of its columns, must stay between 0.1 and 10. A column of the response must change the bias, and one
-sd of a parameter must change bias or relative scale, by at most a million times these limits.
+of the largest effects of its columns, must stay between 0.1 and 10. The effect of a column on the bias, and of a parameter's
+sd on bias or relative scale, must be at most a million times the limit of that quantity.
 """
 
 INTERFACE = """\

@@ -119,7 +119,7 @@ class AxisSet:
 
 @dataclass(frozen=True)
 class LackOfFit:
-    """Error of a regime's curves at a board temperature, beyond the sd of the posterior."""
+    """Sd of the error of a regime's curves at a board temperature, besides the posterior's sd."""
 
     temperature_c: Annotated[Celsius, 'Board temperature of the entry [degC].']
     sd_m_s2: Annotated[
