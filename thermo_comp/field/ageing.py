@@ -141,7 +141,7 @@ class Rows:
 
 
 def rows_of(series: RestSeries, scatter: float) -> Rows:
-    """Return the equations of rests, weighted by noise and a scatter of rests [m/s^2]."""
+    """Return the equations of rests, weighted by noise and by the sd `scatter` [m/s^2]."""
     parts: list[list[Floats]] = []
     variance = series.noise + (series.by_start**2).sum(axis=1) + scatter**2
     for start in np.unique(series.start):
@@ -150,7 +150,7 @@ def rows_of(series: RestSeries, scatter: float) -> Rows:
         Q = np.eye(len(at))
         if len(at) > _ROWS:
             Q = np.linalg.svd(series.by_level[at] * weight[:, np.newaxis], full_matrices=False)[0]
-        # The columns of Q are orthonormal: n equal rests become sqrt(n) times the equation of one.
+        # Orthonormal columns of Q turn n equal rests into the equation of one rest times sqrt(n).
         Q = Q * weight[:, np.newaxis]
         n, warmth = Q.shape[1], series.temperature[at].mean() - series.reference_temperature
         # A change of gravity changes |f| by the same value in all attitudes.

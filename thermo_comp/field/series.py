@@ -321,8 +321,8 @@ def _uncertainty(
     weight, unknown = at.states[:, WEIGHT], at.states[:, UNKNOWN]
     regimes = np.array([1.0 - weight, weight])
     unexplained = correction.curves.unexplained(at.states[:, BOARD])
-    # The ageing model has separate terms for the residual sd and the lack of fit: subtract both
-    # variances from `slow`; in an unknown regime, those of the static and of the dynamic set.
+    # The ageing model has terms for the residual sd and the lack of fit: subtract both variances
+    # from `slow`, of the present regime's set or, if the regime is unknown, of both sets.
     of_sets = regimes + unknown * regimes[::-1]
     slow -= (at.v.T**2 * (of_sets[:, np.newaxis] * unexplained).sum(axis=0)).sum(axis=0)
     residual = [[a.residual_sd_m_s2**2 for a in part.axes()] for part in calibration.regime_sets()]
@@ -331,7 +331,7 @@ def _uncertainty(
 
 
 def _variance_along(correction: Correction, slow: SlowUncertainty, at: _Geometry) -> Floats:
-    """Return the variance of |f|, (n,), due to `slow` and all else but the samples' noise."""
+    """Return the variance of |f|, (n,), due to `slow`, thermometers and regime, without noise."""
     columns, x = at.states.T, at.x.T
     line = list(correction.line(columns, columns, slow.at(columns, at.shares.T), 0.0))
     if correction.of_force is None:

@@ -89,8 +89,8 @@ class Cells:
 
 class CellAccumulator:
     """
-    Reduces streamed samples to cells of `cell_s`, or of `least` samples if these last longer.
-    A whole number of cells fills a window of `window_s` or, if cells last longer, 2 to 60 windows.
+    Reduces streamed samples to cells of `cell_s`, or of `least` samples if these last longer. A
+    whole number of cells fills a window of `window_s` or, if a cell is longer, 2 to 60 windows.
     """
 
     def __init__(
@@ -201,7 +201,7 @@ class CellAccumulator:
         gaps = steps[steps > 10.0 * step]
         if gaps.sum() > 0.5 * steps.sum():
             # A driver that polls a buffer sends bursts at a constant interval below 5 s: a cell is
-            # two intervals or longer. Pauses between positions by hand are irregular or over 5 s.
+            # two intervals or longer. Pauses while a hand turns a unit are irregular or over 5 s.
             usual = float(np.median(gaps))
             is_regular = np.mean(np.abs(gaps - usual) < 0.2 * usual) > 0.9
             if is_regular and usual < 5e9:
@@ -248,7 +248,7 @@ def widened(full_scale: float, samples: Floats) -> float:
 
 
 def _part_of(window_s: float, least: float) -> float:
-    """Return a cell length [ns] of which a multiple is 1 to 60 windows, or else `least`."""
+    """Return a cell length of `least` [ns] or more that divides 1 to 60 windows, else `least`."""
     for stretch in STRETCHES:
         n_cells = int(stretch * window_s * 1e9 / least * (1.0 + 1e-6))
         if n_cells:

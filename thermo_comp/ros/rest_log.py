@@ -153,8 +153,8 @@ class RestKeeper:
         self, messages: list[bytes], loaded: LoadedCalibration, compensator: Compensator
     ) -> None:
         """Sum messages that the compensator has processed; queue the completed rests."""
-        # The rests of all messages are assigned to the present calibration, also of messages that
-        # were corrected with the old calibration before a reload.
+        # A rest is assigned to the present calibration, even if its messages were corrected with
+        # another calibration before a reload.
         self._use(loaded, compensator)
         stamps, samples = samples_of(messages, is_imu=loaded.calibration.unit.input != 'counts')
         if not len(stamps):
