@@ -4,8 +4,8 @@
 Owns the noise of samples at rest: finds glitches (single samples with wrong bits, as after a
 transfer error), and limits of a cell's variance and roughness for low-pass filtered noise.
 
-A cell is a run of about 0.5 s of samples; its roughness is half the mean square change from sample
-to sample, which equals the variance for white noise.
+A cell is a run of samples of 0.5 s or longer; its roughness is half the mean square change from
+sample to sample, which equals the variance for white noise.
 """
 
 from __future__ import annotations
