@@ -221,7 +221,7 @@ class Model:
             return float(value), np.array(slope) + shift / _LOG_SD
 
         # The gradient of the evidence is almost 0 where a variance is small, so the search begins
-        # at two points: with most of the scatter due to the turn-ons, and due to the random walks.
+        # at two points: with most of the scatter due to the turn-ons, or due to the random walks.
         steps = np.abs(np.diff(self.rows.y[self.rows.rank == 0]))
         step = max(float(np.median(steps)), centre.rest)
         bounds = middle - 5.0 * _LOG_SD, middle + 5.0 * _LOG_SD

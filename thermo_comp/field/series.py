@@ -281,9 +281,9 @@ def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
     Return the number of the group of each window; up to 60 consecutive windows form a group, and
     are averaged to one rest.
 
-    The windows of a group belong to one start of the node, and differ from the first window of the
-    group by less than 1e-3 in each component of the force's unit vector, and by less than 1 K.
-    The mean of unit vectors at angles of up to a to each other has a norm of 1 - a^2 / 2 or more.
+    The windows of a group belong to one start of the node and differ from the group's first window
+    by less than 1e-3 in each component of the force's unit vector, and by less than 1 K on the
+    board. The mean of unit vectors at angles of up to a has a norm of 1 - a^2 / 2 or more.
     """
     direction = force / np.sqrt((force**2).sum(axis=1, keepdims=True))
     group = np.zeros(len(start), dtype=np.int64)

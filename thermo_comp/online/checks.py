@@ -74,12 +74,12 @@ Run: TypeAlias = tuple[tuple[float, float, float, int], int, float, int, float]
 
 class StuckCheck:
     """
-    Counts consecutive equal readings of each axis; if `timeout_s` is 0, nothing counts as stuck.
+    Counts consecutive equal readings of each axis; with a `timeout_s` of 0 s, nothing is stuck.
 
     Samples are stuck if all three axes repeat their readings for over `timeout_s`. One axis alone
-    is stuck if it repeats its reading as long while both other axes change by over `motion` [input
-    unit], or while the other axes show noise and the sd of this axis' noise is two converter steps
-    or more. `noise_sds`: sd of the noise of each axis [input unit].
+    is stuck if it repeats its reading for over `timeout_s` while both other axes change by over
+    `motion` [input unit], or while they show noise and its own noise has an sd of two converter
+    steps or more. `noise_sds`: sd of the noise of each axis [input unit].
     """
 
     def __init__(self, timeout_s: float, motion: float, noise_sds: Sequence[float]) -> None:

@@ -117,7 +117,7 @@ class RawSubscription:
         self._newest_ns = 0
         #: Number of messages sent and not received, by the sequence numbers of one publisher.
         self.n_lost = 0
-        #: Mean interval between the messages that were taken last [ns].
+        #: Mean interval between the messages that the last `drain` took [ns].
         self.interval_ns = 0
 
     def drain_single_source(self) -> tuple[list[bytes], list[int], int]:
