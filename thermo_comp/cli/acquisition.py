@@ -30,7 +30,7 @@ _LOOKED_BACK = 200
 # Sd of a position's mean force due to hysteresis, mounting and drift, even in a long rest [g].
 _FLOOR_SD = 2e-5
 # A position is 'restless' if its noise is above `_RESTLESS` times the median of all positions. A
-# still interval after the found rests is a rest if its noise is below `_LOUDEST` times theirs.
+# still interval after found rests is a rest if its noise is below `_LOUDEST` times their noise.
 _RESTLESS, _LOUDEST = 3.0, 10.0
 # Smallest backward step of the stamps that shows a restart of the driver [ns].
 _STEP_BACK_NS = 10**9
@@ -59,11 +59,11 @@ class Position:
 class Account:
     """
     State of a test, and the missing data.
-    The last of `positions` is unfinished. `worst_sd_g` is the sd of the corrected force in the
-    attitude with the largest sd, `constants_sd` the sds of bias [g], scale and misalignment [rad].
-    `now` is the direction of the newest sample, NaN without samples. `next_up` is the direction
-    recommended for the next position, `next_deg` away from `now`. `farthest_up` is the direction
-    farthest (by `farthest_deg`) from all positions. `findings` are texts about missing data.
+    The last of the `positions` is unfinished. `worst_sd_g` is the sd of the corrected force in
+    the attitude with the largest sd, `constants_sd` the sds of bias [g], scale and misalignment
+    [rad]. `now` is the direction of the newest sample, NaN without samples. `next_up` is the
+    direction recommended for the next position, at `next_deg` [deg] from `now`. `farthest_up` is
+    the direction that is farthest, by `farthest_deg`, from all positions.
     """
 
     positions: tuple[Position, ...]
@@ -112,8 +112,8 @@ class Acquisition:
         #: Earliest stamp at which the next position can begin [ns].
         self.settled_ns = self._newest_ns = self._begin_ns = _FIRST_NS
         self._n_looked = 0
-        # Mean sample of the first rest of the position. A search after more samples may miss this
-        # rest: its variance limit follows from the quietest tenth of the cells.
+        # Mean sample of the first rest of the position. A later search may miss this rest, because
+        # the limit of the variance follows from the quietest tenth of the cells searched.
         self._first: Floats | None = None
 
     def add(self, block: Block) -> list[int]:

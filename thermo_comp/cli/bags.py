@@ -24,7 +24,7 @@ _BAG = argument('Recording: rosbag2 directory, .mcap, .db3 or ROS 1 .bag.', meta
 _LEFT_OUT = {
     'n_not_finite': 'samples that are not finite',
     'n_saturated': 'samples at the full scale of the calibration',
-    'n_out_of_order': 'samples with a stamp not later than the sample before',
+    'n_out_of_order': 'samples with a stamp not later than an earlier stamp, or far ahead',
     'n_no_temperature': 'samples before the first board temperature',
     'n_stale': 'samples with a board temperature older than --temperature-timeout',
     'n_stuck': 'samples that repeat earlier values for too long, or are 0 on all axes',

@@ -44,8 +44,8 @@ def fit(
         metavar='CURVE',
     ),
     dynamic_curve: Curve | None = option(
-        'Curve of bias and scale over temperature in ramps; default: the curve in a soak '
-        'plus a quadratic; for --model golovach: quadratic.',
+        'Curve of bias and scale over temperature in ramps; default: the curve in a soak plus a '
+        'quadratic, for spline or exponential a second one; for --model golovach: quadratic.',
         metavar='CURVE',
     ),
     groups: str | None = option(

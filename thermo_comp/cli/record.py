@@ -206,7 +206,7 @@ def _print_account(
     for number, position in enumerate(account.positions, 1):
         if position.n_rests:
             news[f'position {number}'] = f'{position.reason or "good"}; {_reading(position.up)}'
-    # Noise changes the direction that follows the semicolon: compare the text before it.
+    # Noise changes the direction after the semicolon: compare the text before the semicolon.
     new = {name: text for name, text in news.items() if last.get(name) != text.partition(';')[0]}
     for name, text in new.items():
         last[name] = text.partition(';')[0]

@@ -3,9 +3,9 @@
 """
 Owns the reading of bags, of ROS 1 and 2, with topics and units other than those of the node.
 
-Drivers choose their topic names, and some drivers do not publish m/s^2. Topics that are not named
-are found by their types. The board thermometer shares the most namespaces with the Imu. The case
-thermometer shares more namespaces with a barometer than with the Imu, or is the only other one.
+Drivers choose their topic names, and some do not publish m/s^2. Topics that are not named are
+found by type. The board thermometer shares the most namespaces with the Imu. The case thermometer
+shares more namespaces with a barometer than with the Imu, or is the only other thermometer.
 """
 
 from pathlib import Path, PurePosixPath

@@ -40,7 +40,7 @@ _TOLERANCE = 0.2
 _SENSITIVITIES = (2048, 4096, 8192, 16384)
 
 _CELL_S, _MIN_SAMPLES = 0.5, 12  # length of a cell of samples [s], least number of samples in it
-# Ratio of a cell's sd to the lower quartile of the cells' sds, above which the unit is handled;
+# Ratio of a cell's sd to the lower quartile of the cells' sds, above which the cell is a movement;
 # noise alone gives cells of 12 samples a ratio below 2.
 _MOVING_RATIO = 4.0
 _MERGE_NS = 10 * 10**9  # shortest rest between two separate movements [ns]
@@ -231,7 +231,7 @@ def _refuse_wrong_units(log: ForeignLog, stillness: Stillness) -> None:
 def _log_times(stamp_ns: Ints, shifts: Ints | None = None) -> tuple[Ints, Ints]:
     """
     Return log times that never decrease, and the shift added after each restart of the clock [ns].
-    Stamps of readings get the shifts of the samples' stamps, which the caller gives as `shifts`.
+    `shifts`: for stamps of temperature readings, the shifts that the samples' stamps got.
     """
     is_restart = np.diff(stamp_ns, prepend=stamp_ns[:1]) < -_RESTART_NS
     if shifts is None or len(shifts) != is_restart.sum():

@@ -42,7 +42,7 @@ _THERMAL_NOTE = (
 )
 _NAME = re.compile(r'\b(TC_[AG]\d_\w+|TC_[AG]_ENABLE|INS_TCAL\d_\w+|INS_(?:ACC|GYR)\d_CALTEMP)\b')
 _NUMBER = re.compile(r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?')
-#: Reference temperature and temperature range [degC] of files of triads, which state neither.
+#: Reference temperature and range [degC] for imu_tk, imu_calib and Kalibr, whose files have none.
 _REFERENCE_C, _RANGE_C = 20.0, (-60.0, 120.0)
 _TRIAD_NOTE = 'imported: constants of one temperature, used at all temperatures; no uncertainty'
 _HEADING = re.compile(r'\s*(#|Misalignment Matrix|Scale Matrix|Bias Vector)')
@@ -339,7 +339,7 @@ def _array(value: object, key: str, size: int) -> Floats:
 
 @dataclass(frozen=True)
 class Tool:
-    """Writer and reader of a tool's files, of bias curves (`is_thermal`) or of constants."""
+    """Writer and reader of a tool's files, which hold bias curves (`is_thermal`) or constants."""
 
     write: Callable[[Content, int | None, int], str]
     read: Callable[[str, int | None], Content | None]  # returns None for the file of another tool

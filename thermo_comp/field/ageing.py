@@ -141,7 +141,7 @@ class Rows:
 
 
 def rows_of(series: RestSeries, scatter: float) -> Rows:
-    """Return the equations of rests, weighted by noise and a scatter of rests [m/s^2]."""
+    """Return the equations of rests, weighted by noise and by the sd `scatter` [m/s^2]."""
     parts: list[list[Floats]] = []
     variance = series.noise + (series.by_start**2).sum(axis=1) + scatter**2
     for start in np.unique(series.start):
@@ -150,7 +150,7 @@ def rows_of(series: RestSeries, scatter: float) -> Rows:
         Q = np.eye(len(at))
         if len(at) > _ROWS:
             Q = np.linalg.svd(series.by_level[at] * weight[:, np.newaxis], full_matrices=False)[0]
-        # The columns of Q are orthonormal: n equal rests become sqrt(n) times the equation of one.
+        # Orthonormal columns of Q turn n equal rests into the equation of one rest times sqrt(n).
         Q = Q * weight[:, np.newaxis]
         n, warmth = Q.shape[1], series.temperature[at].mean() - series.reference_temperature
         # A change of gravity changes |f| by the same value in all attitudes.
@@ -221,7 +221,7 @@ class Model:
             return float(value), np.array(slope) + shift / _LOG_SD
 
         # The gradient of the evidence is almost 0 where a variance is small, so the search begins
-        # at two points: with most of the scatter due to the turn-ons, and due to the random walks.
+        # at two points: with most of the scatter due to the turn-ons, or due to the random walks.
         steps = np.abs(np.diff(self.rows.y[self.rows.rank == 0]))
         step = max(float(np.median(steps)), centre.rest)
         bounds = middle - 5.0 * _LOG_SD, middle + 5.0 * _LOG_SD

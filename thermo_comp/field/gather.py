@@ -32,13 +32,13 @@ _SPACING = ((360, 30), (60, 6), (0, 1))
 
 #: Thermal state, and remaining fractions of the unknown initial lag states.
 _State = tuple[Sequence[float], Sequence[float]]
-#: Returns the present thermal state, or None before the first temperature reading.
+#: Returns the present thermal state, or None while the samples cannot be corrected.
 StateNow = Callable[[], _State | None]
 
 
 @dataclass
 class _Cell:
-    """Sums of the samples less the first sample, `origin`, from second `begin` to `last`."""
+    """Sums over the samples of seconds `begin` to `last`, each less the first one, `origin`."""
 
     begin: int
     last: int

@@ -28,7 +28,7 @@ _OF_START, _OF_REST = b' {', b' ['
 @dataclass(frozen=True)
 class Start:
     """
-    A start of the node; a change of calibration makes a further `Start` of equal `start_ns`.
+    A start of the node; a new calibration or gravity makes another `Start` of equal `start_ns`.
 
     `start_ns` identifies a start of the node; it is no date, as the clock may be set later.
     """

@@ -281,9 +281,9 @@ def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
     Return the number of the group of each window; up to 60 consecutive windows form a group, and
     are averaged to one rest.
 
-    The windows of a group belong to one start of the node, and differ from the first window of the
-    group by less than 1e-3 in each component of the force's unit vector, and by less than 1 K.
-    The mean of unit vectors at angles of up to a to each other has a norm of 1 - a^2 / 2 or more.
+    The windows of a group belong to one start of the node and differ from the group's first window
+    by less than 1e-3 in each component of the force's unit vector, and by less than 1 K on the
+    board. The mean of unit vectors at angles of up to a has a norm of 1 - a^2 / 2 or more.
     """
     direction = force / np.sqrt((force**2).sum(axis=1, keepdims=True))
     group = np.zeros(len(start), dtype=np.int64)
@@ -321,8 +321,8 @@ def _uncertainty(
     weight, unknown = at.states[:, WEIGHT], at.states[:, UNKNOWN]
     regimes = np.array([1.0 - weight, weight])
     unexplained = correction.curves.unexplained(at.states[:, BOARD])
-    # The ageing model has separate terms for the residual sd and the lack of fit: subtract both
-    # variances from `slow`; in an unknown regime, those of the static and of the dynamic set.
+    # The ageing model has terms for the residual sd and the lack of fit: subtract both variances
+    # from `slow`, of the present regime's set or, if the regime is unknown, of both sets.
     of_sets = regimes + unknown * regimes[::-1]
     slow -= (at.v.T**2 * (of_sets[:, np.newaxis] * unexplained).sum(axis=0)).sum(axis=0)
     residual = [[a.residual_sd_m_s2**2 for a in part.axes()] for part in calibration.regime_sets()]
@@ -331,7 +331,7 @@ def _uncertainty(
 
 
 def _variance_along(correction: Correction, slow: SlowUncertainty, at: _Geometry) -> Floats:
-    """Return the variance of |f|, (n,), due to `slow` and all else but the samples' noise."""
+    """Return the variance of |f|, (n,), due to `slow`, thermometers and regime, without noise."""
     columns, x = at.states.T, at.x.T
     line = list(correction.line(columns, columns, slow.at(columns, at.shares.T), 0.0))
     if correction.of_force is None:

@@ -5,7 +5,7 @@ Owns the update of a calibration from rests in the field, and its score on left-
 
 A rest determines the error along gravity alone, so rests in few attitudes leave axes undetermined.
 An axis is updated only if the rests reduce the sd of a combination of its bias and scale by 40 %
-or more (from the sd that includes ageing). Other axes keep their values with larger sds.
+or more (from the sd that includes ageing). Undetermined axes keep their values, with larger sds.
 """
 
 from collections.abc import Sequence
@@ -304,7 +304,7 @@ def _shifted(calibration: Calibration, shift: Floats, covariance: Floats) -> Cal
 
 
 def _with_residual(part: RegimeSet, turn_on: float, changes: Sequence[AxisChange]) -> RegimeSet:
-    """Set each axis' residual sd: `turn_on` if determined, at least `turn_on` if not."""
+    """Set each axis' residual sd to `turn_on`; an undetermined axis keeps a larger old sd."""
     axes: dict[str, Any] = {}
     for axis, change in zip(part.axes(), changes, strict=True):
         sd = turn_on if change.is_determined else max(turn_on, axis.residual_sd_m_s2)

@@ -6,7 +6,7 @@ Owns the drift watch: comparison of ``|f| - g`` in a rest log with the claimed s
 A unit is within its claim while the RMS of its errors along gravity, over attitudes and node
 starts, is at most `LIMIT` times the sd that its calibration claims for them. The verdict follows
 from the rests of the last week and the error at the last rest by the ageing model. The forecast is
-the distribution of the time at which this RMS first exceeds the limit, for random walks of bias
+the distribution of the time at which the RMS error exceeds the limit, for random walks of bias
 and scale that begin at the present estimate and have the variances estimated from the log.
 """
 
@@ -242,8 +242,8 @@ def passage(
 
     The walk begins at a random vector of mean `mean`, (k,), and covariance `covariance`, (k, k).
     In d days the walk changes by sqrt(d) `walk`, (k, m), times m independent normal variables;
-    `rate_sd` is the sd of the logarithm of the variance of the walk. A walk that begins above the
-    bound exceeds it at time 0, others at 0.01 days or later.
+    `rate_sd` is the sd of the logarithm of the variance of the walk. The time is 0 for a walk that
+    begins above the bound, 0.01 days or more for other walks.
     """
     rng = np.random.default_rng(1)
     # Principal directions with less than a thousandth of the largest error are left out.

@@ -161,7 +161,7 @@ def _determined(quantity: TableColumn, values: Floats, own_sd: Floats) -> Bools:
     """
     order = np.argsort(own_sd, kind='stable')
     n = len(values)
-    # Begin with the units of smallest sd: eight, or over half of a fleet of 13 units or less.
+    # Begin with the units of smallest sd: eight of them, or n // 2 + 1 if this is less.
     first = min(_UNITS_NEEDED, n // 2 + 1)
     n_counted = 0
     for k in range(first, n + 1):

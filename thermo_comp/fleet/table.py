@@ -122,7 +122,7 @@ _COMPARED = {
 
 
 def _places(name: str) -> dict[str, str]:
-    """Return the texts for {0} and {1} in the name of a column: axes, or elements of M."""
+    """Return the texts that replace {0} and {1} in a line of `_TABLE`: axes or elements of M."""
     if '{0}' not in name:
         return {'': ''}
     if name.startswith('m_'):
@@ -181,7 +181,7 @@ def fitted_cells(
         'm_sd_{0}_urad': np.array(calibration.misalignment_sd) * 1e6,
         'noise_{0}_ug_sqrt_hz': np.array(calibration.noise_density_m_s2_sqrt_hz) / MICRO_G,
     }
-    # Without a prior, few positions do not separate the slopes of bias and scale: omit both sds.
+    # Without a prior, few positions do not separate the slopes of bias and scale: omit their sds.
     is_separable = has_prior or len(distinct_directions(up)) >= POSITIONS_NEEDED
     for quantity, unit, slope, sd in _slopes(calibration):
         parts[f'{quantity}_slope_{{0}}_{unit}'] = slope

@@ -125,8 +125,8 @@ def _push(
     while arrivals and arrivals[-1][0] <= place:
         _, _, name, stamp_ns, celsius = arrivals.pop()
         if len(thermal.queue) >= PENDING_LIMIT:
-            # The node applies waiting readings while no samples come; here, if the queue is full,
-            # its old readings are applied: after the first sample, those stamped up to `due_ns`.
+            # As in the node while no samples come, a full queue is applied up to `DISORDER_NS`
+            # before the new reading, but once a sample has been processed, only up to `due_ns`.
             limit_ns = NEVER_NS if compensator.now_ns is None else due_ns
             thermal.flush(min(limit_ns, stamp_ns - DISORDER_NS))
         thermal.push(name, stamp_ns, celsius)
@@ -260,7 +260,7 @@ def _judge(
     looks = zip(segments, first.tolist(), stamps[first].tolist(), rows, strict=True)
     held = _REFUTED if compensator.is_refusing else 0
     for (segment, count), begin, stamp_ns, row in looks:
-        # The check of |f| uses the first sample of a new segment even if it is not published.
+        # The check of |f| uses the first sample of a new segment, if valid, even if not published.
         is_bad = bool(reasons[begin])
         if segment.is_too_fast:
             held = _TOO_FAST

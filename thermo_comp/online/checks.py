@@ -49,8 +49,8 @@ LONGEST_WINDOW_NS: Final = 30_000_000_000
 # Shortest time between two samples of a window of the gravity check [ns].
 PROBE_NS: Final = 90_000_000
 SMALLEST_WINDOW: Final = 5  # smallest number of samples in a window of the gravity check
-#: Largest ratio of a still window's scatter to the noise of its samples (both as sd), also of the
-#: scatter that the changes from one sample to the next show.
+#: Largest ratio of a still window's scatter to the noise of its samples, both as sd: the scatter
+#: about the mean and the scatter from sample to sample must not exceed this ratio.
 SCATTER_FACTOR: Final = 3.0
 #: Largest change of the mean between two still windows in addition to noise [m/s^2]: 0.5 mg.
 LARGEST_CHANGE: Final = 5e-3
@@ -79,12 +79,12 @@ Run: TypeAlias = tuple[tuple[float, float, float, int], int, float, int, float]
 
 class StuckCheck:
     """
-    Counts consecutive equal readings of each axis; `timeout_s` [s]: 0 = nothing is stuck.
+    Counts consecutive equal readings of each axis; with a `timeout_s` of 0 s, nothing is stuck.
 
     Samples are stuck if all three axes repeat their readings for over `timeout_s`. One axis alone
-    is stuck if it repeats its reading as long while both other axes change by over `motion` [input
-    unit], or while the other axes show noise and the sd of this axis' noise is two converter steps
-    or more. `noise_sds`: sd of the noise of each axis [input unit].
+    is stuck if it repeats its reading for over `timeout_s` while both other axes change by over
+    `motion` [input unit], or while they show noise and its own noise has an sd of two converter
+    steps or more. `noise_sds`: sd of the noise of each axis [input unit].
     """
 
     def __init__(self, timeout_s: float, motion: float, noise_sds: Sequence[float]) -> None:
@@ -253,7 +253,7 @@ def variance_along(force: Sequence[float], covariance: Sequence[float]) -> float
 
 
 def roughness(sample: Sequence[float], last: Sequence[float], scales: Sequence[float]) -> float:
-    """Return half the squared change of the force between two samples [m^2/s^4]; NaN counts 0."""
+    """Return half the squared change of the force between two samples [m^2/s^4]; 0 for NaN."""
     changes = [(a - b) / scale for a, b, scale in zip(sample, last, scales, strict=True)]
     half = 0.5 * sum(change * change for change in changes)
     return half if half >= 0.0 else 0.0
@@ -270,7 +270,7 @@ class GravityCheck:
         self._n_agreeing = 0
         self._is_against = False
         self._forces: list[Sequence[float]] = []
-        #: Samples since |f| stepped from one rest to another, and the stamp of the first sample.
+        #: Forces since |f| stepped from one rest to another, and the stamp of the first of them.
         self._off: list[Sequence[float]] = []
         self._off_ns = 0
         self._is_resting = False  # whether the last sample agreed with the last still window
@@ -298,7 +298,7 @@ class GravityCheck:
     ) -> None:
         """
         Add a sample: force [m/s^2], covariance (xx to zz), trace of the noise covariance, and
-        `roughness`: samples at intervals of whole periods of a vibration are equal, as at rest.
+        `roughness`, which shows a vibration whose phase is the same in all added samples.
         """
         self._watch_step(stamp_ns, force, covariance, noise, rough)
         since_ns, step_ns = stamp_ns - self._begin_ns, stamp_ns - self._last_ns

@@ -98,7 +98,7 @@ class Compensator:
         self._use(model.calibration)
         self.stuck = self._stuck_check()
         self.last_ns = self.event_ns = EVER_NS
-        #: Stamp of a sample far ahead of all earlier stamps, which no second stamp has confirmed.
+        #: Stamp of a sample far ahead of all earlier stamps, not yet confirmed by a second sample.
         self.leapt_ns: int | None = None
         self.reading_ns = EVER_NS  # the latest stamp of a reading
         #: The present segment: start [ns], result of `Correction.line`, and misalignment.
@@ -298,7 +298,7 @@ class Compensator:
         return new
 
     def take_over(self, model: Model, config: CompensatorConfig) -> None:
-        """Use `model` and `config` from now on; copy objects that another compensator shares."""
+        """Use `model` and `config` from now on; copy objects shared with another compensator."""
         gravity, before, stuck = copy(self.gravity), self._gravity_settings, self.stuck
         self.config, self.thermal = config, copy(self.thermal)
         self.thermal.take_over(model, config, self.now_ns)

@@ -6,7 +6,7 @@ Owns the segments: time intervals between temperature readings, with a correctio
 A segment ends at a temperature reading, or after one second. The correction is evaluated at both
 ends of a segment and interpolated, so a sample costs a few operations, and the output has no steps
 between two readings. The slowly varying variance due to parameters and initial lag states is
-evaluated every 10 s; soon after the board readings begin, in each segment.
+evaluated every 10 s, and every second during the first 30 board readings.
 """
 
 from collections.abc import Sequence
@@ -84,7 +84,7 @@ class Model:
         self.inputs = (BOARD_INPUT, *calibration.sensors)
 
     def slow_rows(self, held: Sequence[SlowState]) -> Floats:
-        """Return the slowly varying variances: `n_slow` rows of force, then angular rate."""
+        """Return the slowly varying variances: `n_slow` rows of force, then those of the rate."""
         states, shares, rates = (np.array(part).T for part in zip(*held, strict=True))
         return np.concatenate([part.at(states, shares, rates) for part in self.uncertainty])
 
@@ -144,7 +144,7 @@ class ThermalSide:
         return config, unit.board_lag_s, unit.rest_gradient_range_k or ANY_RANGE
 
     def take_over(self, model: Model, config: CompensatorConfig, now_ns: int | None) -> None:
-        """Use `model` and `config` from now on; copy objects that another compensator shares."""
+        """Use `model` and `config` from now on; copy objects shared with another compensator."""
         old, self.queue = self.tracker, copy(self.queue)
         unit, rate = self.calibration.unit, copy(self.rate)
         self._use(model, config)
@@ -260,8 +260,8 @@ class ThermalSide:
 
     def _slow_at(self, start_ns: int, end_state: tuple[float, ...]) -> SlowState:
         """Return the arguments of the slowly varying variance; they are at most `SLOW_NS` old."""
-        # The unknown initial lag states depend on the rate of the board temperature, which the
-        # first readings do not determine: evaluate the variance in each segment meanwhile.
+        # The variance due to the unknown initial lag states depends on the rate of the board
+        # temperature, which is uncertain at first: evaluate this variance every second.
         is_young = self.tracker.board.n_in_row < YOUNG_READINGS
         key = start_ns // (SEGMENT_NS if is_young else SLOW_NS)
         if key != self._slow_key:

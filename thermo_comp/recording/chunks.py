@@ -227,7 +227,7 @@ def _messages(data: Bytes, at: Ints, size: Ints, head: NDArray[np.void]) -> Mess
 
 
 def expand(packed: Path, target: Path) -> str | None:
-    """Decompress a ``.zstd`` file of rosbag2; return a text on damaged data, or None."""
+    """Decompress a ``.zstd`` file of rosbag2; return a description of damage, or None."""
     with open_regular(packed) as source, target.open('wb') as file:
         limit = packed.stat().st_size * _MAX_GROWTH + _FREE_GROWTH_BYTES
         loss = None

@@ -5,7 +5,7 @@ Owns the reading of an MCAP file chunk by chunk, in bounded memory.
 
 The summary of a complete file lists its chunks of messages. A file without a usable summary, or
 cut off anywhere, is read record by record, and its messages are counted. The `mcap` library
-reads all other records.
+reads schemas, channels, metadata and the summary.
 """
 
 import os

@@ -4,8 +4,8 @@
 Owns the noise of samples at rest: finds glitches (single samples with wrong bits, as after a
 transfer error), and limits of a cell's variance and roughness for low-pass filtered noise.
 
-A cell is a run of about 0.5 s of samples; its roughness is half the mean square change from sample
-to sample, which equals the variance for white noise.
+A cell is a run of samples of 0.5 s or longer; its roughness is half the mean square change from
+sample to sample, which equals the variance for white noise.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 # Smallest distance of a glitch from the mean of its neighbours, in sd of the noise.
 _SDS = 25.0
-# Smallest distance of a glitch from the mean of its neighbours, divided by the samples' norm. A
-# change of a sample by one count, as by the carried remainder of a converter, is no glitch.
+# Smallest distance of a glitch from the mean of its neighbours, divided by the samples' norm. One
+# count more or less, as by the remainder that a converter carries over, is no glitch.
 _LEAST = 0.02
 # Smallest number of samples in which glitches are searched; fewer do not determine the noise.
 _FEWEST = 30

@@ -173,7 +173,7 @@ class _Clock:
     last_ns: int = 0
     newest_ns: int = 0  # newest stamp since the last restart of the clock
     step_ns: float = 0.0
-    n_backwards: int = 0  # number of stamps that do not rise above all earlier stamps
+    n_backwards: int = 0  # number of stamps not later than the newest stamp before
     n_restarts: int = 0  # number of steps back by more than `LONGEST_PAUSE_NS`
     n_gaps: int = 0
     longest_gap_s: float = 0.0

@@ -31,7 +31,7 @@ def _everywhere(buffer: Bytes, n_bytes: int) -> Any:
 
 
 def number_at(rows: NDArray[Any], offset: int, kind: str) -> Any:
-    """View the number at an offset [bytes] of each gathered row as the numpy type `kind`."""
+    """Return the number of numpy type `kind` at an offset [bytes] of each row, without a copy."""
     if len(rows) == 0:
         return np.empty(0, kind)
     return np.ndarray((len(rows),), kind, rows.data, offset=offset, strides=(rows.itemsize,))
@@ -57,7 +57,7 @@ class Messages:
 
     @classmethod
     def of_rows(cls, rows: Bytes, channel: NDArray[np.uint16], log_ns: Ints) -> Messages:
-        """Make messages of rows of bytes, shape (n, size), a message per row."""
+        """Make a message of each row of bytes, shape (n, size)."""
         size = np.full(len(rows), rows.shape[1])
         return cls(rows.ravel(), np.cumsum(size) - size, size, channel, log_ns)
 

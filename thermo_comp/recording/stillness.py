@@ -40,7 +40,7 @@ _DRIFT_STEPS, _DRIFT = 9, 5e-5
 _QUANTUM_SAMPLES, _STEPS_NEEDED = 20000, 10
 STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # numbers of windows a cell may fill at low sample rates
 _LONGEST_CELL_NS = 86400e9  # limit of a cell's length, for wrong stamps [ns]
-MIN_SAMPLES = 30  # smallest number of samples in a cell
+MIN_SAMPLES = 30  # usual smallest number of samples in a cell
 _LARGEST = 1e100  # largest valid sample: squares of larger samples may overflow
 _WORD = 32768.0  # middle of the range of unsigned 16-bit numbers
 _LONGER = (23, 31)  # magnitude bits of 24- and 32-bit words
@@ -89,8 +89,8 @@ class Cells:
 
 class CellAccumulator:
     """
-    Reduces streamed samples to cells of `cell_s`, or of `least` samples if these last longer.
-    A whole number of cells fills a window of `window_s` or, if cells last longer, 2 to 60 windows.
+    Reduces streamed samples to cells of `cell_s`, or of `least` samples if these last longer. A
+    whole number of cells fills a window of `window_s` or, if a cell is longer, 2 to 60 windows.
     """
 
     def __init__(
@@ -201,7 +201,7 @@ class CellAccumulator:
         gaps = steps[steps > 10.0 * step]
         if gaps.sum() > 0.5 * steps.sum():
             # A driver that polls a buffer sends bursts at a constant interval below 5 s: a cell is
-            # two intervals or longer. Pauses between positions by hand are irregular or over 5 s.
+            # two intervals or longer. Pauses while a hand turns a unit are irregular or over 5 s.
             usual = float(np.median(gaps))
             is_regular = np.mean(np.abs(gaps - usual) < 0.2 * usual) > 0.9
             if is_regular and usual < 5e9:
@@ -249,13 +249,13 @@ def widened(full_scale: float, samples: Floats) -> float:
     return next(2.0**bits - 1.0 for bits in _LONGER if np.median(size) < 2.0**bits or bits == 31)
 
 
-def _part_of(window_s: float, smallest_ns: float) -> float:
-    """Return a cell length [ns] of which a multiple is 1 to 60 windows, or else `smallest_ns`."""
+def _part_of(window_s: float, least_ns: float) -> float:
+    """Return a length of `least_ns` or more that divides 1 to 60 windows, else `least_ns` [ns]."""
     for stretch in STRETCHES:
-        n_cells = int(stretch * window_s * 1e9 / smallest_ns * (1.0 + 1e-6))
+        n_cells = int(stretch * window_s * 1e9 / least_ns * (1.0 + 1e-6))
         if n_cells:
             return stretch * window_s * 1e9 / n_cells
-    return smallest_ns
+    return least_ns
 
 
 def _quantum_of(samples: Floats, few: list[Floats]) -> Floats:

@@ -88,7 +88,7 @@ class Topics:
     Topics of the inputs in a bag, the choice of counts or Imu, and the part to read.
     A name matches with or without its leading slash and, if only one topic fits, with any
     namespace. If no topic has the default name of an input other than `case`, the only topic of
-    the input's type is used; samples: of an Imu (imu/data_raw first), else of counts. Thermometers
+    the input's type is used: for samples, an Imu (imu/data_raw first) before counts. Thermometers
     besides board and case: `further`, and ``temperature/<name>`` in the board topic's namespace.
     A thermometer's reading may be a field, ``TOPIC:FIELD``, as for ``ros2 topic echo --field``.
     """
@@ -99,7 +99,7 @@ class Topics:
     case: str = CASE.name
     further: Mapping[str, str] = field(default_factory=dict)
     part: BagPart = WHOLE
-    input: Input = 'auto'  # 'auto': counts, if a topic has their name, else an Imu
+    input: Input = 'auto'  # 'auto': counts if a topic has their name, else Imu, else counts
 
     @classmethod
     def named(cls, names: Mapping[str, str], **others: Any) -> 'Topics':

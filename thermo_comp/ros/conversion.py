@@ -131,7 +131,7 @@ def read_temperature(data: bytes) -> tuple[int, float] | None:
 
 
 def _values_at(data: bytes, size: int) -> int:
-    """Return the offset of the `size` bytes of numbers in a message; 0 unless in plain CDR."""
+    """Return the offset of the `size` bytes of numbers in a message; 0 if it is not plain CDR."""
     if not 16 < len(data) <= _LONGEST_MESSAGE or data[:4] != _ENCAPSULATION:
         return 0
     length = int.from_bytes(data[12:16], 'little')

@@ -148,7 +148,7 @@ class Reporter:
         return {'n_in': counters.n_in, **asdict(counters), **traffic}
 
     def _count_lost(self) -> None:
-        """Count the messages missing in the numbering of the driver if no other node publishes."""
+        """Count messages missing by the driver's sequence numbers, if no other node publishes."""
         samples = self._relay.samples
         n_lost, samples.n_lost = samples.n_lost, 0
         before, self._n_publishers = self._n_publishers, samples.count_publishers()

@@ -72,7 +72,7 @@ def play(
     ros_args: Sequence[str] = (),
     progress: Callable[[float], None] = lambda _: None,
 ) -> PlayReport:
-    """Play a bag at `rate` times real time once all topics have subscribers, or `wait_s` later."""
+    """Play a bag at `rate` times real time, once all topics have subscribers or after `wait_s`."""
     with opened_player(path, rate, topics, ros_args) as player:
         wait_until(lambda: not player.unheard(), wait_s)
         if wait_s > 0.0:
@@ -117,7 +117,7 @@ class Player:
     def run(
         self, progress: Callable[[float], None], throttle: Callable[[int], object] = lambda _: None
     ) -> PlayReport:
-        """Send the bag; call `throttle` with the number of sent samples after each WINDOW."""
+        """Send the bag; after each WINDOW of samples, call `throttle` with the number sent."""
         reader, n_sent = self._reader, dict.fromkeys(self._publishers, 0)
         total = sum(reader.info.topics[name][1] for name in reader.topics.values())
         topics = {publisher.topic_name: role for role, publisher in self._publishers.items()}

@@ -4,7 +4,7 @@
 Owns the processing of samples in the node in order of arrival, whenever the loop wakes up.
 
 Messages do not identify their publisher. While several publishers may send on a topic, the topic's
-messages are dropped, as is the first batch of messages after a publisher has left.
+messages are dropped, as is the first batch of messages after all publishers but one have left.
 """
 
 from bisect import bisect_left, bisect_right
@@ -29,7 +29,7 @@ from .reader import LoadedCalibration
 from .rest_log import BLOCK, RestKeeper
 from .waitloop import RawSubscription, RCLError, WaitLoop
 
-#: While no samples come, a reading is used once another is stamped this much later [ns].
+#: While no samples come, a reading is used once another reading is stamped this much later [ns].
 IDLE_NS = 1_000_000_000
 
 # A received temperature: time of reception [ns]; thermometer, stamp [ns], degC.
@@ -217,7 +217,7 @@ class Relay:
                 self._readings.append((received, (name, *reading)))
 
     def _relay_with_readings(self, messages: list[bytes], received_ns: list[int]) -> list[bytes]:
-        """Relay samples and readings as they arrived; return the samples after all readings."""
+        """Relay samples and readings in order of arrival; return samples after the readings."""
         start, push = 0, self.running.compensator.push
         self._readings.sort(key=itemgetter(0))
         n = bisect_right(self._readings, received_ns[-1], key=itemgetter(0))

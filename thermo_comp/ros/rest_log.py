@@ -65,7 +65,7 @@ class RestLog:
         self._thread.start()
 
     def put(self, stamp_ns: int, start: bytes, rest: bytes) -> None:
-        """Queue the line of a rest, after that of its `start` if the file or the start is new."""
+        """Queue the line of a rest, and before it the line of its `start` if this is new."""
         day = np.datetime64(stamp_ns, 'ns').astype('datetime64[D]')
         try:
             self._lines.put_nowait((str(day), start, rest))
@@ -153,8 +153,8 @@ class RestKeeper:
         self, messages: list[bytes], loaded: LoadedCalibration, compensator: Compensator
     ) -> None:
         """Sum messages that the compensator has processed; queue the completed rests."""
-        # The rests of all messages are assigned to the present calibration, also of messages that
-        # were corrected with the old calibration before a reload.
+        # A rest is assigned to the present calibration, even if its messages were corrected with
+        # another calibration before a reload.
         self._use(loaded, compensator)
         stamps, samples = samples_of(messages, is_imu=loaded.calibration.unit.input != 'counts')
         if not len(stamps):
@@ -205,7 +205,7 @@ class RestKeeper:
 
 
 def samples_of(messages: Sequence[bytes], *, is_imu: bool) -> tuple[Stamps, Floats]:
-    """Read stamps [ns], samples of little-endian messages whose length is that of the last."""
+    """Read stamps [ns] and samples of the little-endian messages as long as the last one."""
     size = len(messages[-1]) if messages else 0
     # A message shorter than one with an empty frame_id is malformed.
     if size < _SHORTEST[is_imu]:

@@ -117,7 +117,7 @@ class RawSubscription:
         self._newest_ns = 0
         #: Number of messages sent and not received, by the sequence numbers of one publisher.
         self.n_lost = 0
-        #: Mean interval between the messages that were taken last [ns].
+        #: Mean interval between the messages that the last `drain` took [ns].
         self.interval_ns = 0
 
     def drain_single_source(self) -> tuple[list[bytes], list[int], int]:
@@ -146,7 +146,7 @@ class RawSubscription:
         self.interval_ns = (self._newest_ns - before_ns) // len(messages)
         before, self._sequence = self._sequence, numbers[-1]
         if before is not None and self._sequence is not None:
-            # A number below the previous number comes from another publisher: no message is lost.
+            # A falling sequence number comes from another publisher: no message is lost.
             self.n_lost += max(0, self._sequence - before - len(messages))
         return messages, received_ns, numbers
 
