@@ -11,7 +11,7 @@ kind, with the scatter of turn-ons, exceeds a tolerance of 200 ug. The figures o
 the percentage of the drawn times in the forecast's 10 to 90 % interval, and the forecast's median
 divided by the median drawn time. A second part of the benchmark gives a verdict every five days on
 level and on carried units, half of which do not age. The figures are the numbers of verdicts
-"outside" by class of the true RMS of |f| - g divided by the limit.
+"outside" by class of true RMS of |f| - g / (twice the claimed sd).
 """
 
 from __future__ import annotations

@@ -102,7 +102,7 @@ def run_ramps(job: Job) -> tuple[Scene, Outcome]:
 
 
 def run_soak(job: tuple[Scene, float, int]) -> tuple[str, int, int, float]:
-    """Return sensor, number of switches to dynamic, of all switches, and share of known flags."""
+    """Return sensor, switches to dynamic, all switches, share of time with a known regime."""
     scene, hours, seed = job
     rng = rng_of(seed, 7, scene)
     t = np.arange(0.0, 3600.0 * hours, 1.0 / scene.rate_hz)

@@ -39,13 +39,13 @@ def test_derivatives_of_a_rest_by_all_parameters_agree_with_finite_differences()
     layout = parameter_layout(unit)
     levels = {block.static: axis for axis, block in enumerate(layout.scale)}
     levels |= {block.dynamic: axis for axis, block in enumerate(layout.scale)}
-    # Test every second calibration parameter. The block of parameters of a bias or scale has an
-    # odd length, so each kind of parameter is tested either in the bias or in the scale.
+    # Test the derivatives by every other parameter. The block of parameters of a bias or scale has
+    # an odd length, so each kind of parameter is tested either in the bias or in the scale.
     for k in range(0, layout.n_parameters, 2):
         step = 1e-7
         moved = values.copy()
         if k in levels:
-            continue  # the derivatives by scale levels are tested below by a change of K
+            continue  # the derivatives by an axis's scale factor K are tested below
         if k in {block.static for block in layout.bias}:
             continue
         moved[k] += step
@@ -214,7 +214,7 @@ def test_a_change_of_gravity_is_not_taken_for_a_change_of_three_scales(day):
     assert result.judged.after < 40.0 * MICRO_G
     (text,) = (line for line in change_texts(result) if 'as if gravity' in line)
     assert text.startswith('from 2026-')
-    assert 'as if gravity were not the stated 9.80665 m/s^2: no scale was changed' in text
+    assert 'as if gravity differed from the stated 9.80665 m/s^2: no scale was changed' in text
     # If gravity is stated as certain, the update takes the step of |f| for three scale changes.
     certain = update(series_of(stepped(history, size, day), unit), unit, is_gravity_certain=True)
     assert certain.solution.gravity == ()

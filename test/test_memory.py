@@ -221,7 +221,7 @@ def test_the_prior_covariance_of_initial_lag_states_agrees_with_the_formula():
 
 
 def test_the_prior_of_initial_lag_states_is_their_covariance_after_a_random_walk(rng):
-    # `start_covariance` is the covariance of lags after a long random walk of the board.
+    # `start_covariance` equals that of lags after a long random walk of T_board.
     D = 0.005
     tau = np.array([60.0, 240.0, 960.0])
     n, step = 4000, 6.0

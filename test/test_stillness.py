@@ -57,7 +57,7 @@ def test_no_rest_is_found_in_a_flight(rng, with_gyro):
 
 
 def test_a_flight_with_little_vibration_is_recognised_by_its_gyroscope(rng):
-    # A noisy accelerometer at rest may scatter by 15 mg, but the sway reaches rates of 4 deg/s.
+    # A noisy accelerometer at rest may scatter by 15 mg, but the drone sways at up to 4 deg/s.
     accel, gyro = hover(rng, 120.0, vibration=15.0 * MG)
     with pytest.raises(FitError, match='the angular rate mostly varies more than at rest'):
         reduce_bag(source(accel, gyro), OPTIONS)

@@ -83,7 +83,7 @@ def test_the_claimed_sd_of_a_mems_with_a_single_turn_on_is_0_3_to_1_5_mg():
     bag, *_ = turned(rng, ((0.0, 20.0), (9000.0, 20.0)), 'one')
     unit = tc.fit([bag], gravity=GRAVITY, input='m/s^2')
     # The bias of a MEMS of noise `NOISE` changes by 0.1 to 1 mg (geometric mean 0.3 mg) at a
-    # turn-on. The claimed sd must be 0.3 to 1.5 mg.
+    # turn-on. The x axis' residual sd must be 0.3 to 1.5 mg.
     assert 0.3 * 1e-3 * GRAVITY < unit.static.x.residual_sd_m_s2 < 1.5e-3 * GRAVITY
 
 

@@ -103,8 +103,8 @@ class Change:
 @dataclass(frozen=True)
 class Rows:
     """
-    Equations of the rests in the order of the node's starts, at most `_ROWS` per start: orthogonal
-    combinations of the rests of a start, with all information of the rests about bias and scale.
+    Up to `_ROWS` equations per start of the node, in the order of starts: orthogonal combinations
+    of the rests of a start, with all information of the rests about bias and scale.
 
     y, `by_...`, lack: combinations of ``|f| - g`` [m/s^2] and of the fields of `RestSeries`
     noise, scatter: variance of the noise of a row, and factor of the scatter variance in a row

@@ -192,8 +192,8 @@ class _PartCurves:
     def _lag(self, axis: int, noise: float) -> Part:
         """
         Return the lag with the smallest RMS residual; 0 s if no lag reduces the residual. If noise
-        does not explain the residual, a second stage or another share of the gradient, then both,
-        are tried; each must reduce the RMS residual by more than 5 %.
+        does not explain the residual, a lag of two stages or another share of case less board,
+        then both, are tried; each must reduce the RMS residual by more than 5 %.
         """
         one_stage = self.one_stage(axis)
         best = self._with_lead(one_stage, axis)

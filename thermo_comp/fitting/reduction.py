@@ -290,7 +290,7 @@ def _cycle_s(cells: Cells) -> float:
     if not len(cells.count):
         return np.nan
     # A cell is complete if its number of samples is within 1 of the median. If most cells are not
-    # complete, as with bursts of samples, cells with over half of the median number are used.
+    # complete, as with bursts, cells with over half of the median number of samples are used.
     median = float(np.median(cells.count))
     use = np.abs(cells.count - median) <= 1.0
     if np.mean(use) < 0.5:

@@ -37,9 +37,9 @@ def is_bench(windows: ThermalWindows, up: Floats) -> bool:
 
 def _is_heated(windows: ThermalWindows) -> Bools:
     """
-    Return which positions were heated or cooled, shape (n_positions,), or all if none was. In a
-    heated one the temperature changes, or its mean differs from the positions' median, by over a
-    tenth of the whole span. Drifts of short rests in a room hardly separate bias and scale.
+    Return which positions were heated or cooled, shape (n_positions,), or all if none was. A
+    position is heated if its temperature changes, or its mean differs from the median, by over a
+    tenth of the span of all. Drifts of short rests in a room hardly separate bias and scale.
     """
     t, edges, weight = windows.temperature, windows.data.edges[:-1], windows.data.weight
     mean = block_means(t[:, None], weight, edges)[:, 0]

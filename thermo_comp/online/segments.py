@@ -230,7 +230,7 @@ class ThermalSide:
             self.counters.n_stale += n_samples
 
     def segment(self, stamp_ns: int, n_seen: int) -> Segment:
-        """Open the segment of sample number `n_seen`; check the sample rate in a new segment."""
+        """Return the segment of a stamp; if new, check the rate of the `n_seen` samples so far."""
         start_ns = stamp_ns - (stamp_ns - (self.tracker.updated_ns or 0)) % SEGMENT_NS
         key = (self._n_applied, start_ns)
         is_new = key != self._segment_key

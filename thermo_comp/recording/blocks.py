@@ -150,8 +150,8 @@ class Readings(NamedTuple):
 class Block:
     """
     Consecutive messages in reading order, as columns; a block ends where `frame_id` changes.
-    `accel`, shape (n, 3), is in counts per cycle, or m/s^2 if the input is sensor_msgs/Imu; `imu`
-    holds the other fields of sensor_msgs/Imu. `temperatures` has a key for each thermometer;
+    `accel`, shape (n, 3), is in counts per conversion cycle, or m/s^2 if the input is
+    sensor_msgs/Imu; `imu` holds its other fields. `temperatures` has a key for each thermometer;
     `log_ns` and, if requested, the serialized messages `raw` also have the key ``accel``.
     """
 

@@ -38,7 +38,7 @@ _DRIFT_STEPS, _DRIFT = 9, 5e-5
 # Number of samples searched for a quantum; smallest number of changes from sample to sample that
 # show a quantum if all changes are whole multiples of the smallest change.
 _QUANTUM_SAMPLES, _STEPS_NEEDED = 20000, 10
-STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # numbers of windows a cell may fill at low sample rates
+STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # whole cells fill one of these numbers of windows
 _LONGEST_CELL_NS = 86400e9  # limit of a cell's length, for wrong stamps [ns]
 MIN_SAMPLES = 30  # usual smallest number of samples in a cell
 _LARGEST = 1e100  # largest valid sample: squares of larger samples may overflow

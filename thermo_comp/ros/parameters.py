@@ -79,7 +79,7 @@ class NodeConfig:
     input: str = _parameter(
         'counts',
         'Input to compensate: accel/counts (Vector3Stamped) or imu/uncompensated (Imu). If '
-        '`topics` names only counts or only imu, the start sets `input` to this name.',
+        '`topics` names only one of counts and imu, the start sets `input` to it.',
         choices=('counts', 'imu'),
     )
     frame_id: str = _parameter(

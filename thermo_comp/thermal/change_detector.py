@@ -71,7 +71,7 @@ class ChangeDetector:
         self.rate = 0.0
         self.swing = self._ripple_rate
         self._baseline = 0.0
-        # Largest error of the baseline [K/s]: the first rate may be at a crest of the ripple.
+        # Largest error of the rate in a soak [K/s]: the first rate may be at a crest of a ripple.
         self._baseline_error = self.swing
         self._trend = 0.0
         self._is_above = False

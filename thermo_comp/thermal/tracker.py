@@ -301,7 +301,7 @@ class ThermalTracker:
         is_known = name == self.spec.sensors[0] and upper < inf
         usual = 0.5 * (lower + upper) if is_known else 0.0
         gradient = self._rest_gradients.get(name, usual) + lag * rate
-        # Largest change of the case temperature after the end of the board's extrapolation [K].
+        # Largest change of the case temperature since the board's extrapolation ended [K].
         unseen = self.settings.case.fastest_ramp_k_min / 60.0 * self.board.beyond(stamp_ns)
         variance = (
             (LOST_GRADIENT_RELATIVE_SD * gradient) ** 2

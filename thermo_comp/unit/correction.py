@@ -129,7 +129,7 @@ class Correction:
 
     def _blended(self, sets: Floats, weight: Floats, phi: Floats) -> Floats:
         result = self._weigh(phi, (1.0 - weight) * sets[0] + weight * sets[1])
-        # Scale factor = K times relative scale (equation 8 of the paper).
+        # Scale factor = K times relative scale, Eq. (8) of docs/theory.md.
         result[3:] *= self.K
         return result
 

@@ -140,7 +140,7 @@ def corrected_nonlinear(
     bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1 = line[:12]
     k2x, kqx, k3x, k2y, kqy, k3y, k2z, kqz, k3z = line[_NONLINEAR : _NONLINEAR + 9]
     yx, zx, zy = misalignment
-    # Solve equation 7 of the paper for the input of each axis, then the nonlinearity for f.
+    # Solve Eq. (7), (8) of docs/theory.md for x of each axis, then the nonlinearity for f.
     x = linearised((x - (bx + bx1 * dt)) / (sx + sx1 * dt), k2x, kqx, k3x)
     y = linearised((y - (by + by1 * dt)) / (sy + sy1 * dt), k2y, kqy, k3y)
     z = linearised((z - (bz + bz1 * dt)) / (sz + sz1 * dt), k2z, kqz, k3z)
