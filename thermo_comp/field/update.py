@@ -344,7 +344,8 @@ def change_texts(result: Update) -> list[str]:
             f'{"larger" if size > 0.0 else "smaller"} by {ug_text(abs(size))} +- {ug_text(sd)} '
             f'than before in all attitudes, as if gravity differed from the stated {stated:.5f} '
             'm/s^2: no scale was changed for this; state the gravity of the place (--gravity; '
-            'parameter local_gravity of the node) or, if the stated gravity is right, use --allow gravity'
+            'parameter local_gravity of the node) or, if the stated gravity is right, use '
+            '--allow gravity'
         )
     undetermined = [change.axis for change in result.axis_changes if not change.is_determined]
     if undetermined:
