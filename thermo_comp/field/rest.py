@@ -64,9 +64,11 @@ def encode(record: Start | Rest) -> bytes:
     if isinstance(record, Start):
         # Earlier releases cannot read rates and newer fields of lags and play operators: write
         # such fields only if their values differ from the defaults.
-        sensors, lags, plays, rates = vars(record.memory).values()
+        sensors, lags, plays, *newer = vars(record.memory).values()
+        while newer and not newer[-1]:
+            newer.pop()
         memory = [sensors, *([_shortened(each) for each in all_] for all_ in (lags, plays))]
-        data: Any = {**vars(record), 'memory': [*memory, rates] if rates else memory}
+        data: Any = {**vars(record), 'memory': [*memory, *newer]}
     else:
         # Nine digits resolve 0.01 counts of a 24-bit converter.
         data = [
@@ -108,12 +110,12 @@ def decode(content: bytes) -> tuple[list[tuple[Start, Rest]], int]:
 
 
 def _start(data: dict[str, Any]) -> Start:
-    sensors, lags, plays, *rates = data['memory']
+    sensors, lags, plays, *newer = data['memory']
     memory = MemorySpec(
         tuple(map(str, sensors)),
         tuple(_quantity(Lag, lag) for lag in lags),
         tuple(_quantity(Play, play) for play in plays),
-        tuple(map(str, *rates)) if rates else (),
+        *(tuple(map(str, names)) for names in newer),
     )
     start = Start(**{**data, 'memory': memory})
     _whole(start.start_ns)
