@@ -259,35 +259,12 @@ def _define(cls: Any, definitions: dict[str, Any]) -> None:
 
 def calibration_page() -> str:
     """Return the page on the calibration file."""
-    schema = calibration_schema()
-    definitions = schema['$defs']
+    definitions: dict[str, Any] = {}
+    _schema(Calibration, definitions)
+    schema = definitions.pop(Calibration.__name__)
     parts = [CALIBRATION_HEAD, *_section('The top level', schema, definitions, heading=2)]
-    for name in (
-        'Unit',
-        'Axes',
-        'AxisReference',
-        'RegimeSet',
-        'AxisSet',
-        'Polynomial',
-        'CubicSpline',
-        'Exponential',
-        'ResponseTerm',
-        'Gyroscope',
-        'RateSet',
-        'RateCurve',
-        'RateTerm',
-        'Nonlinearity',
-        'NonlinearTerm',
-        'Posterior',
-        'LackOfFit',
-        'GroupEvidence',
-        'DetectorSettings',
-        'ThermometerSettings',
-        'Provenance',
-        'Source',
-        'ResidualSummary',
-    ):
-        parts += _section(name, definitions[name], definitions, heading=3)
+    for name, part in definitions.items():
+        parts += _section(name, part, definitions, heading=3)
     return '\n'.join([*parts, *_bounds_table()])
 
 
