@@ -17,8 +17,9 @@ import typer
 from builders import rich_calibration
 from conftest import ROOT, parsed, ran
 
-from thermo_comp.cli import output
+from thermo_comp.cli import bags, output
 from thermo_comp.cli.app import split_arguments
+from thermo_comp.online.status import DROPPED
 from thermo_comp.recording.reader import inspect_recording, read_recording
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.unit.calibration_file import save_calibration
@@ -236,3 +237,7 @@ def test_findings_that_set_the_exit_code_are_printed_despite_quiet(capsys):
     with pytest.raises(typer.Exit):
         out.end()
     assert capsys.readouterr() == ('', 'thermo_comp: 01.mcap: cut off after 3 s\n')
+
+
+def test_the_command_replay_has_a_text_for_every_reason_to_drop_a_sample():
+    assert tuple(bags._LEFT_OUT) == DROPPED

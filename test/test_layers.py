@@ -203,10 +203,14 @@ def test_the_files_that_a_page_names_exist(page):
         assert is_path or any(path.name == name for path in SOURCES), name
 
 
-def test_the_table_of_the_response_on_the_page_has_every_group():
+def test_the_page_and_the_help_of_fit_have_every_group_of_columns():
     text = (DOCS / 'theory.md').read_text()
     shown = re.findall(r'^\| `(\w+)` \|', text, re.MULTILINE)
     columns = bank(('case',), {'case': -0.5}, (-9.0, 9.0))
     # The group `part` has no columns of its own: its curves are sums of other columns.
     groups = {'part', *(column.group for column in columns)}
+    assert groups <= GROUPS.keys()
     assert shown == [group for group in GROUPS if group in groups]
+    command = (PACKAGE / 'cli' / 'fit.py').read_text()
+    listed = re.search(r'Groups of regression columns: ([^.]*)\.', command)[1]
+    assert set(re.findall(r'\w+', listed)) == {'curve', 'set', *groups}

@@ -16,6 +16,7 @@ from ros_helpers import bare_node, node_in_thread
 from thermo_comp.online.status import CompensatorConfig
 from thermo_comp.ros import parameters
 from thermo_comp.ros.parameters import NodeConfig, ParameterError
+from thermo_comp.topics import OUTPUTS
 
 
 def test_parameters_and_compensator_have_the_same_defaults():
@@ -31,9 +32,7 @@ def test_every_parameter_is_described():
         for entry in fields(NodeConfig):
             shown = node.describe_parameter(entry.name)
             assert shown.description == entry.metadata['description']
-            assert shown.read_only == (
-                entry.name in {'calibration_directory', 'topics', 'rest_log'}
-            )
+            assert shown.read_only == entry.metadata['is_fixed']
             assert shown.type == Parameter.Type.from_parameter_value(entry.default).value
             assert bool(shown.floating_point_range) == isinstance(entry.default, float)
             assert bool(shown.integer_range) == isinstance(entry.default, int)
@@ -113,6 +112,7 @@ def test_the_parameter_file_states_the_defaults(root):
     del expected['calibration_file'], stated['calibration_file']
     assert stated == expected
     overrides = yaml.safe_load(overrides_text.replace('    # ', ''))['qos_overrides']
+    assert {f'/{topic.name}' for topic in OUTPUTS} <= overrides.keys()
     calibration = root / 'config' / 'calibration.example.yaml'
     with node_in_thread('-p', f'calibration_file:={calibration}') as node:
         for topic, sides in overrides.items():
