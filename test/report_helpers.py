@@ -52,9 +52,8 @@ def fitted():
 def evidence():
     """Gather the data of a report, with invented left-out residuals, NaN in the last position."""
     *others, last = fitted().positions
-    left_out = [
-        replace(other, left_out_rms=rms) for other, rms in zip(others, LEFT_OUT_RMS, strict=True)
-    ]
+    pairs = zip(others, LEFT_OUT_RMS, strict=True)
+    left_out = [replace(other, left_out_rms=rms) for other, rms in pairs]
     positions = (*left_out, replace(last, left_out_rms=np.nan))
     return evidence_of_fit(replace(fitted(), positions=positions))
 
