@@ -138,8 +138,7 @@ def test_fault_rows_over_dds_give_the_samples_without_dds(tmp_path):
             events = row.inject(list(bag(duration_s=200.0)))
             heard, expected = node.play(events), direct(events)
             for name in ('stamp_ns', 'force', 'covariance'):
-                np.testing.assert_array_equal(
-                    getattr(heard, name), getattr(expected, name), row.fault
-                )
+                got, wanted = getattr(heard, name), getattr(expected, name)
+                np.testing.assert_array_equal(got, wanted, row.fault)
             for level, text in row.says:
                 assert heard.says(text, level), (row.fault, text, sorted(set(heard.reports)))
