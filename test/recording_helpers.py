@@ -14,6 +14,8 @@ from rosbags.rosbag2 import Reader as Reader2
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
+from thermo_comp.recording.blocks import ImuColumns
+
 VECTOR = 'geometry_msgs/msg/Vector3Stamped'
 IMU = 'sensor_msgs/msg/Imu'
 TEMPERATURE = 'sensor_msgs/msg/Temperature'
@@ -113,6 +115,11 @@ def write_rosbag1(path, messages):
                 links[topic] = writer.add_connection(topic, kind, typestore=store)
             data = store.serialize_ros1(to_ros(message, 1), kind)
             writer.write(links[topic], message.log_ns, data)
+
+
+def imu_columns(rng, n):
+    """Draw the columns of n Imu messages other than the linear acceleration."""
+    return ImuColumns(*(rng.standard_normal((n, width)) for width in (4, 9, 3, 9, 9)))
 
 
 def read_with_rosbags(path):

@@ -137,7 +137,7 @@ def test_unreadable_bags_leave_earlier_results_in_place(scheduler, tmp_path):
 
 def test_an_interrupted_fleet_run_continues(scheduler, tmp_path):
     fleet, out = tmp_path / 'bags', tmp_path / 'out'
-    for seed in range(3):
+    for seed in range(2):
         write_unit(fleet / 'A' / f'u{seed}', seed, 1)
 
     def stop(n, _total):
@@ -152,8 +152,8 @@ def test_an_interrupted_fleet_run_continues(scheduler, tmp_path):
     (out / 'units/A/u0').mkdir(parents=True, exist_ok=True)
     (out / 'units/A/u0/result.json').write_text('{"format": 1,')
     result = fit_fleet(str(fleet), out, OPTIONS, scheduler=scheduler)
-    assert len(result.rows) == 3
-    assert result.n_done in (2, 3)
+    assert len(result.rows) == 2
+    assert result.n_done in (1, 2)
     assert json.loads((out / 'units/A/u0/result.json').read_text())['is_final']
 
 

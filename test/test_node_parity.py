@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from recording_helpers import imu_columns
 
 pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
 
@@ -61,7 +62,7 @@ def thermal_test(path, imu=False, has_case=True):
             late = late_ns * (rng.random(len(values)) < 0.3)
             writer.write_temperature(topic, reading_ns, noisy, reading_ns + late)
         if imu:
-            rest = ImuColumns(*(rng.standard_normal((n, k)) for k in (4, 9, 3, 9, 9)))
+            rest = imu_columns(rng, n)
             rest.angular_velocity_covariance[::10, 0] = -1.0
             covariance = rest.linear_acceleration_covariance
             force = accel / [300.0, -295.0, 310.0]
@@ -73,13 +74,13 @@ def thermal_test(path, imu=False, has_case=True):
 
 def output_of(path):
     with AnyReader([path]) as reader:
-        wanted = [c for c in reader.connections if c.topic.endswith(REGIME.name)]
-        flags = [
-            bool(reader.deserialize(data, connection.msgtype).data)
-            for connection, _, data in reader.messages(wanted)
-        ]
-        wanted = [c for c in reader.connections if c.topic.endswith(STAMPED.name)]
-        stamped = [bytes(data) for _, _, data in reader.messages(wanted)]
+
+        def messages(topic):
+            wanted = [link for link in reader.connections if link.topic.endswith(topic.name)]
+            return [(link.msgtype, bytes(data)) for link, _, data in reader.messages(wanted)]
+
+        flags = [bool(reader.deserialize(data, kind).data) for kind, data in messages(REGIME)]
+        stamped = [data for _, data in messages(STAMPED)]
     topics = Topics(imu=IMU_OUT.name, input='imu')
     return read_recording(path, topics, require=('accel',)).columns, flags, stamped
 
@@ -91,15 +92,13 @@ def assert_same(live, offline):
     assert out.accel_stamp_ns.tolist() == expected.accel_stamp_ns.tolist()
     different = np.flatnonzero((out.accel != expected.accel).any(axis=1))
     assert different.tolist() == []
-    assert out.imu is not None
-    assert expected.imu is not None
     for name in ImuColumns._fields:
         assert getattr(out.imu, name).tobytes() == getattr(expected.imu, name).tobytes(), name
     # There is one regime flag for each case reading, so equal flags mean equal switching times.
-    assert (len(flags), flags) == (len(expected_flags), expected_flags)
-    assert False in flags
-    assert True in flags
-    assert (len(stamped), stamped) == (len(flags), expected_stamped)
+    assert flags == expected_flags
+    assert {*flags} == {False, True}
+    assert stamped == expected_stamped
+    assert len(stamped) == len(flags)
 
 
 def run(calibration, bag, folder, *node_args, **keys):

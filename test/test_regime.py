@@ -39,10 +39,8 @@ SENSORS = {'1 mK': (0.001, 0.0), '10 mK': (0.01, 0.0),
 
 
 def case_and_board(t, corners, lag=LAG_S, start=20.0):
-    return (
-        start + lagged(t, corners, lag),
-        start + 0.3 + lagged_twice(t, corners, lag, BOARD_LAG_S),
-    )
+    behind = lagged_twice(t, corners, lag, BOARD_LAG_S)
+    return start + lagged(t, corners, lag), start + 0.3 + behind
 
 
 def onsets(noise, quantum, rate_k_min, lag, n, *, dt=1.0, end_s=1500.0, soak_s=1500.0):
@@ -54,9 +52,8 @@ def onsets(noise, quantum, rate_k_min, lag, n, *, dt=1.0, end_s=1500.0, soak_s=1
         t = np.arange(-soak_s, end_s, dt)
         start, sign = 20.0 + rng.uniform(-0.5, 0.5) * max(quantum, 0.1), rng.choice([-1, 1])
         case, board = case_and_board(t, [(0.0, sign * rate_k_min)], lag, start)
-        changes = switches(
-            settings, t, read(case, noise, quantum, rng), read(board, noise, quantum, rng)
-        )
+        readings = (read(celsius, noise, quantum, rng) for celsius in (case, board))
+        changes = switches(settings, t, *readings)
         before = [each for each in changes if each[0] < 0.0]
         n_static += bool(before) and before[-1][1] == STATIC
         collected.append([each for each in changes if each[0] >= 0.0])
@@ -136,10 +133,8 @@ def test_each_ramp_switches_the_regime_to_dynamic_once(noise, quantum, rate_k_mi
 @pytest.mark.parametrize(
     'sensor',
     [
-        '1 mK',
-        pytest.param('10 mK', marks=pytest.mark.slow),
-        pytest.param('1 mK, 62.5 mK steps', marks=pytest.mark.slow),
-        '10 mK, 62.5 mK steps',
+        *('1 mK', '10 mK, 62.5 mK steps'),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ('10 mK', '1 mK, 62.5 mK steps')),
     ],
 )
 def test_three_soaks_of_5_h_have_at_most_two_false_alarms(sensor):
@@ -153,12 +148,8 @@ def test_three_soaks_of_5_h_have_at_most_two_false_alarms(sensor):
         drift = 0.01 / 60.0 * 5400.0 * (1.0 - np.exp(-t / 5400.0))
         case = 20.0 + rng.uniform(0.0, 0.1) + drift
         swing = ripple(t, LAG_S, rng.uniform(180.0, 900.0), rng.uniform(0.0, 6.0))
-        changes = switches(
-            detector_settings(noise, quantum),
-            t,
-            read(case + swing, noise, quantum, rng),
-            read(case + 0.3, noise, quantum, rng),
-        )
+        readings = (read(each, noise, quantum, rng) for each in (case + swing, case + 0.3))
+        changes = switches(detector_settings(noise, quantum), t, *readings)
         assert changes[0][1] == STATIC
         assert changes[0][0] < 2400.0
         n_openings += sum(regime == DYNAMIC for _, regime, _ in changes)
@@ -272,10 +263,8 @@ def test_the_dynamic_regime_ends_by_the_case_or_the_board(sensor):
     # 62.5 mK do not show the last 5 min of the case's change.
     noise, quantum = SENSORS[sensor]
     lag, behind = 180.0, 900.0
-    board_too = DetectorSettings(
-        case=ThermometerSettings(noise, quantum, lag_s=lag),
-        board=ThermometerSettings(noise, quantum, lag_s=lag + behind),
-    )
+    of_case = ThermometerSettings(noise, quantum, lag_s=lag)
+    board_too = DetectorSettings(case=of_case, board=replace(of_case, lag_s=lag + behind))
     case_alone = replace(board_too, end_condition='case')
     earlier = behind * math.log(10.0 * behind / (behind - lag)) - lag * math.log(10.0)
     rng = np.random.default_rng(5)
@@ -372,16 +361,8 @@ def test_switches_do_not_depend_on_the_origin_of_time():
         (DetectorSettings, {'relaxed_rate_k_min': math.nan}, 'must be greater than 0'),
         (DetectorSettings, {'ripple_c': -0.1}, 'must be at least 0, got -0.1'),
         (DetectorSettings, {'dwell_s': math.inf}, r'must be at most 1e\+07, got inf'),
-        (
-            DetectorSettings,
-            {'end_condition': 'chamber'},
-            "must be 'board' or 'case', got 'chamber'",
-        ),
-        (
-            DetectorSettings,
-            {'relaxed_rate_k_min': 0.15},
-            'must be below `smallest_ramp_k_min` / 1',
-        ),
+        (DetectorSettings, {'end_condition': 'chamber'}, "must be 'board' or 'case', got 'chambe"),
+        (DetectorSettings, {'relaxed_rate_k_min': 0.15}, 'must be below `smallest_ramp_k_min` / '),
         (ThermometerSettings, {'noise_sd_c': 0.0}, 'must be greater than 0, got 0.0'),
         (ThermometerSettings, {'fastest_ramp_k_min': -1.0}, 'must be greater than 0, got -1'),
         (ThermometerSettings, {'lag_s': math.inf}, r'must be at most 1e\+08, got inf'),
