@@ -145,8 +145,7 @@ def test_readings_stay_among_samples_after_a_restart_of_the_clock(tmp_path):
 
 
 def test_readings_of_minus_127_degc_are_left_out(tmp_path):
-    # WHY: 46 readings of -127 degC (DS18B20 without contact) increased the error of a fit from
-    # 0.02 to 0.68 mg.
+    # WHY: 46 readings of -127 degC (DS18B20 without contact) increased a fit's error to 0.68 mg.
     path, _ = table(tmp_path / 'log.csv')
     lines = path.read_text().splitlines()
     for k in (50, 51, 300):

@@ -262,8 +262,7 @@ def present(imu, temperature=(), pressure=()):
         ((), (), None, None),
         (('/t',), (), '/t', None),
         (('/imu/t', '/air'), (), '/imu/t', '/air'),
-        # A thermometer in a barometer's namespace is the case's, even if it is the only
-        # thermometer.
+        # A thermometer in a barometer's namespace is the case's, even as the only thermometer.
         (('/baro/t',), ('/baro/p',), None, '/baro/t'),
         (('/imu/t', '/baro/t', ), ('/baro/p',), '/imu/t', '/baro/t'),
         (('/robot/imu/t', '/robot/baro/t'), ('/robot/baro/p',), '/robot/imu/t', '/robot/baro/t'),

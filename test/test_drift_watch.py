@@ -51,8 +51,7 @@ def test_the_probability_of_a_first_passage_agrees_with_closed_forms():
 
 @pytest.mark.slow
 def test_forecasts_agree_with_the_simulated_future_of_units():
-    # WHY: errors of opposite signs in opposite attitudes cancelled: forecasts were 3 to 5 times
-    # too long.
+    # WHY: errors of opposite attitudes cancelled: forecasts were 3 to 5 times too long.
     shares, ratios = [], []
     for kind in ('fixed', 'up and down', 'faces', 'carried'):
         for rows in field_watch.forecasts(kind, 3, 20).values():

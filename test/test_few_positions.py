@@ -39,8 +39,7 @@ def left_by(pair, **options):
     time_s = held_out.time_s[: 8 * n].reshape(n, 8).mean(axis=1)
     counts = held_out.counts[: 8 * n].reshape(n, 8, 3).mean(axis=1)
     corrected = calibration.correct(time_s, counts, **held_out.temperatures)
-    # A fit to two positions leaves bias, K and M uncertain: in a third position the claimed sd of
-    # an axis exceeds 1 mg.
+    # A fit to two positions leaves bias, K and M uncertain: an axis' sd in a third exceeds 1 mg.
     sd = np.sqrt(np.nanmedian(np.einsum('nii->ni', corrected.covariance), axis=0))
     assert (sd > 1000.0 * MICRO_G).any()
     return np.asarray(minutes(corrected.specific_force).std(axis=0))

@@ -125,8 +125,7 @@ def test_updates_of_ageing_units_have_small_errors_of_at_most_1_4_claimed_sd_rms
         if kind == 'level':
             assert abs(updated.ageing.turn_on / (20 * MICRO_G) - 1.0) < 0.5
     before, left = np.sqrt(np.mean(np.square(squares), axis=0)) / MICRO_G
-    # A Kalman filter with the true variances leaves |f| - g of 12 to 14 ug RMS
-    # (benchmarks/field.py).
+    # A Kalman filter with the true variances leaves 12 to 14 ug RMS (benchmarks/field.py).
     assert before > 100.0
     assert left < 30.0
     assert np.sqrt(np.mean(np.square(ratios))) < 1.4
@@ -191,7 +190,7 @@ def stepped(history, size, day):
     ]
 
 
-@pytest.mark.parametrize('day', [15, 0])
+@pytest.mark.parametrize('day', [15, pytest.param(0, marks=pytest.mark.slow)])
 def test_a_change_of_gravity_is_not_taken_for_a_change_of_three_scales(day):
     # Bias and scale walk by 15 ug and 10 ppm per root day; from `day` on gravity is 300 ug larger.
     unit, size = field_units.calibration(), 300.0 * MICRO_G
@@ -307,8 +306,7 @@ def test_a_wrong_clock_at_the_start_of_the_node_does_not_change_the_update(tmp_p
 
 
 def test_rests_with_stamps_in_wrong_order_give_a_valid_covariance(rng):
-    # The stamps of a third of the turn-ons are wrong by up to 10 days, so rests change their
-    # order.
+    # Stamps of a third of the turn-ons are wrong by up to 10 days: rests change their order.
     unit = known()
     logged = rests(unit, upright, no_error)
     wrong = {s.start_ns: int(rng.choice((0, 0, 864e12 * rng.uniform(-1, 1)))) for s, _ in logged}
@@ -436,7 +434,7 @@ def test_an_unknown_regime_after_a_turn_on_does_not_increase_the_noise_of_a_rest
     assert np.sqrt(series.noise.max()) < 8.0 * MICRO_G < early.claim.min()
 
 
-@pytest.mark.parametrize('lags', [0.0, 1.0])
+@pytest.mark.parametrize('lags', [pytest.param(0.0, marks=pytest.mark.slow), 1.0])
 def test_unknown_initial_lag_states_are_not_taken_for_scatter_of_rests(rng, lags):
     # A turn-on has three rests, in which 100, 70 and 40 % of the initial lag states remain. Random
     # walks grow by 15 ug (bias) and 10 ug (scale, at 1 g) per root day; sd of turn-ons: 20 ug, of

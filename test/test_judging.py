@@ -389,8 +389,7 @@ def test_evaluate_reports_exchanged_thermometers_and_temperatures_out_of_range(r
 
 
 def test_an_axis_that_repeats_one_value_in_a_rest_is_named(tmp_path):
-    # WHY: a level axis hardly changes |f|, and a bag whose y axis repeated one number for an hour
-    # was judged as valid.
+    # WHY: a bag whose level y axis repeated one number, which hardly changes |f|, was valid.
     bag = resting(tmp_path / 'dead.mcap', 20.0, noise=5.0, dead='y')
     density = (5.0 / K * np.sqrt(0.1),) * 3
     noisy = corrected_by(SLOPE, noise_density_m_s2_sqrt_hz=density)

@@ -28,7 +28,7 @@ from thermo_comp.unit.calibration_file import save_calibration
 TOPICS = Topics()
 START_NS = 1_767_225_600_000_000_000
 RATE_HZ = 1
-MINUTES = 24
+MINUTES = 18
 UNIT = Unit('T-1', 'counts', 32767.0, 1.0 / RATE_HZ)
 
 
@@ -45,8 +45,8 @@ def thermal_test(path, imu=False, has_case=True):
     n = MINUTES * 60 * RATE_HZ
     stamps = START_NS + np.arange(1, n + 1) * (1_000_000_000 // RATE_HZ)
     seconds = np.arange(0.0, MINUTES * 60.0, 2.0)
-    case = np.interp(seconds, [0.0, 600.0, 1200.0], [15.0, 15.0, 25.0])
-    board = np.interp(seconds - 100.0, [0.0, 600.0, 1200.0], [16.0, 16.0, 26.0])
+    case = np.interp(seconds, [0.0, 400.0, 800.0], [15.0, 15.0, 25.0])
+    board = np.interp(seconds - 100.0, [0.0, 400.0, 800.0], [16.0, 16.0, 26.0])
     reading_ns = START_NS + (seconds * 1e9).astype(np.int64)
     # The unit rests with z up; the counts follow from the scale factors of `rich_calibration`.
     accel = np.array([5.0, -3.0, 310.0 * 9.80665]) + rng.integers(-4, 5, (n, 3))

@@ -84,8 +84,7 @@ def check_positions(result):
 
 def check_fit(result, cli, folder):
     """Run the fit that `record` printed, and compare its constants with the true constants."""
-    # The model `golovach` is sufficient for constants; a model with a response takes ten times as
-    # long.
+    # The model `golovach` is sufficient for constants; a response takes ten times as long.
     given = '--gravity 9.80665 --model golovach'
     words = shlex.split(result['command'].replace('--gravity G', given))
     assert words.pop(0) == 'thermo_comp'

@@ -209,8 +209,7 @@ def test_the_files_of_a_split_bag_are_read_in_order(tmp_path):
     assert recording.info.truncated is None
     assert recording.info.n_messages == len(messages)
 
-    # Without metadata.yaml, as after the end of a recorder by a signal, numbers in the file names
-    # give the order.
+    # Without metadata.yaml, as after a killed recorder, numbers in the file names give the order.
     (tmp_path / 'bag' / 'bag.mcap').rename(tmp_path / 'bag' / 'bag_0.mcap')
     (tmp_path / 'bag' / 'bag_1.mcap').rename(tmp_path / 'bag' / 'bag_2.mcap')
     for text in (None, ''):

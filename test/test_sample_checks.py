@@ -192,8 +192,7 @@ def test_the_variance_of_samples_in_m_s2_is_proportional_to_their_rate(rng):
     samples = GRAVITY * np.array(UP) + 1e-3 * rng.standard_normal((8000, 3))
     rows, _ = stream(compensator, recording(8000, 400.0, lambda k: tuple(samples[k])))
     assert len(rows) == 8000
-    # At four times the calibrated rate a sample averages 1/4 of the time and has 4 times the
-    # variance.
+    # At four times the calibrated rate a sample has 1/4 of the time, and 4 times the variance.
     assert rows[-1][3] / rows[0][3] == pytest.approx(4.0, rel=1e-6)
 
 
