@@ -30,7 +30,7 @@ def run(position=0):
     """Run one position of a thermostatted unit through 54 minutes of ramps and soaks."""
     return simulate(
         unit_preset('thermostatted', 1), parse_cyclogram(PROGRAM),
-        positions(N_POSITIONS, 0)[position], rate_hz=RATE_HZ, temperature_rate_hz=0.4,
+        positions(N_POSITIONS, 0)[position], rate_hz=RATE_HZ, temperature_rate_hz=0.2,
         seed=position,
     )  # fmt: skip
 

@@ -55,9 +55,8 @@ LAYOUTS = {
 #: Drivers that publish no temperature.
 LACKS = {'ardupilot', 'realsense', 'mpu6050'}
 #: Drivers whose bags are fitted: one for each type of temperature message, one without readings.
-FITTED = {'xsens', 'mavros', 'px4', 'phidgets', 'ardupilot'}
-#: Seven rests of REST_S [s], on six faces and then on the first face; the board warms by WARMING
-#: [K/s].
+FITTED = {'mavros', 'px4', 'phidgets', 'ardupilot'}
+#: Seven rests of REST_S [s]: six faces, the first again; the board warms by WARMING [K/s].
 UPS = np.concatenate((np.eye(3), -np.eye(3), [[1.0, 0.0, 0.0]]))
 RATE, REST_S, WARMING = 2, 75, 0.05
 SECONDS = len(UPS) * REST_S
