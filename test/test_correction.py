@@ -81,10 +81,10 @@ def test_blocks_corrected_with_all_columns_have_the_bits_of_single_samples(seed,
     rng = np.random.default_rng(seed)
     unit = full_bank(rng, posterior=True)
     # Temperatures exceed the range (5 to 35 degC) and its continuation (-2.5 to 42.5 degC).
-    events = run_of(rng, seconds=50, rate=2, swing_k=90.0)
+    events = run_of(rng, seconds=30, swing_k=150.0)
     assert max(value for kind, _, value in events if kind == 'board') > 45.0
     rows, _, _ = builders.assert_equal_bits(unit, builders.UNCHECKED, events, chunk)
-    assert len(rows) > 95
+    assert len(rows) > 110
 
 
 def test_columns_of_the_x_axis_do_not_change_the_output_of_y_and_z(rng):

@@ -34,14 +34,14 @@ OVER_DDS = (
     *('board late by 5 s', 'counts out of order'),
     *('time jumps back', 'temperatures of another clock'),
 )
-#: Faults of the case thermometer that are read like those of the board.
-LIKE_BOARD = {
-    f'case {fault}'
-    for fault in ('twice', 'in whole degrees', 'is infinite', 'jumps by 40 K and stays')
+#: Slow tests: faults of the case that are read like those of the board, and second time jumps.
+SLOW = {
+    *('case twice', 'case in whole degrees', 'case is NaN', 'case is infinite'),
+    *('case jumps by 40 K and stays', 'case out of order', 'case late by 5 s'),
+    *('time jumps forward by 10 min in the soak', 'time jumps forward by a day in the ramp'),
 }
 CASES = [
-    pytest.param(row, id=row.fault, marks=[pytest.mark.slow] * (row.fault in LIKE_BOARD))
-    for row in ROWS
+    pytest.param(row, id=row.fault, marks=[pytest.mark.slow] * (row.fault in SLOW)) for row in ROWS
 ]
 
 

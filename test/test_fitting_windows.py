@@ -238,7 +238,11 @@ def test_curve_columns_of_a_fit_are_powers_of_temperature(
     assert all(column[0] == 0.0 for column in columns[sets.static.n_free :])
 
 
-@pytest.fixture(scope='module', params=['golovach', 'linear', 'exponential', 'spline'])
+#: Models that are fitted; the sets of `golovach` are polynomials like that of `linear`.
+MODELS = 'golovach', pytest.param('linear', marks=pytest.mark.slow), 'exponential', 'spline'
+
+
+@pytest.fixture(scope='module', params=MODELS)
 def fitted(request, all_bags):
     groups = ('curve', 'set', *(['board'] if request.param == 'exponential' else []))
     is_paper = request.param == 'golovach'
