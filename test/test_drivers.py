@@ -58,11 +58,11 @@ LACKS = {'ardupilot', 'realsense', 'mpu6050'}
 FITTED = {'mavros', 'px4', 'phidgets', 'ardupilot'}
 #: Seven rests of REST_S [s]: six faces, the first again; the board warms by WARMING [K/s].
 UPS = np.concatenate((np.eye(3), -np.eye(3), [[1.0, 0.0, 0.0]]))
-RATE, REST_S, WARMING = 2, 75, 0.05
+RATE, REST_S, WARMING = 5, 75, 0.05
 SECONDS = len(UPS) * REST_S
 GRAVITY, MICRO_G = 9.80665, 9.80665e-6
 #: Bias [m/s^2], its slope [m/s^2/K], noise of a sample [m/s^2] (6 ug in means over 60 s).
-BIAS, SLOPE, NOISE = np.array([0.05, -0.03, 0.08]), np.array([1e-3, -2e-3, 3e-3]), 6.3e-4
+BIAS, SLOPE, NOISE = np.array([0.05, -0.03, 0.08]), np.array([1e-3, -2e-3, 3e-3]), 1e-3
 
 
 @pytest.fixture(scope='module')
@@ -96,7 +96,7 @@ def message(store, kind, stamp_ns, celsius, force):
 
 @pytest.fixture
 def bag(request, tmp_path, store):
-    """Write rests with the topics of a driver: samples at 2 Hz, other messages at 1 Hz."""
+    """Write rests with the topics of a driver: samples at 5 Hz, other messages at 1 Hz."""
     path, noise = tmp_path / 'bag', np.random.default_rng(40)
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         links = {
