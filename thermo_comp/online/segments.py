@@ -43,7 +43,7 @@ UNMEASURED_SD_K: Final = 10.0
 class SlowState(NamedTuple):
     """
     Arguments of the variance due to parameters and initial lag states: thermal state, remaining
-    shares of the unknown initial lag states, largest rate of the board since the start [K/s].
+    shares of the unknown initial lag states, board rate of a ramp at the start [K/s].
     """
 
     state: tuple[float, ...]
