@@ -169,9 +169,11 @@ class ThermalSide:
         self._forget_samples()
 
     def push(self, name: str, stamp_ns: int, celsius: float) -> None:
-        """Queue a reading, if the calibration has a thermometer of this name."""
-        if name in self.inputs:
-            self._count_rejected(name, self.queue.push(name, stamp_ns, celsius))
+        """Queue a reading; ValueError if the calibration has no thermometer of this name."""
+        if name not in self.inputs:
+            known = ', '.join(self.inputs)
+            raise ValueError(f'{name!r} is not a thermometer of the calibration, which has {known}')
+        self._count_rejected(name, self.queue.push(name, stamp_ns, celsius))
 
     def _apply(self, name: str, stamp_ns: int, celsius: float) -> None:
         self._n_applied += 1
