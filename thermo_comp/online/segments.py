@@ -171,8 +171,8 @@ class ThermalSide:
     def push(self, name: str, stamp_ns: int, celsius: float) -> None:
         """Queue a reading; ValueError if the calibration has no thermometer of this name."""
         if name not in self.inputs:
-            known = ', '.join(self.inputs)
-            raise ValueError(f'{name!r} is not a thermometer of the calibration, which has {known}')
+            text = f'{name!r} is not a thermometer of the calibration, which has '
+            raise ValueError(text + ', '.join(self.inputs))
         self._count_rejected(name, self.queue.push(name, stamp_ns, celsius))
 
     def _apply(self, name: str, stamp_ns: int, celsius: float) -> None:
