@@ -418,6 +418,15 @@ def test_an_axis_that_repeats_one_value_in_a_rest_is_named(tmp_path):
     assert judged(bag, dataclasses.replace(noisy, noise_density_m_s2_sqrt_hz=(1e-5,) * 3))
 
 
+def test_a_bag_with_temperatures_in_kelvins_is_refused(tmp_path):
+    # WHY: the verdict on such a bag was only that its temperatures are outside the calibration's.
+    bag = resting(tmp_path / 'hot.mcap', 293.15)
+    with pytest.raises(
+        RecordingError, match=r'hot\.mcap: temperature/board reads 293\S* degC .* kelv'
+    ):
+        judged(bag, CLAIMING)
+
+
 @pytest.mark.parametrize(
     ('step', 'noise', 'is_refused'), [(0.0, 0.02, True), (0.005, 0.02, True), (0.01, 0.001, False)]
 )

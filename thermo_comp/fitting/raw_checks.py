@@ -121,6 +121,17 @@ def _rests(bags: Sequence[ReducedBag]) -> list[StillInterval]:
     return [rest for bag in bags for rest in bag.intervals]
 
 
+def in_kelvins(bag: ReducedBag) -> str:
+    """Describe the thermometer of a bag whose readings look like kelvins; '' if none does."""
+    for name in sorted(bag.temperatures):
+        celsius = bag.readings(name).value
+        # 233 K is -40 degC, the lower limit of industrial electronics; none works at 233 degC.
+        if len(celsius) and 233.0 < (median := float(np.median(celsius))) < KELVINS[1]:
+            reads = f'temperature/{name} reads {median:.4g} degC in the median'
+            return f'{reads}: that looks like kelvins; record degC'
+    return ''
+
+
 def _judge_thermometers(bags: Sequence[ReducedBag]) -> Iterator[Finding]:
     """Check the readings of the thermometers; FitError if those of a bag are in kelvins."""
     names = sorted({name for bag in bags for name in bag.temperatures})
@@ -131,18 +142,10 @@ def _judge_thermometers(bags: Sequence[ReducedBag]) -> Iterator[Finding]:
                 f'temperature/{name}: {counted(n, "reading")} more than 10 K from the readings '
                 'before and after, left out: does the thermometer lose contact?',
             )
+    for bag in bags:
+        if text := in_kelvins(bag):
+            raise FitError(f'{bag.source.name}: {text}')
     for name in names:
-        medians = {
-            bag.source.name: float(np.median(bag.readings(name).value))
-            for bag in bags
-            if len(bag.readings(name).value)
-        }
-        # 233 K is -40 degC, the lower limit of industrial electronics; none works at 233 degC.
-        if odd := [bag for bag, median in medians.items() if 233.0 < median < KELVINS[1]]:
-            raise FitError(
-                f'{odd[0]}: temperature/{name} reads {medians[odd[0]]:.4g} degC in the median: '
-                'that looks like kelvins; record degC'
-            )
         celsius = np.concatenate([bag.readings(name).value for bag in bags])
         if len(celsius) and KELVINS[0] < np.median(celsius) < KELVINS[1]:
             reads = f'temperature/{name} reads {np.min(celsius):.4g} .. {np.max(celsius):.4g} degC'

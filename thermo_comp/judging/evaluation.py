@@ -13,7 +13,7 @@ import numpy as np
 from ..errors import RecordingError
 from ..fitting.joining import joined
 from ..fitting.options import COUNTS_FULL_SCALE
-from ..fitting.raw_checks import constant_axes
+from ..fitting.raw_checks import constant_axes, in_kelvins
 from ..fitting.reduction import ReducedBag, reduce_source
 from ..fitting.sources import ForceOptions, digest, recording_source
 from ..recording.blocks import Role
@@ -56,8 +56,8 @@ def open_bags(
     """
     Read bags for windows of `window_s`; the first calibration, if any, sets topics and full scale.
 
-    Raises RecordingError if a bag cannot be read, is given twice, has a dead axis, or lacks a
-    board temperature that is needed.
+    Raises RecordingError if a bag cannot be read, is given twice, has a dead axis or temperatures
+    in kelvins, or lacks a board temperature that is needed.
     """
     require: tuple[Role, ...] = ('board',)
     known: dict[str, Any] = {}
@@ -88,6 +88,8 @@ def open_bags(
                 'with --topic board=TOPIC',
                 path=str(path),
             )
+        if text := in_kelvins(bag):
+            raise RecordingError(text, path=str(path))
         if calibrations and (dead := _dead_axes(bag, calibrations[0])):
             raise RecordingError(f'dead axis: {dead}', path=str(path))
         bags.append(bag)

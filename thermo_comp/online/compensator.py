@@ -344,7 +344,7 @@ class Compensator:
         for name, twin in tracker.copies.items():
             if twin.is_copy and faults[name][0] is Fault.NONE:
                 faults[name] = Fault.COPY, 0.0
-        if loose_k and faults[BOARD_INPUT][0] is Fault.NONE:
+        if loose_k and faults[BOARD_INPUT][0] in (Fault.NONE, Fault.SHIFTED):
             faults[BOARD_INPUT] = Fault.LOOSE, loose_k
         return CompensatorStatus(
             stamp_ns,
