@@ -22,10 +22,9 @@ from live_node import lossless
 from node_process import NodeProcess
 from rcl_interfaces.srv import SetParameters
 from rclpy.context import Context
-from rclpy.parameter import Parameter
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
-from ros_helpers import Peer
+from ros_helpers import Peer, parameters_of
 from sensor_msgs.msg import Imu, Temperature
 
 from thermo_comp.ros.waitloop import WaitLoop
@@ -79,10 +78,8 @@ class Bench:
         self.process = node
         self.node = rclpy.create_node('fault_bench', context=context)
         # WaitLoop does not serve clients, so a `Peer` calls the services of the node.
-        self._operator = Peer()
-        self._client = self._operator.node.create_client(
-            SetParameters, 'thermo_comp/set_parameters'
-        )
+        operator = self._operator = Peer()
+        self._client = operator.node.create_client(SetParameters, 'thermo_comp/set_parameters')
         self._loop = WaitLoop(self.node)
         self._imu = self._loop.subscribe(Imu, 'imu/data_raw', QOS)
         self._diagnostics = self._loop.subscribe(DiagnosticArray, '/diagnostics', QOS)
@@ -139,18 +136,13 @@ class Bench:
 
     def wait_for(self, condition, what):
         with self._news:
-            is_done = self._news.wait_for(
-                lambda: condition() or not self.process.is_alive, TIMEOUT_S
-            )
+            done = self._news.wait_for(lambda: condition() or not self.process.is_alive, TIMEOUT_S)
         assert self.process.is_alive, self.process.said
-        assert is_done, f'{what} did not come true; {self._values}'
+        assert done, f'{what} did not come true; {self._values}'
 
     def ask(self, **values):
         assert self._client.wait_for_service(TIMEOUT_S)
-        messages = [
-            Parameter(name, value=value).to_parameter_msg() for name, value in values.items()
-        ]
-        return self._client.call_async(SetParameters.Request(parameters=messages))
+        return self._client.call_async(SetParameters.Request(parameters=parameters_of(values)))
 
     def set_parameters(self, **values):
         future = self.ask(**values)

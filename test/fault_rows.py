@@ -10,35 +10,18 @@ Times are seconds of the bag of `fault_rig`: the unit turns until 40 s, the ramp
 import math
 from dataclasses import dataclass, field
 
+import fault_rig as rig
 import numpy as np
-from fault_rig import (
-    DURATION_S,
-    FULL_SCALE,
-    RATE_HZ,
-    START_NS,
-    Event,
-    Inject,
-    bag,
-    chain,
-    changed,
-    frozen,
-    late,
-    seconds_of,
-    shifted,
-    shuffled,
-    stop,
-    value,
-)
 
 OK, WARN, ERROR = 0, 1, 2
 #: Number of samples in the bag without a fault.
-N_SAMPLES = round(RATE_HZ * DURATION_S)
+N_SAMPLES = round(rig.RATE_HZ * rig.DURATION_S)
 
 
 @dataclass(frozen=True)
 class Row:
     fault: str
-    inject: Inject
+    inject: rig.Inject
     #: Required diagnostics: pairs of a level and a part of the message.
     says: tuple[tuple[int, str], ...]
     #: Smallest number of published samples.
@@ -52,7 +35,7 @@ class Row:
     #: Time from which stamps are ahead of the true times, and the difference [s].
     shift: tuple[float, float] = (math.inf, 0.0)
     #: Messages before the fault is applied; None: the bag of `fault_rig`.
-    source: list[Event] | None = field(default=None, repr=False)
+    source: list[rig.Event] | None = field(default=None, repr=False)
 
 
 def swap_topics(events):
@@ -62,12 +45,12 @@ def swap_topics(events):
 
 def lose(share):
     rng = np.random.default_rng(3)
-    return changed('counts', 0.0, 999.0, lambda e: [e] if rng.random() >= share else [])
+    return rig.changed('counts', 0.0, 999.0, lambda e: [e] if rng.random() >= share else [])
 
 
 def faster(begin_s, end_s, factor):
     """Replace each sample by `factor` samples with 1/`factor` of its counts each."""
-    step_ns = round(1e9 / RATE_HZ / factor)
+    step_ns = round(1e9 / rig.RATE_HZ / factor)
 
     def split(event):
         topic, stamp_ns, sample = event
@@ -77,12 +60,12 @@ def faster(begin_s, end_s, factor):
             for k in reversed(range(factor))
         ]
 
-    return changed('counts', begin_s, end_s, split)
+    return rig.changed('counts', begin_s, end_s, split)
 
 
 def half_time(begin_s):
     """Play the messages before `begin_s` and then the whole bag, so that stamps jump back."""
-    return lambda events: [e for e in events if seconds_of(e[1]) < begin_s] + events
+    return lambda events: [e for e in events if rig.seconds_of(e[1]) < begin_s] + events
 
 
 def sensor_rows(name):
@@ -92,31 +75,32 @@ def sensor_rows(name):
     level = ERROR if is_board else WARN
     held = (WARN, 'board temperature') if is_board else (WARN, 'case temperature lost')
     return [
-        Row(f'{name} stops', stop(name, 80.0, 130.0), ((level, lost),), 3600,
+        Row(f'{name} stops', rig.stop(name, 80.0, 130.0), ((level, lost),), 3600,
             silent=((100.5, 129.5),) if is_board else (), recovered=165.0),
-        Row(f'{name} freezes in the ramp', frozen(name, 80.0, 130.0),
+        Row(f'{name} freezes in the ramp', rig.frozen(name, 80.0, 130.0),
             ((WARN, f'{name} temperature frozen'), (level, lost)), 3650,
             silent=((107.8, 129.5),) if is_board else (), recovered=165.0),
-        Row(f'{name} freezes in the soak', frozen(name, 45.0, 130.0),
+        Row(f'{name} freezes in the soak', rig.frozen(name, 45.0, 130.0),
             ((WARN, f'{name} temperature stands still'), (WARN, f'{name} temperature frozen')),
             3450, recovered=200.0),
-        Row(f'{name} jumps by 40 K', value(name, 80.0, 95.0, lambda v: v + 40.0),
+        Row(f'{name} jumps by 40 K', rig.value(name, 80.0, 95.0, lambda v: v + 40.0),
             ((WARN, f'{name} temperature jumped by +'),), N_SAMPLES, recovered=125.0),
-        Row(f'{name} jumps by 40 K and stays', value(name, 80.0, 130.0, lambda v: v + 40.0),
+        Row(f'{name} jumps by 40 K and stays', rig.value(name, 80.0, 130.0, lambda v: v + 40.0),
             ((WARN, f'{name} temperature jumped by +'), (WARN, 'outside the calibrated range')),
             3950, recovered=230.0),
-        Row(f'{name} jumps by 2 K', value(name, 80.0, 130.0, lambda v: v + 2.0), (), N_SAMPLES,
+        Row(f'{name} jumps by 2 K', rig.value(name, 80.0, 130.0, lambda v: v + 2.0), (), N_SAMPLES,
             recovered=220.0),
         *(
-            Row(f'{name} is {word}', value(name, 80.0, 95.0, lambda _, bad=bad: bad), (held,),
+            Row(f'{name} is {word}', rig.value(name, 80.0, 95.0, lambda _, bad=bad: bad), (held,),
                 N_SAMPLES, recovered=125.0)
             for word, bad in (('NaN', math.nan), ('infinite', -math.inf))
         ),
-        Row(f'{name} in whole degrees', value(name, 45.0, 160.0, lambda v: float(round(v))),
+        Row(f'{name} in whole degrees', rig.value(name, 45.0, 160.0, lambda v: float(round(v))),
             ((WARN, f'{name} temperature'),), 3850, recovered=220.0),
-        Row(f'{name} twice', changed(name, 45.0, 160.0, lambda e: [e, e]), (), N_SAMPLES),
-        Row(f'{name} out of order', shuffled(name, 45.0, 160.0), (), N_SAMPLES, recovered=170.0),
-        Row(f'{name} late by 5 s', late(name, 5.0, 45.0, 160.0),
+        Row(f'{name} twice', rig.changed(name, 45.0, 160.0, lambda e: [e, e]), (), N_SAMPLES),
+        Row(f'{name} out of order', rig.shuffled(name, 45.0, 160.0), (), N_SAMPLES,
+            recovered=170.0),
+        Row(f'{name} late by 5 s', rig.late(name, 5.0, 45.0, 160.0),
             ((WARN, 'board temperature 5'),) if is_board else (), N_SAMPLES, recovered=200.0),
     ]  # fmt: skip
 
@@ -125,39 +109,41 @@ SENSOR_ROWS = [*sensor_rows('board'), *sensor_rows('case')]
 
 BOTH_ROWS = [
     Row('both temperatures freeze',
-        chain(frozen('board', 80.0, 130.0), frozen('case', 80.0, 130.0)),
+        rig.chain(rig.frozen('board', 80.0, 130.0), rig.frozen('case', 80.0, 130.0)),
         ((WARN, 'board temperature stands still'), (WARN, 'case temperature stands still')),
         N_SAMPLES, recovered=230.0),
     Row('board thermometer loose',
-        value('board', 45.0, 999.0, lambda v: 20.0 + 0.01 * math.sin(1e5 * v)),
+        rig.value('board', 45.0, 999.0, lambda v: 20.0 + 0.01 * math.sin(1e5 * v)),
         ((WARN, 'thermometer loose'),), N_SAMPLES, blind=(60.0, 85.0), recovered=math.inf),
-    Row('both temperatures stop', chain(stop('board', 80.0, 130.0), stop('case', 80.0, 130.0)),
+    Row('both temperatures stop',
+        rig.chain(rig.stop('board', 80.0, 130.0), rig.stop('case', 80.0, 130.0)),
         ((ERROR, 'nothing is published'), (WARN, 'case temperature lost')), 3600,
         silent=((100.5, 129.5),), recovered=170.0),
     Row('topics swapped', swap_topics, ((ERROR, 'swapped'),), N_SAMPLES, recovered=math.inf),
 ]  # fmt: skip
 
 SAMPLE_ROWS = [
-    Row('counts are NaN', value('counts', 80.0, 95.0, lambda v: (math.nan, v[1], v[2])),
+    Row('counts are NaN', rig.value('counts', 80.0, 95.0, lambda v: (math.nan, v[1], v[2])),
         ((WARN, 'samples not finite, dropped'),), 3800, silent=((80.0, 95.0),)),
-    Row('counts saturated', value('counts', 80.0, 95.0, lambda v: (v[0], -FULL_SCALE, v[2])),
+    Row('counts saturated',
+        rig.value('counts', 80.0, 95.0, lambda v: (v[0], -rig.FULL_SCALE, v[2])),
         ((ERROR, 'samples saturated'),), 3800, silent=((80.0, 95.0),)),
-    Row('counts stuck', frozen('counts', 80.0, 130.0),
+    Row('counts stuck', rig.frozen('counts', 80.0, 130.0),
         ((ERROR, 'samples stuck or all zero, dropped'),), 3375, silent=((84.1, 130.0),),
         recovered=130.0),
-    Row('counts stuck in motion', frozen('counts', 10.0, 20.0),
+    Row('counts stuck in motion', rig.frozen('counts', 10.0, 20.0),
         ((ERROR, 'samples stuck or all zero, dropped'),), 3850, silent=((14.1, 20.0),),
         blind=(10.0, 14.1), recovered=20.0),
-    Row('one axis stuck in motion', value('counts', 10.0, 20.0, lambda v: (v[0], v[1], 77.0)),
+    Row('one axis stuck in motion', rig.value('counts', 10.0, 20.0, lambda v: (v[0], v[1], 77.0)),
         ((ERROR, 'samples stuck or all zero, dropped'),), 3850, silent=((14.1, 20.0),),
         blind=(10.0, 14.1), recovered=20.0),
-    Row('counts all zero', value('counts', 80.0, 95.0, lambda _: (0.0, 0.0, 0.0)),
+    Row('counts all zero', rig.value('counts', 80.0, 95.0, lambda _: (0.0, 0.0, 0.0)),
         ((ERROR, 'samples stuck or all zero, dropped'),), 3800, silent=((80.0, 95.0),)),
-    Row('an axis reversed', value('counts', 130.0, 220.0, lambda v: (v[0], v[1], -v[2])),
+    Row('an axis reversed', rig.value('counts', 130.0, 220.0, lambda v: (v[0], v[1], -v[2])),
         ((ERROR, 'or an axis reversed? Nothing is published'),), 2800,
         silent=((138.1, 220.0),), blind=(130.0, 138.1), recovered=220.0),
     Row('an axis reversed from the start',
-        value('counts', 0.0, 999.0, lambda v: (v[0], v[1], -v[2])),
+        rig.value('counts', 0.0, 999.0, lambda v: (v[0], v[1], -v[2])),
         ((ERROR, 'or an axis reversed? Nothing is published'),), 500, silent=((48.1, 320.0),),
         blind=(0.0, 48.1), recovered=math.inf),
     *(
@@ -166,11 +152,11 @@ SAMPLE_ROWS = [
         for share in (0.01, 0.1, 0.5)
     ),
     Row('counts lost in bursts',
-        changed('counts', 0.0, 999.0, lambda e: [e] if seconds_of(e[1]) // 7 % 2 else []),
+        rig.changed('counts', 0.0, 999.0, lambda e: [e] if rig.seconds_of(e[1]) // 7 % 2 else []),
         ((WARN, 'samples/s, calibrated for'),), 1950, recovered=300.0),
-    Row('counts twice', changed('counts', 0.0, 999.0, lambda e: [e, e]),
+    Row('counts twice', rig.changed('counts', 0.0, 999.0, lambda e: [e, e]),
         ((WARN, 'samples out of order, dropped'),), N_SAMPLES),
-    Row('counts out of order', shuffled('counts', 0.0, 999.0),
+    Row('counts out of order', rig.shuffled('counts', 0.0, 999.0),
         ((WARN, 'samples out of order, dropped'),), N_SAMPLES // 2, recovered=300.0),
     Row('counts 20 times as fast', faster(150.0, 160.0, 20),
         ((ERROR, 'samples too fast for their conversion cycle, dropped'),), 3800,
@@ -179,13 +165,13 @@ SAMPLE_ROWS = [
 
 TIME_ROWS = [
     Row('a gap of 10 min',
-        chain(stop('counts', 130, 730), stop('board', 130, 730), stop('case', 130, 730)), (),
-        2300, recovered=820.0, source=bag(duration_s=850.0)),
-    Row('counts alone pause for 2 min', stop('counts', 80.0, 200.0), (), 2500),
+        rig.chain(*(rig.stop(topic, 130, 730) for topic in ('counts', 'board', 'case'))), (), 2300,
+        recovered=820.0, source=rig.bag(duration_s=850.0)),
+    Row('counts alone pause for 2 min', rig.stop('counts', 80.0, 200.0), (), 2500),
     Row('time jumps back', half_time(100.0),
         ((WARN, 'jumps of time backwards, estimators reset'),), 5000),
     *(
-        Row(f'time jumps forward by {word}{where}', shifted(at, by), (), 3995, shift=(at, by),
+        Row(f'time jumps forward by {word}{where}', rig.shifted(at, by), (), 3995, shift=(at, by),
             recovered=at + 80.0)
         for word, by in (('10 min', 600.0), ('a day', 86400.0))
         for where, at in ((' in the ramp', 90.0), (' in the soak', 220.0))
@@ -202,6 +188,6 @@ ROWS = [*SENSOR_ROWS, *BOTH_ROWS, *SAMPLE_ROWS, *TIME_ROWS]
 
 
 def true_seconds(row, stamps):
-    seconds = (stamps - START_NS) * 1e-9
+    seconds = (stamps - rig.START_NS) * 1e-9
     at, by = row.shift
     return np.where(seconds >= at + by, seconds - by, seconds)

@@ -16,36 +16,27 @@ PROGRAM = parse_cyclogram('20 2min, 45@5 8min, 5@5 10min')
 OPTIONS = FleetOptions(FitOptions(gravity=STANDARD_GRAVITY, model='golovach'), certificates=False)
 
 
-def write_unit(
-    folder,
-    seed,
-    n_bags=6,
-    *,
-    unit=None,
-    serial=None,
-    test=0,
-    metadata=None,
-    names=None,
-    is_exchanged=False,
-    counts='accel/counts',
-):
-    """Simulate a test with one bag per position; `is_exchanged` exchanges the thermometers."""
+def write_unit(folder, seed, n_bags=6, *, unit=None, names=None, is_exchanged=False, **options):
+    """
+    Simulate a test with a bag per position; `is_exchanged` exchanges the thermometers. `options`:
+    `serial` and further `metadata` of the bags, and `counts`, the topic of the samples.
+    """
     unit = unit or preset('mems', seed)
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for number, up in enumerate(positions(n_bags, 1)):
         run = simulate(
-            unit, PROGRAM, up, rate_hz=1.0, temperature_rate_hz=0.5,
-            seed=1000 * seed + 100 * test + number,
-            start_ns=1_767_225_600_000_000_000 + test * 30 * 86400 * 10**9,
+            unit, PROGRAM, up, rate_hz=1.0, temperature_rate_hz=0.5, seed=1000 * seed + number,
+            start_ns=1_767_225_600_000_000_000,
         )  # fmt: skip
         path = folder / (names[number] if names else f'{number + 1:02d}.mcap')
-        facts = {'serial': unit.serial if serial is None else serial, **(metadata or {})}
+        facts = {'serial': options.get('serial', unit.serial), **options.get('metadata', {})}
         with BagWriter(path, metadata={k: v for k, v in facts.items() if v}) as bag:
             board, case = ('case', 'board') if is_exchanged else ('board', 'case')
             bag.write_temperature(f'temperature/{board}', run.board_stamp_ns, run.board)
             bag.write_temperature(f'temperature/{case}', run.case_stamp_ns, run.case)
-            bag.write_counts(counts, run.accel_stamp_ns, run.counts.astype(float), 'imu_link')
+            topic = options.get('counts', 'accel/counts')
+            bag.write_counts(topic, run.accel_stamp_ns, run.counts.astype(float), 'imu_link')
         paths.append(path)
     return paths
 

@@ -33,10 +33,8 @@ class NodeProcess:
         # Run this source tree, not an installed package.
         paths = [str(Path(__file__).resolve().parents[1]), os.environ.get('PYTHONPATH', '')]
         path = os.pathsep.join(filter(None, paths))
-        environment = {**os.environ, **self._environment, 'PYTHONPATH': path}
-        self.process = subprocess.Popen(
-            command, stdout=self._log, stderr=self._log, env=environment
-        )
+        given = {**os.environ, **self._environment, 'PYTHONPATH': path}
+        self.process = subprocess.Popen(command, stdout=self._log, stderr=self._log, env=given)
         return self
 
     def __exit__(self, *_):

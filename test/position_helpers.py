@@ -59,9 +59,8 @@ class Rest:
     def source(self, n_blocks=1, with_gyro=False, name='rest'):
         stamp_ns = START_NS + np.rint(self.time * 1e9).astype(np.int64)
         board_ns = START_NS + np.rint(self.board_time * 1e9).astype(np.int64)
-        board = self.temperature(self.board_time) + 0.02 * np.random.default_rng(
-            7
-        ).standard_normal(len(self.board_time))
+        noise = np.random.default_rng(7).standard_normal(len(self.board_time))
+        board = self.temperature(self.board_time) + 0.02 * noise
         board = np.rint(board / self.quantum) * self.quantum if self.quantum else board
         cuts = np.linspace(0, len(stamp_ns), n_blocks + 1).astype(int)
         blocks = []

@@ -68,9 +68,7 @@ def refresh():
 
         page = CLI_PAGE.read_text(encoding='utf-8')
         text = re.sub(r'^```console\n(.*?)^```', run, page, flags=re.MULTILINE | re.DOTALL)
-        shutil.copy(
-            Path(folder, 'out', 'figures', '4_gravity.png'), ROOT / 'docs/images/gravity.png'
-        )
+        shutil.copy(Path(folder, 'out/figures/4_gravity.png'), ROOT / 'docs/images/gravity.png')
     CLI_PAGE.write_text(text, encoding='utf-8')
 
 

@@ -6,13 +6,15 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
-from mcap.writer import CompressionType, IndexType
+from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Reader as Reader2
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
+
+from thermo_comp.recording.blocks import ImuColumns
 
 VECTOR = 'geometry_msgs/msg/Vector3Stamped'
 IMU = 'sensor_msgs/msg/Imu'
@@ -71,39 +73,21 @@ def serialize(message):
     return bytes(typestore().serialize_cdr(to_ros(message), kind, little_endian=message.is_little))
 
 
-def write_mcap(
-    path,
-    messages,
-    *,
-    chunk_size=1 << 20,
-    compression='none',
-    use_chunking=True,
-    index_types=IndexType.ALL,
-    use_statistics=True,
-    repeat=True,
-    enable_crcs=True,
-):
+def write_mcap(path, messages, *, compression='none', repeat=True, **options):
+    """Write an MCAP file; `options`: arguments of `mcap.writer.Writer`, such as `chunk_size`."""
+    options |= {'repeat_channels': repeat, 'repeat_schemas': repeat}
     with path.open('wb') as file:
-        writer = McapWriter(
-            file, chunk_size=chunk_size, compression=getattr(CompressionType, compression.upper()),
-            index_types=index_types, use_chunking=use_chunking, use_statistics=use_statistics,
-            repeat_channels=repeat, repeat_schemas=repeat, enable_crcs=enable_crcs,
-        )  # fmt: skip
+        writer = McapWriter(file, compression=CompressionType[compression.upper()], **options)
         writer.start('ros2')
-        channels = {}
-        schemas = {}
+        channels, schemas = {}, {}
         for message in messages:
-            kind = TYPES[message.topic]
+            topic, log_ns, kind = message.topic, message.log_ns, TYPES[message.topic]
             if kind not in schemas:
                 text = typestore().generate_msgdef(kind, ros_version=2)[0]
                 schemas[kind] = writer.register_schema(kind, 'ros2msg', text.encode())
-            if message.topic not in channels:
-                channels[message.topic] = writer.register_channel(
-                    message.topic, 'cdr', schemas[kind]
-                )
-            writer.add_message(
-                channels[message.topic], message.log_ns, serialize(message), message.log_ns
-            )
+            if topic not in channels:
+                channels[topic] = writer.register_channel(topic, 'cdr', schemas[kind])
+            writer.add_message(channels[topic], log_ns, serialize(message), log_ns)
         writer.finish()
 
 
@@ -113,27 +97,29 @@ def write_rosbag2(path, messages, *, storage='mcap', compression=''):
     if compression:
         writer.set_compression(getattr(CompressionMode, compression), CompressionFormat.ZSTD)
     with writer:
-        connections = {}
+        links = {}
         for message in messages:
-            if message.topic not in connections:
-                connections[message.topic] = writer.add_connection(
-                    message.topic, TYPES[message.topic], typestore=typestore()
-                )
-            writer.write(connections[message.topic], message.log_ns, serialize(message))
+            topic = message.topic
+            if topic not in links:
+                links[topic] = writer.add_connection(topic, TYPES[topic], typestore=typestore())
+            writer.write(links[topic], message.log_ns, serialize(message))
 
 
 def write_rosbag1(path, messages):
     store = typestore(1)
     with Writer1(path) as writer:
-        connections = {}
+        links = {}
         for message in messages:
-            kind = TYPES[message.topic]
-            if message.topic not in connections:
-                connections[message.topic] = writer.add_connection(
-                    message.topic, kind, typestore=store
-                )
+            topic, kind = message.topic, TYPES[message.topic]
+            if topic not in links:
+                links[topic] = writer.add_connection(topic, kind, typestore=store)
             data = store.serialize_ros1(to_ros(message, 1), kind)
-            writer.write(connections[message.topic], message.log_ns, data)
+            writer.write(links[topic], message.log_ns, data)
+
+
+def imu_columns(rng, n):
+    """Draw the columns of n Imu messages other than the linear acceleration."""
+    return ImuColumns(*(rng.standard_normal((n, width)) for width in (4, 9, 3, 9, 9)))
 
 
 def read_with_rosbags(path):
@@ -187,9 +173,8 @@ def regular_messages(n=40, accel=ACCEL, every=8):
         time_ns = START_NS + 2_500_000 * row
         if row % every == 0:
             for topic, celsius in ((BOARD, 20.0), (CASE, 25.0)):
-                messages.append(
-                    Message(topic, time_ns, time_ns - 900, 'board', (celsius + row, 0.0))
-                )
+                reading = (celsius + row, 0.0)
+                messages.append(Message(topic, time_ns, time_ns - 900, 'board', reading))
         numbers = tuple(float(row * width + k) for k in range(width))
         messages.append(Message(accel, time_ns, time_ns - 1000, 'accel', numbers))
     return messages

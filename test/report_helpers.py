@@ -30,7 +30,7 @@ def run(position=0):
     """Run one position of a thermostatted unit through 54 minutes of ramps and soaks."""
     return simulate(
         unit_preset('thermostatted', 1), parse_cyclogram(PROGRAM),
-        positions(N_POSITIONS, 0)[position], rate_hz=RATE_HZ, temperature_rate_hz=0.4,
+        positions(N_POSITIONS, 0)[position], rate_hz=RATE_HZ, temperature_rate_hz=0.2,
         seed=position,
     )  # fmt: skip
 
@@ -52,9 +52,8 @@ def fitted():
 def evidence():
     """Gather the data of a report, with invented left-out residuals, NaN in the last position."""
     *others, last = fitted().positions
-    left_out = [
-        replace(other, left_out_rms=rms) for other, rms in zip(others, LEFT_OUT_RMS, strict=True)
-    ]
+    pairs = zip(others, LEFT_OUT_RMS, strict=True)
+    left_out = [replace(other, left_out_rms=rms) for other, rms in pairs]
     positions = (*left_out, replace(last, left_out_rms=np.nan))
     return evidence_of_fit(replace(fitted(), positions=positions))
 

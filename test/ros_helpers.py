@@ -122,22 +122,21 @@ class Peer:
         return future.result()
 
     def set_parameters(self, **values):
-        request = SetParameters.Request(parameters=_messages(values))
+        request = SetParameters.Request(parameters=parameters_of(values))
         return self.call(SetParameters, 'thermo_comp/set_parameters', request).results
 
     def set_atomically(self, **values):
-        request = SetParametersAtomically.Request(parameters=_messages(values))
+        request = SetParametersAtomically.Request(parameters=parameters_of(values))
         name = 'thermo_comp/set_parameters_atomically'
         return self.call(SetParametersAtomically, name, request).result
 
     def describe(self, *names):
         request = DescribeParameters.Request(names=list(names))
-        return self.call(
-            DescribeParameters, 'thermo_comp/describe_parameters', request
-        ).descriptors
+        name = 'thermo_comp/describe_parameters'
+        return self.call(DescribeParameters, name, request).descriptors
 
 
-def _messages(values):
+def parameters_of(values):
     return [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
 
 

@@ -29,9 +29,8 @@ def rippled(program, seed=1, amplitude=0.1, period=300.0):
     # The sine has twelve points per period; per period its phase changes with an sd of 0.5 rad.
     time = np.arange(0.0, program.duration_s, period / 12.0)
     rng = np.random.default_rng(seed)
-    phase = rng.uniform(0.0, 2.0 * np.pi) + np.cumsum(
-        rng.normal(0.0, 0.5 / np.sqrt(12.0), len(time))
-    )
+    phase = rng.uniform(0.0, 2.0 * np.pi)
+    phase += np.cumsum(rng.normal(0.0, 0.5 / np.sqrt(12.0), len(time)))
     wave = amplitude * np.sin(phase + 2.0 * np.pi * time / period)
     both = np.union1d(time, program.time_s)
     air = np.interp(both, program.time_s, program.temperature_c)

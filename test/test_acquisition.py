@@ -64,9 +64,8 @@ def test_positions_do_not_depend_on_the_length_of_blocks(stream, seconds):
     test = Acquisition(6, 50.0)
     starts = [begin for block in stream.blocks(seconds) for begin in test.add(block)]
     # A position begins within 1.1 s after the end of a turn.
-    assert np.array(starts) * 1e-9 - START_NS * 1e-9 == pytest.approx(
-        np.array(begins[1:]) + 0.5, abs=0.6
-    )
+    seconds = np.array(starts) * 1e-9 - START_NS * 1e-9
+    assert seconds == pytest.approx(np.array(begins[1:]) + 0.5, abs=0.6)
     account = test.account()
     assert account.is_complete
     for position, up in zip(account.positions, UPS, strict=True):
@@ -76,11 +75,9 @@ def test_positions_do_not_depend_on_the_length_of_blocks(stream, seconds):
         board = position.thermometers['board']
         assert board.highest - board.lowest == pytest.approx(1.0, abs=0.15)
         assert (position.n_rests, position.reason) == (1, '')
-    board = account.thermometers['board']
-    assert (board.lowest, board.n) == (
-        20.0,
-        sum(position.thermometers['board'].n for position in account.positions),
-    )
+    board, parts = account.thermometers['board'], account.positions
+    assert board.lowest == 20.0
+    assert board.n == sum(position.thermometers['board'].n for position in parts)
     assert board.highest == pytest.approx(26.0, abs=0.1)
 
 
@@ -101,18 +98,13 @@ def test_a_position_is_good_after_the_required_time_at_rest(stream):
 
 
 def test_faults_of_a_position_are_reported(stream):
-    stream.rest((0, 0, 1), 60.0)
-    stream.turn()
-    stream.rest((1, 0, 0), 20.0)
-    stream.turn()
-    stream.rest((0, 0.03, 1), 60.0)
-    stream.turn()
-    stream.rest((0, 1, 0), 60.0, noise=15.0)
-    stream.turn()
-    stream.rest((0, -1, 0), 30.0)
-    stream.turn()
-    # The unit is turned and put back in its previous position.
-    stream.rest((0, -1, 0), 30.0)
+    # Finally the unit is turned and put back in its previous position.
+    for up, seconds, noise in (
+        *(((0, 0, 1), 60.0, 3.0), ((1, 0, 0), 20.0, 3.0), ((0, 0.03, 1), 60.0, 3.0)),
+        *(((0, 1, 0), 60.0, 15.0), ((0, -1, 0), 30.0, 3.0), ((0, -1, 0), 30.0, 3.0)),
+    ):
+        stream.rest(up, seconds, noise=noise)
+        stream.turn()
     test = Acquisition(5, 50.0)
     for block in stream.blocks(0.5):
         test.add(block)

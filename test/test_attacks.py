@@ -98,13 +98,12 @@ def test_twenty_clients_that_set_parameters_at_once_are_all_answered(peer, tmp_p
         for client in clients:
             assert client.wait_for_service(30.0)
         rng = random.Random(7)
-        choices = [
-            *(('calibration_file', str(path)) for path in (*paths, tmp_path / 'none')),
-            *(('frame_id', frame) for frame in ('a', 'b', 'x' * 300)),
-            *(('transition_time', value) for value in (0.0, 5.0, -1.0)),
-            *(('diagnostics_period', value) for value in (0.05, 1.0)),
-            *(('input', value) for value in ('imu', 'counts')),
-        ]
+        values = {
+            'calibration_file': [str(path) for path in (*paths, tmp_path / 'none')],
+            'frame_id': ['a', 'b', 'x' * 300], 'transition_time': [0.0, 5.0, -1.0],
+            'diagnostics_period': [0.05, 1.0], 'input': ['imu', 'counts'],
+        }  # fmt: skip
+        choices = [(name, value) for name, some in values.items() for value in some]
         asked = []
         for _ in range(6):
             for client in clients:
@@ -220,13 +219,10 @@ def test_damaged_autopilot_logs_are_read_or_refused_with_one_line(kind, tmp_path
     rng = np.random.default_rng(11)
     path = tmp_path / f'log.{"ulg" if kind == "ulog" else "bin"}'
     if kind == 'ulog':
-        from test_convert_ulog import write_two_imus
-
-        write_two_imus(path, rng)
+        from test_convert_ulog import write_two_imus as write
     else:
-        from test_convert_dataflash import write_new
-
-        write_new(path, rng)
+        from test_convert_dataflash import write_new as write
+    write(path, rng)
     good = path.read_bytes()
     n_read, lines = 0, []
     for number in range(150):

@@ -17,6 +17,7 @@ from sensor_msgs.msg import Imu, Temperature
 from thermo_comp.ros.conversion import SampleConverter, read_temperature
 
 floats = st.floats(allow_nan=True, allow_infinity=True, width=64)
+STAMPS = {'sec': st.integers(-(2**31), 2**31 - 1), 'nanosec': st.integers(0, 2**32 - 1)}
 # Frame names without NUL, which ends a string in CDR, and without characters outside UTF-8.
 frames = st.text(st.characters(codec='utf-8', exclude_characters='\0'), max_size=12)
 
@@ -37,6 +38,9 @@ def pack(order, values):
     return struct.pack(f'{order}{len(values)}d', *values)
 
 
+GOOD = cdr('<', (3, 4), 'imu', [1.0, 2.0, 3.0])
+
+
 def doubles(data):
     """Return each of the 37 values of a serialized Imu as bytes: a NaN does not equal itself."""
     body = data[-37 * 8 :]
@@ -49,12 +53,9 @@ def convert(converter, *messages):
 
 
 @given(
-    order=st.sampled_from('<>'),
-    sec=st.integers(-(2**31), 2**31 - 1),
-    nanosec=st.integers(0, 2**32 - 1),
-    frame=frames,
-    values=st.lists(floats, min_size=3, max_size=3),
-)
+    order=st.sampled_from('<>'), frame=frames, values=st.lists(floats, min_size=3, max_size=3),
+    **STAMPS,
+)  # fmt: skip
 def test_counts_are_converted_to_an_imu_message(order, sec, nanosec, frame, values):
     converter = SampleConverter(Vector3Stamped)
     written = convert(converter, *[cdr(order, (sec, nanosec), frame, values)] * 2)
@@ -76,11 +77,9 @@ def test_counts_are_converted_to_an_imu_message(order, sec, nanosec, frame, valu
 
 
 @given(
-    order=st.sampled_from('<>'),
-    frame=frames,
-    override=st.sampled_from(['', 'other_link']),
+    order=st.sampled_from('<>'), frame=frames, override=st.sampled_from(['', 'other_link']),
     values=st.lists(floats, min_size=37, max_size=37),
-)
+)  # fmt: skip
 def test_imu_fields_except_acceleration_are_copied_bit_for_bit(order, frame, override, values):
     converter = SampleConverter(Imu, override)
     (written,) = convert(converter, cdr(order, (5, 7), frame, values))
@@ -95,9 +94,8 @@ def test_the_byte_swap_keeps_the_bits_of_a_signalling_nan():
     # A processor may turn a signalling NaN into a quiet NaN when it loads it as a float64.
     payload = 0x7FF0_0000_0000_0001
     values = struct.pack('>37Q', *[payload] * 37)
-    message = cdr('>', (1, 2), 'imu', [])[:] + values
-    converter = SampleConverter(Imu)
-    written = converter.convert(message, lambda *_: tuple(map(float, range(9))))
+    message = cdr('>', (1, 2), 'imu', []) + values
+    written = SampleConverter(Imu).convert(message, lambda *_: tuple(map(float, range(9))))
     assert written is not None
     assert doubles(written)[:25] == [struct.pack('<Q', payload)] * 25
 
@@ -138,8 +136,7 @@ def test_messages_with_extra_bytes_are_converted_by_rclpy(kind, override):
 )  # fmt: skip
 def test_unreadable_messages_are_counted_and_later_messages_converted(bad):
     converter = SampleConverter(Vector3Stamped)
-    good = cdr('<', (3, 4), 'imu', [1.0, 2.0, 3.0])
-    written = convert(converter, good, bad, good)
+    written = convert(converter, GOOD, bad, GOOD)
     assert len(written) == 2
     assert written[0] == written[1]
     assert converter.traffic.n_malformed == 1
@@ -149,15 +146,13 @@ def test_an_unreadable_first_message_of_any_length_is_counted():
     # WHY: the converter took a first message of one byte for a valid one (found by fuzzing).
     for n in range(40):
         converter = SampleConverter(Vector3Stamped)
-        good = cdr('<', (3, 4), 'imu', [1.0, 2.0, 3.0])
-        assert len(convert(converter, bytes(n), good)) == 1
+        assert len(convert(converter, bytes(n), GOOD)) == 1
         assert converter.traffic.n_malformed == 1
 
 
 def test_samples_without_a_correction_give_no_message():
     converter = SampleConverter(Vector3Stamped)
-    good = cdr('<', (3, 4), 'imu', [1.0, 2.0, 3.0])
-    for message in (good, good + bytes(8)):
+    for message in (GOOD, GOOD + bytes(8)):
         assert converter.convert(message, lambda *_: None) is None
     assert converter.last_result is None
 
@@ -165,12 +160,8 @@ def test_samples_without_a_correction_give_no_message():
 @given(
     st.binary(max_size=80)
     | st.builds(
-        lambda order, stamp, frame, value, cut, tail: (
-            cdr(order, stamp, frame, [value, 0.0])[: 64 - cut] + tail
-        ),
-        st.sampled_from('<>'),
-        st.tuples(st.integers(-(2**31), 2**31 - 1), st.integers(0, 2**32 - 1)),
-        st.text(max_size=12),
+        lambda head, value, cut, tail: cdr(*head, [value, 0.0])[: 64 - cut] + tail,
+        st.tuples(st.sampled_from('<>'), st.tuples(*STAMPS.values()), st.text(max_size=12)),
         st.floats(),
         st.integers(0, 40),
         st.sampled_from([b'', b'\0\0\0\0', bytes(8)]),

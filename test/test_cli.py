@@ -17,6 +17,7 @@ import typer
 from builders import rich_calibration
 from conftest import ROOT, parsed, ran
 
+import thermo_comp
 from thermo_comp.cli import output
 from thermo_comp.cli.app import split_arguments
 from thermo_comp.recording.reader import inspect_recording, read_recording
@@ -39,11 +40,8 @@ def unit(bag):
     return bag.parent / 'unit.yaml'
 
 
-class TestHelp:
-    def test_the_option_version_prints_the_version(self, cli):
-        from thermo_comp import __version__
-
-        assert cli('--version').stdout == f'thermo_comp {__version__}\n'
+def test_the_option_version_prints_the_version(cli):
+    assert cli('--version').stdout == f'thermo_comp {thermo_comp.__version__}\n'
 
 
 class TestOutput:
@@ -118,9 +116,8 @@ class TestPlay:
         finished = cli(*arguments, '--ros-args', '-r', '__ns:=/here')
         data = parsed(finished.stdout)
         info = inspect_recording(bag)
-        assert data['messages'] == {
-            f'/here{name}': count for name, (_, count) in info.topics.items()
-        }
+        counts = {f'/here{name}': count for name, (_, count) in info.topics.items()}
+        assert data['messages'] == counts
         assert data['unheard'] == sorted(data['unheard'])
         assert '/here/accel/counts had no subscriber' in finished.stderr
 
@@ -177,9 +174,8 @@ class TestTopics:
     @pytest.fixture
     def named(self, tmp_path):
         with BagWriter(tmp_path / 'bag') as writer:
-            writer.write_counts(
-                '/imu/raw', np.arange(1, 1001) * 10_000_000, np.arange(3000.0).reshape(-1, 3)
-            )
+            counts = np.arange(3000.0).reshape(-1, 3)
+            writer.write_counts('/imu/raw', np.arange(1, 1001) * 10_000_000, counts)
             for row, topic in enumerate(('/t1', '/t2', '/t3')):
                 writer.write_temperature(topic, [10_000_000], [20.0 + row])
         return tmp_path / 'bag'

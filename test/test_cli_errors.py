@@ -57,10 +57,8 @@ class TestUsage:
             (('replay', 'a', '-o', 'b', '-c', 'c', '--temperature-timeout', '0'),
              r'--temperature-timeout must be greater than 0'),
             (('fit', 'a', '-o', 'b'), r'give --gravity, or --latitude and --height'),
-            (
-                ('fit', 'a', '-o', 'b', '--gravity', '9.81', '--latitude', '48'),
-                r'give --gravity, or --latitude and --height, not both',
-            ),
+            (('fit', 'a', '-o', 'b', '--gravity', '9.81', '--latitude', '48'),
+             r'give --gravity, or --latitude and --height, not both'),
             (('fit', 'a', '-o', 'b', '--gravity', '9.81', '--reference-temperature', 'nan'),
              r'--reference-temperature: must be at least -273.15 degC, got nan'),
             (('play', 'a', '--rate', 'inf'),
@@ -133,29 +131,21 @@ class TestBags:
 
     def test_a_bag_of_another_unit_is_refused(self, cli, unit, tmp_path):
         path = bag(tmp_path / 'bag', serial='T-2')
-        self.replayed(
-            cli, unit, path, r'unit.serial: this calibration is of unit T-1.*of unit T-2'
-        )
+        self.replayed(cli, unit, path, r'serial: this calibration is of unit T-1.*of unit T-2')
         refused(cli, 1, r'is of unit T-1', 'evaluate', path, '-c', unit)
 
 
 class TestFits:
     def test_unknown_groups_and_models_are_refused(self, cli, tmp_path):
-        arguments = ('fit', bag(tmp_path / 'a.mcap'), '-o', tmp_path / 'new.yaml')
-        arguments += ('--gravity', '9.80665')
-        refused(
-            cli, 2, r'--groups must be one of curve, .*memory', *arguments, '--groups', 'memory'
-        )
-        refused(cli, 2, r'quadratic', *arguments, '--model', 'quadratic')
+        given = 'fit', bag(tmp_path / 'a.mcap'), '-o', tmp_path / 'new.yaml', '--gravity', '9.8'
+        refused(cli, 2, r'--groups must be one of curve, .*memory', *given, '--groups', 'memory')
+        refused(cli, 2, r'quadratic', *given, '--model', 'quadratic')
         assert not (tmp_path / 'new.yaml').exists()
 
     def test_bags_of_two_units_are_refused(self, cli, tmp_path):
         paths = [bag(tmp_path / f'{i}.mcap', serial=f'T-{i}') for i in range(2)]
-        arguments = ('-o', tmp_path / 'new.yaml', '--gravity', '9.80665')
-        refused(
-            cli, 1, r'of different units: .*0.mcap of T-0, .*1.mcap of T-1', 'fit', *paths,
-            *arguments,
-        )  # fmt: skip
+        words = 'fit', *paths, '-o', tmp_path / 'new.yaml', '--gravity', '9.80665'
+        refused(cli, 1, r'of different units: .*0.mcap of T-0, .*1.mcap of T-1', *words)
 
 
 class TestEvaluations:
@@ -178,9 +168,8 @@ class TestEvaluations:
         right = axis_set(delta=30.0)
         sets = regime_set(right, right, right)
         axes = equal_axes(300.0, -30.0)
-        save_calibration(
-            calibration(axes=axes, static=sets, dynamic=sets), tmp_path / 'right.yaml'
-        )
+        valid = calibration(axes=axes, static=sets, dynamic=sets)
+        save_calibration(valid, tmp_path / 'right.yaml')
         arguments = ('evaluate', path, '-c', tmp_path / 'right.yaml')
         assert 'no claim: ' in cli(*arguments, code=1).stdout
         assert 'valid: ' in cli(*arguments, '--tolerance', '1mg').stdout

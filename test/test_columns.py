@@ -3,6 +3,7 @@
 """The columns of the thermal response have the right number, lags, values and slopes."""
 
 import math
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -31,10 +32,7 @@ WIDE = {'range': UNBOUNDED}
 
 
 def by_group(columns):
-    groups = {}
-    for column in columns:
-        groups.setdefault(column.group, []).append(column)
-    return {name: len(group) for name, group in groups.items()}
+    return Counter(column.group for column in columns)
 
 
 def test_the_bank_of_columns_has_the_expected_number_per_group():
@@ -42,13 +40,11 @@ def test_the_bank_of_columns_has_the_expected_number_per_group():
     assert pytest.approx([60.0 * 2.0 ** (k / 2) for k in range(15)]) == FINE_TAUS
     assert by_group(bank()) == {
         'gradient': 1, 'board': 15, 'gradient_lag': 15, 'product': 16,
-        'gradient_x_temperature': 9, 'square': 24,
-        'gradient_even': 21, 'play': 20,
+        'gradient_x_temperature': 9, 'square': 24, 'gradient_even': 21, 'play': 20,
     }  # fmt: skip
     assert by_group(bank(('case', 'tip'))) == {
         'gradient': 2, 'board': 15, 'gradient_lag': 30, 'product': 16,
-        'gradient_x_temperature': 18, 'square': 24,
-        'gradient_even': 42, 'play': 20,
+        'gradient_x_temperature': 18, 'square': 24, 'gradient_even': 42, 'play': 20,
     }  # fmt: skip
     assert len(set(bank(('case', 'tip')))) == len(bank(('case', 'tip')))
     # Knees over any lagged temperature are within the temperature span of the bags.
@@ -77,11 +73,11 @@ def test_gradient_even_about_rest_is_an_even_function_of_gradient_less_rest():
 def test_the_memory_has_the_lags_and_plays_that_the_columns_need():
     spec = memory_of(bank(('case', 'tip')), ('case', 'tip'))
     assert spec.inputs == ('board', 'case', 'tip')
-    taus = {
-        name: tuple(lag.tau_s for lag in spec.lags if lag.input == name) for name in spec.inputs
-    }
-    assert taus['board'] == tuple(sorted((*FINE_TAUS, 450.0, 900.0, 1800.0)))
-    assert taus['case'] == taus['tip'] == FINE_TAUS
+    board, case, tip = (
+        tuple(lag.tau_s for lag in spec.lags if lag.input == name) for name in spec.inputs
+    )
+    assert board == tuple(sorted((*FINE_TAUS, 450.0, 900.0, 1800.0)))
+    assert case == tip == FINE_TAUS
     assert len(spec.plays) == 20
     assert memory_of(()) == MemorySpec()
     with pytest.raises(ValueError, match="one of \\('case',\\), got tip"):
@@ -111,9 +107,8 @@ def test_the_value_of_each_kind_of_column_agrees_with_hand_numbers():
     spec = memory_of(columns, ('case', 'tip'))
     layout = StateLayout(spec)
     # Board, its variance, rate, weight, unknown regime; 2 gradients and 2 lags, variances; play.
-    state = np.array(
-        [[23.0, 0.0, 0.01, 0.25, 0.0, 1.2, 0.0, -0.7, 0.0, 0.5, 0.0, -0.3, 0.0, 0.1]]
-    ).T
+    state = [23.0, 0.0, 0.01, 0.25, 0.0, 1.2, 0.0, -0.7, 0.0, 0.5, 0.0, -0.3, 0.0, 0.1]
+    state = np.array([state]).T
     assert layout.width == len(state)
     values = ColumnTable(columns, spec, 20.0).values(state)[:, 0]
     expected = [

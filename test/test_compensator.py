@@ -69,8 +69,7 @@ def test_a_corrected_sample_agrees_with_the_formula_of_the_static_set():
 #: Calibration of all examples; no example changes it.
 RICH = rich_calibration()
 
-#: Values of a few samples: not finite, limits of a 16-bit converter, zeros, the smallest positive
-#: number.
+#: Values of a few samples: not finite, limits of 16 bits, zeros, the least positive number.
 STRANGE = (math.nan, math.inf, -math.inf, 32767.0, -32768.0, 0.0, -0.0, 5e-324)
 
 
@@ -169,9 +168,7 @@ def test_samples_before_the_first_temperature_or_20_s_after_the_last_are_not_pub
     assert (counters.n_out, counters.n_no_temperature, counters.n_stale) == (4, 1, 1)
 
 
-@pytest.mark.parametrize(
-    'run', [lambda *given: stream(*given)[1], lambda *given: batch(*given).index.tolist()]
-)
+@pytest.mark.parametrize('run', [lambda *given: stream(*given)[1], lambda *a: [*batch(*a).index]])
 def test_a_sample_with_a_stamp_20_s_ahead_is_dropped_unless_the_next_stamp_agrees(run):
     # WHY: after one stamp 20 s ahead all later samples counted as late, and lags were reset.
     leap, step = 20 * SECOND_NS, SECOND_NS // 100
@@ -355,21 +352,21 @@ def test_output_that_is_not_finite_is_never_published(monkeypatch, bad):
 
 
 def test_a_switch_of_sets_causes_no_step():
-    # The output changes by 5 counts = 1.7 mg within 300 s, at most 0.28 ug per sample at 20 Hz.
+    # The output changes by 5 counts = 1.7 mg within 300 s, at most 0.57 ug per sample at 10 Hz.
     unit = calibration(dynamic=regime_set(axis_set(delta=5.0)))
     compensator = Compensator(unit, UNCHECKED)
     outputs = []
-    for k in range(40_000):
-        stamp = k * 50_000_000
-        if k % 20 == 0:
-            ramp = max(k / 20.0 - 1200.0, 0.0) / 60.0
+    for k in range(20_000):
+        stamp = k * 100_000_000
+        if k % 10 == 0:
+            ramp = max(k / 10.0 - 1200.0, 0.0) / 60.0
             compensator.push('board', stamp, 20.0 + 0.3 * ramp)
             compensator.push('case', stamp, 20.0 + ramp)
         outputs.append(compensator.process(stamp, 0.0, 0.0, 1.0)[0])
     steps = np.abs(np.diff(outputs))
     assert outputs[0] == 0.0
     assert outputs[-1] == pytest.approx(-5.0 / 300.0)
-    assert steps.max() <= 5.0 / 300.0 / 6000.0 * 1.001
+    assert steps.max() <= 5.0 / 300.0 / 3000.0 * 1.001
 
 
 @pytest.mark.parametrize(
@@ -383,20 +380,14 @@ def test_a_transition_time_above_0_limits_the_change_to_1_ug_per_s(delta, given_
     assert compensator.thermal.tracker.config.transition_time_s == pytest.approx(expected_s)
 
 
-def test_a_swap_of_calibrations_takes_effect_between_two_samples():
+def test_a_swap_of_calibrations_takes_effect_between_two_samples_and_loses_no_sample():
     compensator = Compensator(calibration())
     warm(compensator, until_s=5)
     before = compensator.process(5 * SECOND_NS, 300.0, 0.0, 1.0)
     compensator.swap(calibration(axes=equal_axes(150.0)))
     after = compensator.process(5 * SECOND_NS + 1, 300.0, 0.0, 1.0)
     assert (before[0], after[0]) == (1.0, 2.0)
-
-
-def test_a_swap_to_another_detector_loses_no_sample():
-    compensator = Compensator(calibration())
-    warm(compensator, until_s=5)
-    assert compensator.process(5 * SECOND_NS, 300.0, 0.0, 1.0) is not None
+    # The detector of this calibration is another one, whose state is not settled.
     compensator.swap(rich_calibration())
-    row = compensator.process(5 * SECOND_NS + 1, 300.0, 0.0, 1.0)
-    assert row is not None
+    assert compensator.process(5 * SECOND_NS + 2, 300.0, 0.0, 1.0) is not None
     assert not compensator.status().is_settled

@@ -20,17 +20,12 @@ from thermo_comp.unit.schema import build
 def table(path, n=400, scale=1.0):
     """Write a log of a unit at rest; temperature cells repeat the last reading."""
     rng = np.random.default_rng(1)
-    columns = {
-        'ms': 1000 + 10 * np.arange(n),
-        'ax': np.round(scale * 0.6 + 1e-3 * scale * rng.standard_normal(n), 6),
-        'ay': np.round(1e-3 * scale * rng.standard_normal(n), 6),
-        'az': np.round(scale * 0.8 + 1e-3 * scale * rng.standard_normal(n), 6),
-        'wx': np.round(rng.standard_normal(n), 3),
-        'wy': np.round(rng.standard_normal(n), 3),
-        'wz': np.round(rng.standard_normal(n), 3),
-        'case': 20.0 + 0.5 * (np.arange(n) // 100),
-        'board': 25.0 + 0.125 * (np.arange(n) // 40),
-    }
+    columns = {'ms': 1000 + 10 * np.arange(n)}
+    for axis, up in (('ax', 0.6), ('ay', 0.0), ('az', 0.8)):
+        columns[axis] = np.round(scale * up + 1e-3 * scale * rng.standard_normal(n), 6)
+    columns |= {axis: np.round(rng.standard_normal(n), 3) for axis in ('wx', 'wy', 'wz')}
+    columns['case'] = 20.0 + 0.5 * (np.arange(n) // 100)
+    columns['board'] = 25.0 + 0.125 * (np.arange(n) // 40)
     lines = [','.join(columns)]
     lines += [','.join(map(repr, map(float, row))) for row in zip(*columns.values(), strict=True)]
     path.write_text('\n'.join(lines) + '\n')
@@ -86,9 +81,8 @@ def test_a_bag_converted_from_a_table_has_the_values_of_the_table(tmp_path):
 def test_counts_with_a_stated_sensitivity_become_imu_messages(tmp_path):
     path, columns = table(tmp_path / 'log.csv', scale=2048.0)
     accel = {'columns': ['ax', 'ay', 'az'], 'unit': 'counts', 'output': 'imu'}
-    write_log(
-        table_log(path, column_map(accel={**accel, 'counts_per_g': 2048.0})), tmp_path / 'bag'
-    )
+    right = column_map(accel={**accel, 'counts_per_g': 2048.0})
+    write_log(table_log(path, right), tmp_path / 'bag')
     block = read_recording(tmp_path / 'bag').columns
     np.testing.assert_allclose(block.accel[:, 0], columns['ax'] * STANDARD_GRAVITY / 2048.0)
     # A sensitivity that contradicts |a| at rest is refused.
@@ -100,14 +94,9 @@ def test_counts_with_a_stated_sensitivity_become_imu_messages(tmp_path):
 
 def test_an_offset_of_raw_words_is_subtracted(tmp_path):
     path, columns = table(tmp_path / 'log.csv', scale=2048.0)
-    rows = path.read_text().splitlines()
-    at = [rows[0].split(',').index(name) for name in ('ax', 'ay', 'az')]
-    for i, row in enumerate(rows[1:], 1):
-        cells = row.split(',')
-        for k in at:
-            cells[k] = repr(float(cells[k]) + 32768.0)
-        rows[i] = ','.join(cells)
-    path.write_text('\n'.join(rows) + '\n')
+    rows = np.loadtxt(path, delimiter=',', skiprows=1)
+    rows[:, 1:4] += 32768.0
+    np.savetxt(path, rows, '%.17g', ',', header=','.join(columns), comments='')
     accel = {'columns': ['ax', 'ay', 'az'], 'unit': 'counts', 'output': 'counts'}
     accel |= {'counts_per_g': 2048.0, 'clip': [0, 65535]}
     with pytest.raises(RecordingError, match='is there an `offset`'):
@@ -156,8 +145,7 @@ def test_readings_stay_among_samples_after_a_restart_of_the_clock(tmp_path):
 
 
 def test_readings_of_minus_127_degc_are_left_out(tmp_path):
-    # WHY: 46 readings of -127 degC (DS18B20 without contact) increased the error of a fit from
-    # 0.02 to 0.68 mg.
+    # WHY: 46 readings of -127 degC (DS18B20 without contact) increased a fit's error to 0.68 mg.
     path, _ = table(tmp_path / 'log.csv')
     lines = path.read_text().splitlines()
     for k in (50, 51, 300):
@@ -218,18 +206,18 @@ def test_the_bag_does_not_depend_on_the_number_of_rows_in_a_block(tmp_path, monk
 
 
 @pytest.mark.parametrize(
-    ('unit', 'celsius'), [('K', 300.0), ('degF', 212.0), ('raw', 160.0), ('degC', 30.0)]
+    ('unit', 'reading', 'celsius'),
+    # The unit `raw` has counts of 1/16 K above 20 degC.
+    [('K', 300, 26.85), ('degF', 212, 100.0), ('raw', 160, 30.0), ('degC', 30, 30.0)],
 )
-def test_temperatures_of_any_unit_become_degc(tmp_path, unit, celsius):
+def test_temperatures_of_any_unit_become_degc(tmp_path, unit, reading, celsius):
     path, _ = table(tmp_path / 'log.csv')
     raw = {'degc_per_count': 0.0625, 'degc_at_zero': 20.0} if unit == 'raw' else {}
-    text = path.read_text().replace(',25.', f',{celsius:g}.')
-    path.write_text(text)
+    path.write_text(path.read_text().replace(',25.', f',{reading}.'))
     board = {'column': 'board', 'unit': unit, **raw}
     write_log(table_log(path, column_map(board=board)), tmp_path / 'bag')
     first = float(read_recording(tmp_path / 'bag').columns.temperatures['board'].celsius[0])
-    # The readings are 300 K, 212 degF, 160 counts of 1/16 K above 20 degC, and 30 degC.
-    assert first == pytest.approx({'K': 26.85, 'degF': 100.0, 'raw': 30.0, 'degC': 30.0}[unit])
+    assert first == pytest.approx(celsius)
 
 
 def test_implausible_temperatures_are_refused(tmp_path):
@@ -266,13 +254,10 @@ class TestThinning:
 
 class TestColumnMap:
     def write(self, tmp_path, **changes):
-        data = {
-            'stamp': {'column': 't', 'unit': 's'},
-            'accel': {'columns': ['x', 'y', 'z'], 'unit': 'g', 'output': 'imu'},
-        }
-        path = tmp_path / 'map.yaml'
-        path.write_text(yaml.safe_dump({**data, **changes}))
-        return path
+        accel = {'columns': ['x', 'y', 'z'], 'unit': 'g', 'output': 'imu'}
+        data = {'stamp': {'column': 't', 'unit': 's'}, 'accel': accel, **changes}
+        (tmp_path / 'map.yaml').write_text(yaml.safe_dump(data))
+        return tmp_path / 'map.yaml'
 
     def test_shipped_column_maps_are_valid(self):
         paths = sorted((ROOT / 'config' / 'columns').glob('*.yaml'))
@@ -343,9 +328,8 @@ class TestCommand:
         printed = cli(*arguments).stdout
         assert '400 rows, 4.0 s at 100 Hz' in printed
         assert '400 imu/uncompensated' in printed
-        assert cli(*arguments, code=1).stderr == (
-            f'thermo_comp: error: {tmp_path / "bag"}: exists already; --force overwrites it\n'
-        )
+        text = f'thermo_comp: error: {tmp_path}/bag: exists already; --force overwrites it\n'
+        assert cli(*arguments, code=1).stderr == text
         data = json.loads(cli(*arguments, '--force', '--json').stdout)
         assert data['accel_messages'] == 400
         assert data['stillness']['moving_ns'] == []

@@ -31,9 +31,8 @@ class DataflashWriter:
         self._format(0x80, 'FMT', 89, 'BBnNZ', 'Type,Length,Name,Format,Columns')
 
     def _format(self, number, name, length, layout, columns):
-        self.body += b'\xa3\x95\x80' + struct.pack(
-            '<BB4s16s64s', number, length, name.encode(), layout.encode(), columns.encode()
-        )
+        texts = (text.encode() for text in (name, layout, columns))
+        self.body += b'\xa3\x95\x80' + struct.pack('<BB4s16s64s', number, length, *texts)
 
     def define(self, name, layout, columns):
         number = 0x81 + len(self.types)
@@ -60,14 +59,11 @@ def write_new(path, rng, parameters=(('INS_TCAL1_ENABLE', 0.0),)):
     force = np.array([still(rng), still(rng)])
     for k in range(N):
         now = 2_000_000 + k * STEP_US
-        for i in (0, 1):
-            log.write(
-                'IMU', now + i, i, 0.1, 0.2, 0.3 + i, *force[i][k], 0, 0,
-                30.0 + i + 0.25 * (k // 10), 1, 1, 1000, 1000,
-            )  # fmt: skip
-        if k % 10 == 0:
-            log.write('BARO', now, 0, 1.0, 1e5, 2000 + k, 0.0, 0, 0.0, 20.0, 1)
-            log.write('BARO', now, 1, 1.0, 1e5, 1500 - k, 0.0, 0, 0.0, 20.0, 1)
+        for i, hundredths in ((0, 2000 + k), (1, 1500 - k)):
+            numbers = (*force[i][k], 0, 0, 30.0 + i + 0.25 * (k // 10), 1, 1, 1000, 1000)
+            log.write('IMU', now + i, i, 0.1, 0.2, 0.3 + i, *numbers)
+            if k % 10 == 0:
+                log.write('BARO', now, i, 1.0, 1e5, hundredths, 0.0, 0, 0.0, 20.0, 1)
     path.write_bytes(log.body)
     return force
 
@@ -78,18 +74,15 @@ def test_each_imu_of_a_log_in_the_new_format_can_be_converted(tmp_path, rng, imu
     path = tmp_path / 'new.BIN'
     force = write_new(path, rng)
     write_log(read_autopilot(path, imu=imu, baro=baro), tmp_path / 'bag.mcap')
-    recording = read_recording(tmp_path / 'bag.mcap')
-    bag = recording.columns
-    np.testing.assert_array_equal(
-        bag.accel_stamp_ns, (2_000_000 + np.arange(N) * STEP_US + imu) * 1000
-    )
+    bag = read_recording(tmp_path / 'bag.mcap').columns
+    stamp_ns = (2_000_000 + np.arange(N) * STEP_US + imu) * 1000
+    np.testing.assert_array_equal(bag.accel_stamp_ns, stamp_ns)
     np.testing.assert_array_equal(bag.accel, force[imu])
     # The log has numbers of single precision, so the rate 0.3 has a rounding error of 1e-7.
     np.testing.assert_allclose(bag.imu.angular_velocity[:, 2], 0.3 + imu, atol=1e-7)
     # The chip temperature changes every ten samples, and each change is a message.
-    np.testing.assert_array_equal(
-        bag.temperatures['board'].celsius, 30.0 + imu + 0.25 * np.arange(N // 10)
-    )
+    celsius = 30.0 + imu + 0.25 * np.arange(N // 10)
+    np.testing.assert_array_equal(bag.temperatures['board'].celsius, celsius)
     # The log has the temperature of the barometer in units of 0.01 degC.
     hundredths = (2000 + np.arange(0, N, 10)) if baro == 0 else (1500 - np.arange(0, N, 10))
     np.testing.assert_allclose(bag.temperatures['case'].celsius, hundredths / 100, rtol=1e-15)

@@ -31,11 +31,8 @@ def write(path, text):
 @pytest.mark.parametrize(
     ('delimiter', 'newline', 'prefix'),
     [
-        (',', '\n', ''),
-        (';', '\r\n', ''),
-        ('\t', '\n', '\ufeff'),
-        ('|', '\n', '# a logger wrote this\n'),
-        ('  ', '\n', '\n'),
+        *((',', '\n', ''), (';', '\r\n', ''), ('\t', '\n', '\ufeff')),
+        *(('|', '\n', '# a logger wrote this\n'), ('  ', '\n', '\n')),
     ],
     ids=['comma', 'semicolon-crlf', 'tab-bom', 'bar-comment', 'blanks'],
 )
@@ -143,25 +140,23 @@ class TestParquet:
         return tmp_path / 'log.parquet'
 
     def test_a_parquet_table_gives_the_values_of_the_text_table(self, tmp_path):
-        path = self.table(
-            tmp_path, t=[row[0] for row in ROWS], a=[row[1] for row in ROWS], b=[1, None, 3]
-        )
+        t, a, _ = zip(*ROWS, strict=True)
+        path = self.table(tmp_path, t=t, a=a, b=[1, None, 3])
         table = read_parquet(path, ['a', 'b'], Stamp('t', 'ms'))
         assert table.stamp_ns.tolist() == [1000 * 10**6, 1001 * 10**6, 1003 * 10**6]
-        assert table.values['a'].tolist() == [row[1] for row in ROWS]
+        assert table.values['a'].tolist() == [*a]
         np.testing.assert_array_equal(table.values['b'], [1.0, np.nan, 3.0])
 
-    def test_parquet_timestamps_have_their_unit(self, tmp_path):
-        path = self.table(
-            tmp_path, t=np.array([1767225600123, 0], dtype='datetime64[ms]'), a=[1.0, 2.0]
-        )
-        table = read_parquet(path, ['a'], Stamp('t', 's'))
-        assert table.stamp_ns.tolist() == [1767225600123 * 10**6, 0]
-
-    def test_parquet_stamps_may_be_fractional_seconds(self, tmp_path):
-        path = self.table(tmp_path, t=[0.5, float('nan')], a=[1.0, 2.0])
-        table = read_parquet(path, ['a'], Stamp('t', 's'))
-        assert table.stamp_ns.tolist() == [500_000_000, NO_STAMP]
+    @pytest.mark.parametrize(
+        ('stamps', 'expected'),
+        [
+            (np.array([1767225600123, 0], dtype='datetime64[ms]'), [1767225600123 * 10**6, 0]),
+            ([0.5, float('nan')], [500_000_000, NO_STAMP]),
+        ],
+    )
+    def test_parquet_stamps_are_dates_or_fractional_seconds(self, tmp_path, stamps, expected):
+        path = self.table(tmp_path, t=stamps, a=[1.0, 2.0])
+        assert read_parquet(path, ['a'], Stamp('t', 's')).stamp_ns.tolist() == expected
 
     def test_unreadable_parquet_is_refused(self, tmp_path):
         path = self.table(tmp_path, a=['one', 'two'])
@@ -207,8 +202,7 @@ def test_stamps_that_ros_cannot_hold_are_left_out(tmp_path, suffix, unit):
         left_out = report.findings['out_of_range'].count + report.findings['non_numeric'].count
         assert (report.messages['accel'], left_out) == (40, len(stamps) - 40)
         bag = read_recording(tmp_path / 'bag.mcap', Topics(input='imu'), require=('accel',))
-        accel_stamp_ns = bag.columns.accel_stamp_ns
-        assert accel_stamp_ns.tolist() == [stamp * scale for stamp in good]
+        assert bag.columns.accel_stamp_ns.tolist() == [stamp * scale for stamp in good]
     with pytest.raises(RecordingError, match=r'before 1970 or after January 2038|holds numbers'):
         write_log(table_log(written(bad[1:]), chart), tmp_path / 'none.mcap')
 
@@ -227,10 +221,9 @@ def write_bag(path, rng, ros=2, scale=G):
         imu = (0.0, 0.0, 0.0, 1.0, *zeros, 0.01, 0.0, 0.5, *zeros, *force[k], *zeros)
         messages.append(Message('/mpu/data', now_ns, now_ns, 'mpu', imu))
         if k % 50 == 0:
-            messages += [
-                Message(topic, now_ns, now_ns, 'mpu', (len(topic) + k / 50, 0.0))
-                for topic in ('/mpu/die', '/baro/air')
-            ]
+            for topic in ('/mpu/die', '/baro/air'):
+                reading = (len(topic) + k / 50, 0.0)
+                messages.append(Message(topic, now_ns, now_ns, 'mpu', reading))
     if ros == 1:
         write_rosbag1(path, messages)
     else:
@@ -243,19 +236,15 @@ def test_topics_of_any_name_are_converted_to_the_default_topics(tmp_path, rng, r
     path = write_bag(tmp_path / ('old.bag' if ros == 1 else 'new'), rng, ros)
     report = write_log(bag_log(path), tmp_path / 'bag.mcap')
     recording = read_recording(tmp_path / 'bag.mcap')
+    columns = recording.columns
     assert report.messages['accel'] == N
-    np.testing.assert_array_equal(
-        recording.columns.accel_stamp_ns, START_NS + 10_000_000 * np.arange(N)
-    )
-    np.testing.assert_allclose(recording.columns.accel.mean(axis=0), (0.0, 0.1 * G, G), atol=0.02)
-    np.testing.assert_array_equal(recording.columns.imu.angular_velocity[0], (0.01, 0.0, 0.5))
+    np.testing.assert_array_equal(columns.accel_stamp_ns, START_NS + 10_000_000 * np.arange(N))
+    np.testing.assert_allclose(columns.accel.mean(axis=0), (0.0, 0.1 * G, G), atol=0.02)
+    np.testing.assert_array_equal(columns.imu.angular_velocity[0], (0.01, 0.0, 0.5))
     # The thermometer in the namespace of the Imu is the board thermometer.
-    np.testing.assert_array_equal(
-        recording.columns.temperatures['board'].celsius, len('/mpu/die') + np.arange(8)
-    )
-    np.testing.assert_array_equal(
-        recording.columns.temperatures['case'].celsius, len('/baro/air') + np.arange(8)
-    )
+    for name, topic in (('board', '/mpu/die'), ('case', '/baro/air')):
+        celsius = columns.temperatures[name].celsius
+        np.testing.assert_array_equal(celsius, len(topic) + np.arange(8))
     assert recording.info.metadata['topic_board'] == '/mpu/die'
 
 
@@ -273,8 +262,7 @@ def present(imu, temperature=(), pressure=()):
         ((), (), None, None),
         (('/t',), (), '/t', None),
         (('/imu/t', '/air'), (), '/imu/t', '/air'),
-        # A thermometer in a barometer's namespace is the case's, even if it is the only
-        # thermometer.
+        # A thermometer in a barometer's namespace is the case's, even as the only thermometer.
         (('/baro/t',), ('/baro/p',), None, '/baro/t'),
         (('/imu/t', '/baro/t', ), ('/baro/p',), '/imu/t', '/baro/t'),
         (('/robot/imu/t', '/robot/baro/t'), ('/robot/baro/p',), '/robot/imu/t', '/robot/baro/t'),
@@ -296,8 +284,7 @@ def test_ambiguous_topics_must_be_named():
         find_topics(present([], ['/t']), None, None, None)
     both = present(['/imu/data'], ['/imu/t1', '/imu/t2'])
     chosen = find_topics(both, None, '/imu/t2', None)
-    assert chosen['board'] == '/imu/t2'
-    assert chosen['case'] == '/imu/t1'
+    assert (chosen['board'], chosen['case']) == ('/imu/t2', '/imu/t1')
 
 
 def test_the_command_convert_reads_a_bag(tmp_path, rng, cli):
@@ -325,17 +312,10 @@ def test_the_command_convert_reads_a_bag(tmp_path, rng, cli):
 
 @pytest.mark.parametrize(
     ('magnitude', 'unit'),
-    [
-        (1.019, 'g'),  # an MPU6050 with a bias of 19 mg
-        (0.85, 'g'),
-        (9.78, 'm/s^2'),
-        (10.4, 'm/s^2'),
-        (1003.0, 'mg'),
-        (2051.0, 'counts'),
-        (16100.0, 'counts'),
-        (3003.0, 'counts'),
-        (0.1, 'unknown'),
-        (32.2, 'unknown'),  # gravity in ft/s^2
+    [  # 1.019 g is |f| of an MPU6050 with a bias of 19 mg; 32.2 is gravity in ft/s^2.
+        *((1.019, 'g'), (0.85, 'g'), (9.78, 'm/s^2'), (10.4, 'm/s^2'), (1003.0, 'mg')),
+        *((2051.0, 'counts'), (16100.0, 'counts'), (3003.0, 'counts')),
+        *((0.1, 'unknown'), (32.2, 'unknown')),
     ],
 )
 def test_the_unit_follows_from_the_norm_at_rest(magnitude, unit):
@@ -367,9 +347,7 @@ def test_movement_is_found_in_any_unit(rng, scale):
     stamp_ns = np.arange(1, n + 1) * 10_000_000
     stillness = find_stillness(stamp_ns, shaken(rng, n, scale, 1e-3 * scale))
     # The sensor is shaken from 20 to 30 s.
-    assert [(t0 * 1e-9, t1 * 1e-9) for t0, t1 in stillness.moving_ns] == [
-        (pytest.approx(20.01), pytest.approx(30.01))
-    ]
+    assert np.array(stillness.moving_ns) * 1e-9 == pytest.approx(np.array([[20.01, 30.01]]))
     # A mean over 2 s at 100 Hz of samples with a noise of 0.1 % has a noise of 0.1 % / sqrt(200).
     assert stillness.magnitude == pytest.approx(scale, rel=3e-4)
     assert stillness.noise == pytest.approx(1e-3 * scale, rel=0.1)

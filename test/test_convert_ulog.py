@@ -53,22 +53,19 @@ def still(rng, n=N, sd=0.03):
 def write_two_imus(path, rng, gyro_every=1):
     log = UlogWriter(ACCEL, GYRO, BARO)
     ids = [log.subscribe('sensor_accel', i) for i in (0, 1)]
-    gyro_id = log.subscribe('sensor_gyro', 0)
-    baro_id = log.subscribe('sensor_baro', 0)
+    gyro_id, baro_id = log.subscribe('sensor_gyro', 0), log.subscribe('sensor_baro', 0)
     force = [still(rng), still(rng)]
     celsius = [np.float32(30 + 0.01 * np.arange(N)), np.float32(25 - 0.01 * np.arange(N))]
     for k in range(N):
         now = 5_000_000 + k * STEP_US
         for i, number in enumerate(ids):
-            x, y, z = force[i][k]
-            row = (now + 400, now + i, 77 + i, x, y, z, celsius[i][k], 0, 0, 0, 0)
+            row = (now + 400, now + i, 77 + i, *force[i][k], celsius[i][k], 0, 0, 0, 0)
             log.data(number, struct.pack('<QQIffffI3B', *row))
         if k % gyro_every == 0:
             log.data(gyro_id, struct.pack('<QQfff', now + 400, now, 0.001 * k, 0.0, -0.5))
         if k % 50 == 0:
-            log.data(
-                baro_id, struct.pack('<QQIffI', now + 90, now, 9, 1e5, 20 + 0.5 * (k // 50), 0)
-            )
+            row = (now + 90, now, 9, 1e5, 20 + 0.5 * (k // 50), 0)
+            log.data(baro_id, struct.pack('<QQIffI', *row))
     path.write_bytes(log.body)
     return {'force': np.array(force), 'celsius': np.array(celsius)}
 
@@ -129,11 +126,10 @@ def test_a_log_without_sample_times_is_read(tmp_path, rng):
 def test_a_chip_without_a_thermometer_is_recognised(tmp_path, rng):
     log = UlogWriter(ACCEL)
     number = log.subscribe('sensor_accel', 0)
-    for k, (x, y, z) in enumerate(still(rng)):
+    for k, force in enumerate(still(rng)):
         now = 1_000_000 + k * STEP_US
-        log.data(
-            number, struct.pack('<QQIffffI3B', now, now, 1, x, y, z, float('nan'), 0, 0, 0, 0)
-        )
+        row = (now, now, 1, *force, float('nan'), 0, 0, 0, 0)
+        log.data(number, struct.pack('<QQIffffI3B', *row))
     path = tmp_path / 'cold.ulg'
     path.write_bytes(log.body)
     assert not read_autopilot(path).temperatures
@@ -182,12 +178,9 @@ def write_combined(path, rng, later=None, **parameters):
         if k == 3:
             # Add a message without accelerometer sample, and one that repeats a sample.
             rows += [(2**31 - 1, vector), (-200 - 50, vector)]
-        for j, (relative, (x, y, z)) in enumerate(rows):
-            at = now + (50 if j == 2 else 0)
-            log.data(
-                number,
-                struct.pack('<QfffIifffI', at, 0.1, 0.2, 0.3, 5000, relative, x, y, z, 5000),
-            )
+        for j, (relative, own) in enumerate(rows):
+            row = (now + (50 if j == 2 else 0), 0.1, 0.2, 0.3, 5000, relative, *own, 5000)
+            log.data(number, struct.pack('<QfffIifffI', *row))
         if k % 100 == 0:
             log.data(air, struct.pack('<QQf', now, now, 40.0 + 0.01 * k))
         for name, value in (later or {}).items():

@@ -5,15 +5,7 @@
 import numpy as np
 import pytest
 
-from thermo_comp.fitting.coverage import (
-    constants_covariance,
-    direction_text,
-    farthest,
-    force_columns,
-    next_direction,
-    norm_columns,
-    worst_sd,
-)
+from thermo_comp.fitting import coverage
 from thermo_comp.simulation.campaign import positions
 
 PRIOR_SD = np.repeat([1.0 / 9.80665, 0.05, 1e-3], 3)  # bias [g], scale, misalignment [rad]
@@ -28,8 +20,8 @@ def units(rng, n):
 
 
 def mean_variance(ups, at):
-    covariance = constants_covariance(ups, np.full(len(ups), SD))
-    columns = force_columns(at)
+    covariance = coverage.constants_covariance(ups, np.full(len(ups), SD))
+    columns = coverage.force_columns(at)
     return float(np.mean(np.trace(columns @ covariance @ columns.transpose(0, 2, 1), 0, 1, 2)))
 
 
@@ -44,22 +36,23 @@ def test_the_columns_equal_the_derivatives_of_the_measured_force(rng):
 
     for k, step_of in enumerate(step * np.eye(9)):
         slope = (force(step_of) - force(-step_of)) / (2.0 * step)
-        np.testing.assert_allclose(force_columns(up)[:, :, k], slope, atol=1e-9)
+        np.testing.assert_allclose(coverage.force_columns(up)[:, :, k], slope, atol=1e-9)
         norm = [np.linalg.norm(force(step), axis=1) for step in (step_of, -step_of)]
-        np.testing.assert_allclose(
-            norm_columns(up)[:, k], (norm[0] - norm[1]) / (2.0 * step), atol=1e-9
-        )
+        slope = (norm[0] - norm[1]) / (2.0 * step)
+        np.testing.assert_allclose(coverage.norm_columns(up)[:, k], slope, atol=1e-9)
 
 
 def test_without_positions_the_covariance_is_that_of_the_prior():
-    covariance = constants_covariance(NOTHING, np.empty(0))
+    covariance = coverage.constants_covariance(NOTHING, np.empty(0))
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), PRIOR_SD)
     # Along an axis the variance of |f| is the sum of the variances of its bias and scale.
-    assert worst_sd(covariance) == pytest.approx(np.hypot(PRIOR_SD[0], PRIOR_SD[3]), rel=1e-3)
+    assert coverage.worst_sd(covariance) == pytest.approx(
+        np.hypot(PRIOR_SD[0], PRIOR_SD[3]), rel=1e-3
+    )
 
 
 def test_two_opposite_faces_determine_bias_and_scale_of_their_axis():
-    sd = np.sqrt(np.diag(constants_covariance(FACES[:2], np.full(2, SD))))
+    sd = np.sqrt(np.diag(coverage.constants_covariance(FACES[:2], np.full(2, SD))))
     # Bias and scale errors: half the difference and half the sum of errors of |f| on +x and -x.
     assert sd[[0, 3]] == pytest.approx(SD / np.sqrt(2.0), rel=1e-6)
     np.testing.assert_allclose(sd[[1, 2, 4, 5, 6, 7, 8]], PRIOR_SD[[1, 2, 4, 5, 6, 7, 8]])
@@ -67,24 +60,23 @@ def test_two_opposite_faces_determine_bias_and_scale_of_their_axis():
 
 def test_the_covariance_equals_that_of_simulated_estimates(rng):
     up, n = positions(12, 3), 4000
-    covariance = constants_covariance(up, np.full(12, SD))
+    covariance = coverage.constants_covariance(up, np.full(12, SD))
     truth = rng.standard_normal((n, 9)) * PRIOR_SD
-    columns = norm_columns(up)
+    columns = coverage.norm_columns(up)
     seen = truth @ columns.T + SD * rng.standard_normal((n, 12))
     # The estimate is the conditional mean of the constants for the given values of |f|.
     joint = columns * PRIOR_SD**2 @ columns.T + SD**2 * np.eye(12)
     estimate = seen @ np.linalg.solve(joint, columns * PRIOR_SD**2)
     # 4000 trials determine a standard deviation to 1.1 %.
-    np.testing.assert_allclose(
-        np.std(estimate - truth, axis=0), np.sqrt(np.diag(covariance)), rtol=0.06
-    )
+    scatter = np.std(estimate - truth, axis=0)
+    np.testing.assert_allclose(scatter, np.sqrt(np.diag(covariance)), rtol=0.06)
 
 
 @pytest.mark.parametrize('n', [0, 1, 4, 7, 11])
 def test_the_next_direction_reduces_the_mean_variance(n, rng):
     up, at = units(rng, n), units(rng, 2000)
-    covariance = constants_covariance(up, np.full(n, SD))
-    proposed = next_direction(covariance, SD, up)
+    covariance = coverage.constants_covariance(up, np.full(n, SD))
+    proposed = coverage.next_direction(covariance, SD, up)
     before = mean_variance(up, at)
     gain = before - mean_variance(np.vstack([up, proposed]), at)
     others = [before - mean_variance(np.vstack([up, unit]), at) for unit in units(rng, 300)]
@@ -96,24 +88,24 @@ def test_the_next_direction_reduces_the_mean_variance(n, rng):
 def test_the_proposed_directions_are_nearly_as_good_as_spread_positions():
     up = NOTHING
     for _ in range(18):
-        covariance = constants_covariance(up, np.full(len(up), SD))
-        up = np.vstack([up, next_direction(covariance, SD, up)])
+        covariance = coverage.constants_covariance(up, np.full(len(up), SD))
+        up = np.vstack([up, coverage.next_direction(covariance, SD, up)])
     # The six faces are proposed first, beginning with +z, then directions for the misalignment.
     assert up[0].tolist() == [0.0, 0.0, 1.0]
     assert {tuple(row) for row in up[:6]} == {tuple(face) for face in FACES}
-    proposed = worst_sd(constants_covariance(up, np.full(18, SD)))
-    spread = worst_sd(constants_covariance(positions(18), np.full(18, SD)))
+    proposed = coverage.worst_sd(coverage.constants_covariance(up, np.full(18, SD)))
+    spread = coverage.worst_sd(coverage.constants_covariance(positions(18), np.full(18, SD)))
     assert proposed < 1.1 * spread
-    assert farthest(up)[1] < 36.0
+    assert coverage.farthest(up)[1] < 36.0
 
 
 def test_farthest_returns_the_direction_farthest_from_all_given_directions():
     # The corners of a cube are the directions farthest from all six faces.
-    up, angle = farthest(FACES)
+    up, angle = coverage.farthest(FACES)
     assert np.abs(up) == pytest.approx(1.0 / np.sqrt(3.0))
     assert angle == pytest.approx(np.degrees(np.arccos(1.0 / np.sqrt(3.0))))
-    assert farthest(FACES[4:5])[0] == pytest.approx([0.0, 0.0, -1.0])
-    assert farthest(NOTHING)[1] == 180.0
+    assert coverage.farthest(FACES[4:5])[0] == pytest.approx([0.0, 0.0, -1.0])
+    assert coverage.farthest(NOTHING)[1] == 180.0
 
 
 @pytest.mark.parametrize(
@@ -126,4 +118,4 @@ def test_farthest_returns_the_direction_farthest_from_all_given_directions():
     ],
 )
 def test_a_direction_is_described_in_words(up, words):
-    assert direction_text(np.array(up, float) / np.linalg.norm(up)) == words
+    assert coverage.direction_text(np.array(up, float) / np.linalg.norm(up)) == words

@@ -97,8 +97,8 @@ def test_rows_of_tables_have_as_many_cells_as_the_header():
 def test_the_site_builds_without_a_warning(tmp_path):
     for module in ('material', 'mkdocstrings', 'mkdocs_jupyter'):
         pytest.importorskip(module, reason=f'{module} of the extra `docs` is not installed')
-    words = ('-m', 'mkdocs', 'build', '--strict', '--site-dir', tmp_path / 'site')
-    finished = ran(sys.executable, *words)
+    words = ('mkdocs', 'build', '--strict', '--site-dir', tmp_path / 'site')
+    finished = ran(sys.executable, '-m', *words)
     assert finished.returncode == 0, finished.stderr
     assert (tmp_path / 'site' / 'index.html').is_file()
 

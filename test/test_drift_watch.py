@@ -19,6 +19,8 @@ from thermo_comp.field.series import series_of
 from thermo_comp.field.watch import LIMIT, passage, watch
 from thermo_comp.unit.gravity import MICRO_G
 
+SLOW = pytest.mark.slow
+
 
 def walked(rate, bound, axes=1, mean=0.0):
     """Forecast a random walk from `mean`, whose variance grows by `rate` per day on each axis."""
@@ -33,9 +35,8 @@ def test_the_probability_of_a_first_passage_agrees_with_closed_forms():
     # probability: 2 sum over k > 0 of (-1)^(k + 1) exp(-(k pi)^2 r t / 2 c^2).
     rate, bound = 4.0, 50.0
     k, n = np.arange(-40, 41), np.arange(1, 200)
-    for probability, days, of_ball in zip(
-        (0.1, 0.5, 0.9), walked(rate, bound), walked(rate, bound, 3), strict=True
-    ):
+    both = walked(rate, bound), walked(rate, bound, 3)
+    for probability, days, of_ball in zip((0.1, 0.5, 0.9), *both, strict=True):
         s = np.sqrt(rate * days)
         inside = norm.cdf((2 * k + 1) * bound / s) - norm.cdf((2 * k - 1) * bound / s)
         # A share of about 0.5 among 2000 simulated walks has a standard error of 0.011.
@@ -50,8 +51,7 @@ def test_the_probability_of_a_first_passage_agrees_with_closed_forms():
 
 @pytest.mark.slow
 def test_forecasts_agree_with_the_simulated_future_of_units():
-    # WHY: errors of opposite signs in opposite attitudes cancelled: forecasts were 3 to 5 times
-    # too long.
+    # WHY: errors of opposite attitudes cancelled: forecasts were 3 to 5 times too long.
     shares, ratios = [], []
     for kind in ('fixed', 'up and down', 'faces', 'carried'):
         for rows in field_watch.forecasts(kind, 3, 20).values():
@@ -66,9 +66,7 @@ def test_forecasts_agree_with_the_simulated_future_of_units():
     assert 0.45 < min(ratios) < max(ratios) < 2.2
 
 
-@pytest.mark.parametrize(
-    'attitudes', [upright, pytest.param(in_any_attitude, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize('attitudes', [upright, pytest.param(in_any_attitude, marks=SLOW)])
 def test_the_verdict_follows_the_true_error_on_each_day(attitudes):
     # The RMS error along gravity is 1.5 times the limit from day 20 to day 34, 20 times on day 12
     # and 0.6 times otherwise. The logs end on different days.
@@ -85,9 +83,8 @@ def test_the_verdict_follows_the_true_error_on_each_day(attitudes):
     for n_days in (11, 13, 14, 16, 18, 20, 24, 26, 28, 33, 34, 40):
         result = watch(series.at(series.day < first + n_days), unit)
         since = {13: 12}.get(n_days, 20 if 20 < n_days <= 34 else None)
-        assert (result.exit_code, result.outside_since) == (
-            (0, None) if since is None else (1, str(np.datetime64(first + since, 'D')))
-        )
+        outside = None if since is None else str(np.datetime64(first + since, 'D'))
+        assert (result.exit_code, result.outside_since) == (int(outside is not None), outside)
         assert ('outside its claim since' in str(result)) == (since is not None)
         # With gravity along (1, 1, 1), bias errors of 0.6 times the limit change |f| by 1.04 times
         # the limit: the day on which the unit returns to its claim may be printed a day late.
@@ -99,15 +96,13 @@ def test_the_verdict_follows_the_true_error_on_each_day(attitudes):
 
 
 def test_the_drift_watch_states_the_day_and_the_temperature_range():
-    unit = known(
-        static=field_units.calibration().static, dynamic=field_units.calibration().dynamic
-    )
+    of_field = field_units.calibration()
+    unit = known(static=of_field.static, dynamic=of_field.dynamic)
     healthy = watch(series_of(rests(unit, upright, no_error), unit), unit)
     assert (healthy.exit_code, healthy.outside_since) == (0, None)
     assert 'within its claim up to 2030-01-20' in str(healthy)
-    assert sum(row.n_rests for row in healthy.days) == sum(
-        row.n_rests for row in healthy.temperatures
-    )
+    n_rests = [row.n_rests for row in healthy.temperatures]
+    assert sum(row.n_rests for row in healthy.days) == sum(n_rests)
     assert [row.name for row in healthy.temperatures] == ['10 .. 20 degC', '20 .. 30 degC']
     assert [row.name for row in healthy.periods] == [row.name for row in healthy.days]
     year = watch(series_of(rests(unit, upright, no_error, days=61), unit), unit)

@@ -10,19 +10,11 @@ import pytest
 
 pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 
+import ros_helpers as ros
 from builders import thermal_calibration
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.serialization import deserialize_message, serialize_message
-from ros_helpers import (
-    SECOND_NS,
-    START_NS,
-    TIMEOUT,
-    node_arguments,
-    node_in_thread,
-    stamped,
-    standing,
-)
 from sensor_msgs.msg import BatteryState, Temperature
 from std_msgs.msg import Float64
 
@@ -45,8 +37,8 @@ def unit(tmp_path):
 
 
 def sample(stamp_ns):
-    message = stamped(Vector3Stamped(), stamp_ns, 'imu')
-    message.vector.x, message.vector.y, message.vector.z = standing(0)
+    message = ros.stamped(Vector3Stamped(), stamp_ns, 'imu')
+    message.vector.x, message.vector.y, message.vector.z = ros.standing(0)
     return message
 
 
@@ -54,9 +46,8 @@ def sample(stamp_ns):
 def test_the_node_finds_the_message_type_of_a_topic_while_it_runs(peer, unit, is_file):
     topics = ','.join(f'{name}={topic}' for name, topic in NAMES.items())
     if is_file:
-        (unit.parent / 'lab.yaml').write_text(
-            ''.join(f'{name}: {topic}\n' for name, topic in NAMES.items())
-        )
+        lines = ''.join(f'{name}: {topic}\n' for name, topic in NAMES.items())
+        (unit.parent / 'lab.yaml').write_text(lines)
         topics = str(unit.parent / 'lab.yaml')
     heard = peer.listen(DiagnosticArray, '/diagnostics')
 
@@ -71,21 +62,20 @@ def test_the_node_finds_the_message_type_of_a_topic_while_it_runs(peer, unit, is
 
         return look
 
-    with node_in_thread(*node_arguments(unit, f'topics:={topics}')):
+    with ros.node_in_thread(*ros.node_arguments(unit, f'topics:={topics}')):
         board = peer.publisher(BatteryState, '/pack')
         case = peer.publisher(Float64, '/case_t')
         samples = peer.publisher(Vector3Stamped, 'accel/counts')
-        board.publish(stamped(BatteryState(temperature=25.0), START_NS))
+        board.publish(ros.stamped(BatteryState(temperature=25.0), ros.START_NS))
         peer.wait_for(values(unpublished=0), 'a report')
-        samples.publish(sample(START_NS))
+        samples.publish(sample(ros.START_NS))
         peer.wait_for(values(**{'board temperature [degC]': 25.0}), 'the board')
         # A reading without a stamp applies from the previous sample on.
         case.publish(Float64(data=23.0))
-        samples.publish(sample(START_NS + SECOND_NS))
-        samples.publish(sample(START_NS + 2 * SECOND_NS))
-        peer.wait_for(
-            values(**{'case minus board [K]': -2.0, 'case age [s]': 2.0}), 'the case, 2 s old'
-        )
+        samples.publish(sample(ros.START_NS + ros.SECOND_NS))
+        samples.publish(sample(ros.START_NS + 2 * ros.SECOND_NS))
+        of_case = {'case minus board [K]': -2.0, 'case age [s]': 2.0}
+        peer.wait_for(values(**of_case), 'the case, 2 s old')
 
 
 @pytest.mark.parametrize(
@@ -100,7 +90,7 @@ def test_the_node_finds_the_message_type_of_a_topic_while_it_runs(peer, unit, is
     ],
 )
 def test_impossible_topics_are_refused(unit, topics, text, capfd):
-    command = ['thermo_comp_node', '--ros-args', *node_arguments(unit, f'topics:={topics}')]
+    command = ['thermo_comp_node', '--ros-args', *ros.node_arguments(unit, f'topics:={topics}')]
     assert main(command) == 1
     (line,) = capfd.readouterr().err.splitlines()
     assert text in line
@@ -109,26 +99,22 @@ def test_impossible_topics_are_refused(unit, topics, text, capfd):
 def test_a_driver_on_imu_data_raw_requires_another_output_topic(unit, capfd):
     calibration = replace(thermal_calibration(), unit=Unit('T-1', 'm/s^2', 160.0, 0.01))
     save_calibration(calibration, unit, overwrite=True)
-    command = [
-        'thermo_comp_node',
-        '--ros-args',
-        *node_arguments(unit, 'topics:=imu=/imu/data_raw'),
-    ]
-    assert main(command) == 1
+    words = ros.node_arguments(unit, 'topics:=imu=/imu/data_raw')
+    assert main(['thermo_comp_node', '--ros-args', *words]) == 1
     text = '/imu/data_raw: is both input and output: remap imu/data_raw to another name'
     assert text in capfd.readouterr().err
     names = 'imu=/imu/data_raw,output=/imu/compensated'
-    with node_in_thread(*node_arguments(unit, f'topics:={names}')) as node:
+    with ros.node_in_thread(*ros.node_arguments(unit, f'topics:={names}')) as node:
         assert node.node.count_publishers('/imu/compensated') == 1
 
 
 def test_record_writes_number_fields_of_messages_as_temperatures(peer):
     outputs = {}
-    pause, deadline = threading.Event(), time.monotonic() + TIMEOUT
+    pause, deadline = threading.Event(), time.monotonic() + ros.TIMEOUT
     messages = [
-        ('accel', sample(START_NS)),
+        ('accel', sample(ros.START_NS)),
         ('case', Float64(data=23.0)),
-        ('board', stamped(BatteryState(temperature=25.0), START_NS + 5)),
+        ('board', ros.stamped(BatteryState(temperature=25.0), ros.START_NS + 5)),
     ]
     with LiveTopics(Topics.named({**NAMES, 'counts': 'accel/counts'})) as live:
         publishers = {
@@ -153,16 +139,18 @@ def test_record_writes_number_fields_of_messages_as_temperatures(peer):
     case = deserialize_message(outputs['case'][0], Temperature)
     board = deserialize_message(outputs['board'][0], Temperature)
     # A reading without a stamp gets the stamp of the previous sample.
-    assert (case.temperature, case.header.stamp.sec) == (23.0, START_NS // SECOND_NS)
+    assert (case.temperature, case.header.stamp.sec) == (23.0, ros.START_NS // ros.SECOND_NS)
     assert (board.temperature, board.header.stamp.nanosec) == (25.0, 5)
 
 
 def test_a_number_field_is_read_from_messages_that_rclpy_wrote():
-    message = stamped(BatteryState(temperature=25.0, cell_temperature=[1.0, 2.5]), START_NS + 7)
+    message = ros.stamped(
+        BatteryState(temperature=25.0, cell_temperature=[1.0, 2.5]), ros.START_NS + 7
+    )
     data = serialize_message(message)
     for path, value in (('temperature', 25.0), ('cell_temperature[1]', 2.5)):
         field = LiveField('/pack', 'sensor_msgs/msg/BatteryState', path)
-        assert field.read(data) == (START_NS + 7, value)
+        assert field.read(data) == (ros.START_NS + 7, value)
     assert LiveField('/pack', 'sensor_msgs/msg/BatteryState', 'cell_voltage[3]').read(data) is None
     for kind, path, text in (
         ('px4_msgs/msg/SensorAccel', 'temperature', '/t: its type px4_msgs.* is not installed'),

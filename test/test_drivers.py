@@ -22,10 +22,8 @@ START_NS = 1_767_225_600 * 10**9
 IMU, TEMPERATURE = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/Temperature'
 MAGNETIC, VECTOR = 'sensor_msgs/msg/MagneticField', 'geometry_msgs/msg/Vector3Stamped'
 FLOAT, PRESSURE = 'std_msgs/msg/Float64', 'sensor_msgs/msg/FluidPressure'
-PX4, MIP = (
-    'px4_msgs/msg/SensorAccel',
-    'microstrain_inertial_msgs/msg/MipSensorTemperatureStatistics',
-)
+PX4 = 'px4_msgs/msg/SensorAccel'
+MIP = 'microstrain_inertial_msgs/msg/MipSensorTemperatureStatistics'
 OWN = {
     PX4: 'uint64 timestamp\nuint64 timestamp_sample\nuint32 device_id\nfloat32 x\nfloat32 y\n'
     'float32 z\nfloat32 temperature\nuint32 error_count\nuint8[3] clip_counter\nuint8 samples\n',
@@ -36,41 +34,29 @@ OWN = {
 #: Topics of each driver with their types (docs/drivers.md), and other topics in a bag.
 LAYOUTS = {
     'microstrain': {'/imu/data': IMU, '/mip/sensor/temperature_statistics': MIP},
-    'xsens': {
-        '/imu/data': IMU,
-        '/temperature': TEMPERATURE,
-        '/filter/free_acceleration': VECTOR,
-        '/imu/angular_velocity': VECTOR,
-    },
-    'vectornav': {
-        '/vectornav/imu': IMU,
-        '/vectornav/imu_uncompensated': IMU,
-        '/vectornav/temperature': TEMPERATURE,
-        '/vectornav/magnetic': MAGNETIC,
-    },
+    'xsens': {'/imu/data': IMU, '/temperature': TEMPERATURE, '/filter/free_acceleration': VECTOR,
+              '/imu/angular_velocity': VECTOR},
+    'vectornav': {'/vectornav/imu': IMU, '/vectornav/imu_uncompensated': IMU,
+                  '/vectornav/temperature': TEMPERATURE, '/vectornav/magnetic': MAGNETIC},
     'sbg': {'/imu/data': IMU, '/imu/temp': TEMPERATURE, '/imu/mag': MAGNETIC},
     'bno055': {'/bno055/imu_raw': IMU, '/bno055/imu': IMU, '/bno055/temp': TEMPERATURE},
     'witmotion': {'/imu': IMU, '/temperature': TEMPERATURE, '/magnetometer': MAGNETIC},
     'phidgets': {'/imu/data_raw': IMU, '/temperature': FLOAT, '/imu/mag': MAGNETIC},
     # PX4 publishes no Imu messages, so a node of the user must publish /imu/uncompensated.
     'px4': {'/imu/uncompensated': IMU, '/fmu/out/sensor_accel': PX4},
-    'mavros': {
-        '/mavros/imu/data': IMU,
-        '/mavros/imu/data_raw': IMU,
-        '/mavros/imu/temperature_imu': TEMPERATURE,
-        '/mavros/imu/temperature_baro': TEMPERATURE,
-        '/mavros/imu/static_pressure': PRESSURE,
-    },
+    'mavros': {'/mavros/imu/data': IMU, '/mavros/imu/data_raw': IMU,
+               '/mavros/imu/temperature_imu': TEMPERATURE,
+               '/mavros/imu/temperature_baro': TEMPERATURE,
+               '/mavros/imu/static_pressure': PRESSURE},
     'ardupilot': {'/ap/imu/experimental/data': IMU, '/ap/airspeed': VECTOR},
     'realsense': {'/camera/camera/accel/sample': IMU, '/camera/camera/gyro/sample': IMU},
     'mpu6050': {'/imu': IMU},
-}
+}  # fmt: skip
 #: Drivers that publish no temperature.
 LACKS = {'ardupilot', 'realsense', 'mpu6050'}
 #: Drivers whose bags are fitted: one for each type of temperature message, one without readings.
-FITTED = {'xsens', 'mavros', 'px4', 'phidgets', 'ardupilot'}
-#: Seven rests of REST_S [s], on six faces and then on the first face; the board warms by WARMING
-#: [K/s].
+FITTED = {'mavros', 'px4', 'phidgets', 'ardupilot'}
+#: Seven rests of REST_S [s]: six faces, the first again; the board warms by WARMING [K/s].
 UPS = np.concatenate((np.eye(3), -np.eye(3), [[1.0, 0.0, 0.0]]))
 RATE, REST_S, WARMING = 5, 75, 0.05
 SECONDS = len(UPS) * REST_S
@@ -89,9 +75,8 @@ def store():
 
 def message(store, kind, stamp_ns, celsius, force):
     types, zeros = store.types, np.zeros(9)
-    header = types['std_msgs/msg/Header'](
-        types['builtin_interfaces/msg/Time'](*divmod(stamp_ns, 10**9)), 'imu_link'
-    )
+    stamp = types['builtin_interfaces/msg/Time'](*divmod(stamp_ns, 10**9))
+    header = types['std_msgs/msg/Header'](stamp, 'imu_link')
     vector = types['geometry_msgs/msg/Vector3']
     if kind == IMU:
         level = types['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0)
@@ -140,9 +125,7 @@ def test_every_driver_has_a_layout_and_a_line_in_the_page():
             assert name == 'output' or topic.partition(':')[0] in line, (path.stem, topic)
 
 
-@pytest.mark.parametrize(
-    ('path', 'bag'), [(path, path.stem) for path in FILES], indirect=['bag'], ids=str
-)
+@pytest.mark.parametrize(('path', 'bag'), [(file, file.stem) for file in FILES], indirect=['bag'])
 def test_every_command_reads_a_bag_with_the_topics_of_the_driver(path, bag, tmp_path, cli):
     names, topics = read_names(path), ('--topics', path)
     has_board = path.stem not in LACKS
@@ -185,12 +168,8 @@ def test_every_command_reads_a_bag_with_the_topics_of_the_driver(path, bag, tmp_
 
 def warming_unit():
     """Make a unit whose z bias grows by 1 mm/s^2/K, so the output shows the reading in use."""
-    return calibration(
-        unit=Unit('T-1', 'm/s^2', 160.0, 1.0 / RATE),
-        axes=equal_axes(1.0),
-        static=regime_set(z=axis_set((0.0, 1e-3))),
-        dynamic=regime_set(z=axis_set((0.0, 1e-3))),
-    )
+    unit, parts = Unit('T-1', 'm/s^2', 160.0, 1.0 / RATE), regime_set(z=axis_set((0.0, 1e-3)))
+    return calibration(unit=unit, axes=equal_axes(1.0), static=parts, dynamic=parts)
 
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: path.stem)

@@ -4,6 +4,7 @@
 
 import re
 from dataclasses import replace
+from itertools import starmap
 from typing import get_args
 
 import numpy as np
@@ -65,14 +66,9 @@ def test_a_serial_with_line_breaks_adds_no_line_to_an_export(cubic, to):
 
 
 def numbers(text, separator):
-    result = {}
-    for line in text.splitlines():
-        if not line.startswith('#'):
-            cells = line.split(separator)
-            result[cells[2] if separator == '\t' else cells[0]] = float(
-                cells[3] if separator == '\t' else cells[1]
-            )
-    return result
+    first = 2 if separator == '\t' else 0
+    rows = (line.split(separator) for line in text.splitlines() if not line.startswith('#'))
+    return {cells[first]: float(cells[first + 1]) for cells in rows}
 
 
 def bias_at(calibration, axis, celsius):
@@ -109,10 +105,8 @@ def test_the_formula_of_ardupilot_gives_the_bias_changes_of_the_calibration(cubi
 
 
 def test_an_imported_ardupilot_bias_is_0_at_its_calibration_temperature(cubic):
-    text = (
-        export_calibration(cubic, 'ardupilot').text.replace(',', '=') + 'INS_ACC1_CALTEMP=28.0\n'
-    )
-    back = import_calibration(text, serial='7')
+    text = export_calibration(cubic, 'ardupilot').text.replace(',', '=')
+    back = import_calibration(text + 'INS_ACC1_CALTEMP=28.0\n', serial='7')
     for axis in range(3):
         assert bias_at(back, axis, 28.0) == pytest.approx(0.0, abs=1e-12)
         ours = bias_at(cubic, axis, 41.0) - bias_at(cubic, axis, 28.0)
@@ -125,9 +119,9 @@ def test_the_bias_of_a_gyroscope_is_exported_and_imported(cubic):
     gyroscope = Gyroscope((0.02, -0.01, 0.03), rates, rates, (1e-4,) * 3)
     unit = replace(cubic, gyroscope=gyroscope)
     celsius = np.linspace(*unit.static.temperature_range_c, 7)
-    true = np.array(gyroscope.bias_rad_s) + np.column_stack(
-        [Polynomial(curve).value(celsius - unit.reference_temperature_c) for curve in curves]
-    )
+    t = celsius - unit.reference_temperature_c
+    changes = [Polynomial(curve).value(t) for curve in curves]
+    true = np.array(gyroscope.bias_rad_s) + np.column_stack(changes)
 
     def again(text):
         imported = import_calibration(text, serial='7')
@@ -170,9 +164,8 @@ def test_an_export_of_counts_to_px4_is_divided_by_the_scale_factor(cubic):
         bias = Polynomial(tuple(300.0 * c for c in axis.bias_function.coefficients))
         scaled.append(replace(axis, bias_function=bias))
     regime = RegimeSet((5.0, 45.0), (-2.0, 2.0), *scaled)
-    counts = replace(
-        cubic, unit=Unit('7', 'counts', 32767.0, 0.005), axes=axes, static=regime, dynamic=regime
-    )
+    unit = Unit('7', 'counts', 32767.0, 0.005)
+    counts = replace(cubic, unit=unit, axes=axes, static=regime, dynamic=regime)
     ours, expected = export_calibration(counts, 'px4'), export_calibration(cubic, 'px4')
     assert any('the driver must divide counts by K' in note for note in ours.notes)
     for name, value in numbers(expected.text, '\t').items():
@@ -183,13 +176,10 @@ def test_an_export_for_a_stated_attitude_contains_the_scale_drift(cubic):
     drifting = replace(cubic.static.z, scale_function=Polynomial((1.0, 1e-4)))
     regime = replace(cubic.static, z=drifting)
     calibration = replace(cubic, static=regime, dynamic=regime)
-    plain, level = (
-        export_calibration(calibration, 'px4'),
-        export_calibration(calibration, 'px4', up=(0.0, 0.0, 1.0)),
-    )
-    assert any(
-        re.search(r'scale over temperature is lost: up to 2[45]\d\d ppm', n) for n in plain.notes
-    )
+    plain = export_calibration(calibration, 'px4')
+    level = export_calibration(calibration, 'px4', up=(0.0, 0.0, 1.0))
+    lost = re.compile(r'scale over temperature is lost: up to 2[45]\d\d ppm')
+    assert any(map(lost.search, plain.notes))
     # If z measures +g, a scale drift of 100 ppm/K is an offset drift of 9.81e-4 m/s^2 per K.
     slope = [numbers(export.text, '\t')['TC_A0_X1_2'] for export in (plain, level)]
     assert slope[1] - slope[0] == pytest.approx(9.81e-4, rel=1e-5)
@@ -221,20 +211,15 @@ def test_losses_of_an_export_are_noted(cubic):
     dynamic = replace(static, y=replace(static.y, delta=0.1))
     square = NonlinearTerm('square', (1e-5,) * 3, (0.0,) * 3, 1e-4)
     calibration = replace(
-        cubic,
-        static=static,
-        dynamic=dynamic,
+        cubic, static=static, dynamic=dynamic,
         response=(term('gradient', (0.0, 1e-3, 0.0)), term('board', tau_s=60.0)),
         misalignment=((1.0, 0.0, 0.0), (1e-3, 1.0, 0.0), (0.0, 0.0, 1.0)),
         nonlinearity=Nonlinearity((9.81, 20.0), 1e-4, (square,)),
-    )
+    )  # fmt: skip
     text = export_calibration(calibration, 'ardupilot')
     for expected in (
-        'cubics replace',
-        '1000 urad',
-        r'response is lost (gradient): ',
-        'dynamic coefficients are lost',
-        'the terms nonlinear in specific force are lost',
+        *('cubics replace', '1000 urad', 'response is lost (gradient): '),
+        *('dynamic coefficients are lost', 'the terms nonlinear in specific force are lost'),
     ):
         assert any(expected in note for note in text.notes), expected
         assert expected in text.text
@@ -283,13 +268,10 @@ def test_wrong_arguments_of_export_are_refused(cubic):
 
 @pytest.fixture
 def tumbled():
-    axes = Axes(
-        AxisReference(373.0, 32800.0), AxisReference(381.0, 32650.0), AxisReference(369.0, 32790.0)
-    )
-    plain = calibration_of([Polynomial((0.0,))] * 3, unit=Unit('7', 'counts', 65536.0, 0.01))
-    return replace(
-        plain, axes=axes, misalignment=((1.0, 0.0, 0.0), (0.02, 1.0, 0.0), (-0.03, 0.05, 1.0))
-    )
+    constants = (373.0, 32800.0), (381.0, 32650.0), (369.0, 32790.0)
+    axes, unit = Axes(*starmap(AxisReference, constants)), Unit('7', 'counts', 65536.0, 0.01)
+    M = (1.0, 0.0, 0.0), (0.02, 1.0, 0.0), (-0.03, 0.05, 1.0)
+    return calibration_of([Polynomial((0.0,))] * 3, unit=unit, axes=axes, misalignment=M)
 
 
 def ours(calibration, raw):
@@ -321,9 +303,8 @@ def test_the_formula_of_imu_tk_gives_the_correction_of_the_calibration(tumbled):
     theirs = (RAW - numbers[18:]) @ (T @ K).T
     # The notes round angles to 1e-6 rad, an error of 1e-6 times 90 m/s^2.
     np.testing.assert_allclose(theirs, ours(tumbled, RAW) @ turn(file.notes).T, atol=1e-4)
-    np.testing.assert_allclose(
-        np.linalg.norm(theirs, axis=1), np.linalg.norm(ours(tumbled, RAW), axis=1), rtol=1e-12
-    )
+    norms, expected = (np.linalg.norm(force, axis=1) for force in (theirs, ours(tumbled, RAW)))
+    np.testing.assert_allclose(norms, expected, rtol=1e-12)
 
 
 def test_formulas_of_imu_calib_and_kalibr_give_the_correction_of_the_calibration(tumbled):
@@ -371,10 +352,8 @@ def test_an_imported_full_matrix_becomes_a_triangular_matrix_and_a_rotation():
     text = f'SM: {SM.ravel().tolist()}\nbias: [0.12, -0.05, 0.2]\n'
     back = import_calibration(text, serial='7')
     raw = np.array([[3.0, -4.0, 8.0], [-9.0, 1.0, 2.0]])
-    rotation = turn(back.provenance.notes)
-    np.testing.assert_allclose(
-        ours(back, raw) @ rotation.T, raw @ SM.T - [0.12, -0.05, 0.2], atol=1e-5
-    )
+    force, expected = ours(back, raw) @ turn(back.provenance.notes).T, raw @ SM.T
+    np.testing.assert_allclose(force, expected - [0.12, -0.05, 0.2], atol=1e-5)
     assert not np.triu(back.misalignment, 1).any()
 
 
@@ -385,9 +364,7 @@ def test_kalibr_files_without_bias_and_with_several_imus_are_read():
     assert 'no bias' in back.provenance.notes[0]
     # The reading (1.01, 1.99, 3.06) is M a for a = (1, 2, 3) m/s^2.
     np.testing.assert_allclose(ours(back, np.array([[1.01, 1.99, 3.06]])), [[1, 2, 3]], rtol=1e-12)
-    with pytest.raises(
-        CalibrationError, match='choose an IMU with --number: the file has imu0, imu1'
-    ):
+    with pytest.raises(CalibrationError, match='an IMU with --number: the file has imu0, imu1'):
         import_calibration(f'imu0:\n{imu}imu1:\n{imu}', serial='7')
 
 

@@ -81,11 +81,8 @@ def test_a_recording_on_a_full_disk_keeps_what_was_written(small_disk, cli):
     options = ('--positions', '1', '--soak', '30min', '-o', small_disk)
     finished = cli('record', bag, *options, '-q', code=1)
     (line,) = finished.stderr.strip().splitlines()
-    match = re.fullmatch(
-        rf'thermo_comp: error: {small_disk}/01.mcap: cannot be written: No space left on device; '
-        r'the part written is in (\S+)',
-        line,
-    )
+    reason = 'cannot be written: No space left on device; the part written is in'
+    match = re.fullmatch(rf'thermo_comp: error: {small_disk}/01.mcap: {reason} (\S+)', line)
     assert match, line
     (kept,) = small_disk.iterdir()
     assert kept.name == match[1]
@@ -97,11 +94,9 @@ def test_a_recording_on_a_full_disk_keeps_what_was_written(small_disk, cli):
 
 @pytest.mark.parametrize('name', COMMANDS)
 def test_output_into_a_read_only_folder_fails_in_one_line(folder, cli, name):
-    if os.geteuid():
-        locked = folder / 'locked'
-        locked.mkdir(mode=0o500)
-    else:
-        locked = Path('/proc')  # a folder in which not even root can write
+    # Not even root can write in /proc.
+    locked = folder / 'locked' if os.geteuid() else Path('/proc')
+    locked.mkdir(mode=0o500, exist_ok=True)
     before, _ = COMMANDS[name]
     finished = cli(*before, locked / name, code=1, cwd=folder)
     (line,) = finished.stderr.strip().splitlines()[-1:]
@@ -142,8 +137,7 @@ def run(script, *arguments, cwd):
     [
         pytest.param('unit.yaml', 'before', marks=pytest.mark.slow),
         pytest.param('page.html', 'before', marks=pytest.mark.slow),
-        ('bag.mcap', 'before'),
-        ('bag.mcap', 'writing'),
+        *(('bag.mcap', 'before'), ('bag.mcap', 'writing')),
     ],
 )
 def test_a_killed_command_leaves_the_old_file(folder, name, point):

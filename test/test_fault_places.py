@@ -11,23 +11,10 @@ Every published sample must have an error below five claimed standard deviations
 import math
 import re
 
+import fault_rig as rig
 import numpy as np
 import pytest
 from conftest import ROOT
-from fault_rig import (
-    BOARD_LAG_S,
-    RAMP_K_S,
-    START_NS,
-    bag,
-    chain,
-    corrected,
-    force_at,
-    frozen,
-    seconds_of,
-    stop,
-    unit,
-    value,
-)
 from fault_rows import ROWS
 
 PAGE = ROOT / 'docs' / 'faults.md'
@@ -37,22 +24,22 @@ SIGMAS = 5.0
 @pytest.mark.parametrize(
     'inject',
     [
-        chain(stop('board', 64.0, 84.0), stop('case', 64.0, 84.0)),
-        chain(stop('board', 76.0, 96.0), stop('case', 76.0, 96.0)),
-        chain(frozen('board', 112.0, 115.0), frozen('case', 112.0, 115.0)),
-        value('case', 44.0, 64.0, lambda v: v + 5.0),
-        chain(
-            value('board', 68.0, 88.0, lambda v: v + 5.0),
-            value('case', 68.0, 88.0, lambda v: v + 5.0),
+        rig.chain(rig.stop('board', 64.0, 84.0), rig.stop('case', 64.0, 84.0)),
+        rig.chain(rig.stop('board', 76.0, 96.0), rig.stop('case', 76.0, 96.0)),
+        rig.chain(rig.frozen('board', 112.0, 115.0), rig.frozen('case', 112.0, 115.0)),
+        rig.value('case', 44.0, 64.0, lambda v: v + 5.0),
+        rig.chain(
+            rig.value('board', 68.0, 88.0, lambda v: v + 5.0),
+            rig.value('case', 68.0, 88.0, lambda v: v + 5.0),
         ),
     ],
     ids=['both stop early', 'both stop later', 'both freeze', 'case steps', 'both step'],
 )
 def test_every_published_error_is_below_five_claimed_sd(inject):
-    stamps, table = corrected(inject(bag()))
-    seconds = (stamps - START_NS) * 1e-9
+    stamps, table = rig.corrected(inject(rig.bag()))
+    seconds = (stamps - rig.START_NS) * 1e-9
     sd = np.sqrt(table[:, [3, 6, 8]])
-    off = (np.abs(table[:, :3] - force_at(seconds)) / sd).max(axis=1)
+    off = (np.abs(table[:, :3] - rig.force_at(seconds)) / sd).max(axis=1)
     assert seconds[off > SIGMAS].tolist() == []
     # Before a fault the published sd must be small: it must not always be as large as for a fault.
     assert sd[450:540].max() < 3e-4
@@ -60,9 +47,9 @@ def test_every_published_error_is_below_five_claimed_sd(inject):
 
 def settling_s():
     """Return the time from the end of a ramp to the end of the dynamic regime [s]."""
-    detector = unit().detector
-    ramp = 60.0 * RAMP_K_S
-    return BOARD_LAG_S * math.log(ramp / detector.relaxed_rate_k_min) + detector.dwell_s
+    detector = rig.unit().detector
+    ramp = 60.0 * rig.RAMP_K_S
+    return rig.BOARD_LAG_S * math.log(ramp / detector.relaxed_rate_k_min) + detector.dwell_s
 
 
 def ended_s(row):
@@ -70,18 +57,17 @@ def ended_s(row):
     at, _ = row.shift
     if math.isfinite(at):
         return at
-    clean = row.source or bag()
+    clean = row.source or rig.bag()
     faulty = row.inject(list(clean))
     n_same = 0
     while n_same < len(clean) and repr(clean[-1 - n_same]) == repr(faulty[-1 - n_same]):
         n_same += 1
-    return seconds_of(clean[-1 - n_same][1])
+    return rig.seconds_of(clean[-1 - n_same][1])
 
 
 def test_output_recovers_from_transient_faults_within_the_settling_time():
-    back = {
-        row.fault: row.recovered - ended_s(row) for row in ROWS if 0 < row.recovered < math.inf
-    }
+    rows = [row for row in ROWS if 0 < row.recovered < math.inf]
+    back = {row.fault: row.recovered - ended_s(row) for row in rows}
     assert {fault: s for fault, s in back.items() if s > settling_s()} == {}
     page = PAGE.read_text()
     assert f'the settling time is {settling_s():.0f} s' in page

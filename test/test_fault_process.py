@@ -22,6 +22,7 @@ from thermo_comp.unit.calibration import Unit
 from thermo_comp.unit.calibration_file import SIZE_LIMIT, dump_calibration, save_calibration
 
 SIGMAS = 5.0
+SLOW = pytest.mark.slow
 
 
 @pytest.fixture
@@ -74,9 +75,8 @@ def test_a_node_killed_in_a_ramp_restarts_with_larger_covariance(path):
     assert (first.covariance[:, 0, 0] > 4.0 * undisturbed[at : at + n, 3].max()).all()
     assert max(sigmas(first), sigmas(rest)) < SIGMAS
     late = rest.stamp_ns > START_NS + 280 * 1_000_000_000
-    np.testing.assert_allclose(
-        rest.force[late], undisturbed[-late.sum() :, :3], rtol=0.0, atol=9.80665e-6
-    )
+    expected = undisturbed[-late.sum() :, :3]
+    np.testing.assert_allclose(rest.force[late], expected, rtol=0.0, atol=9.80665e-6)
 
 
 def replaced(path):
@@ -151,9 +151,8 @@ def test_bad_calibration_files_leave_the_running_calibration(path, tmp_path):
             assert '\n' not in result.reason
     n = sum(len(block.force) for block in heard)
     table = corrected(events)[1][:n, :3]
-    np.testing.assert_allclose(
-        np.concatenate([block.force for block in heard]), table, rtol=0.0, atol=1e-9
-    )
+    force = np.concatenate([block.force for block in heard])
+    np.testing.assert_allclose(force, table, rtol=0.0, atol=1e-9)
     assert n == sum(e[0] == 'counts' for e in events if seconds_of(e[1]) < 10.0 * len(DAMAGES))
 
 
@@ -200,9 +199,7 @@ def test_many_reloads_at_1_khz_lose_no_sample(tmp_path):
     assert (np.abs(heard.force - force_at(seconds)) < (SIGMAS + 1.0) * sd).all()
 
 
-@pytest.mark.parametrize(
-    'number', [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize('number', [signal.SIGINT, pytest.param(signal.SIGTERM, marks=SLOW)])
 def test_a_signal_while_samples_flow_ends_the_node_cleanly(path, number):
     with bench(path) as node:
         heard = node.play(bag(duration_s=20.0))

@@ -39,8 +39,7 @@ def left_by(pair, **options):
     time_s = held_out.time_s[: 8 * n].reshape(n, 8).mean(axis=1)
     counts = held_out.counts[: 8 * n].reshape(n, 8, 3).mean(axis=1)
     corrected = calibration.correct(time_s, counts, **held_out.temperatures)
-    # A fit to two positions leaves bias, K and M uncertain: in a third position the claimed sd of
-    # an axis exceeds 1 mg.
+    # A fit to two positions leaves bias, K and M uncertain: an axis' sd in a third exceeds 1 mg.
     sd = np.sqrt(np.nanmedian(np.einsum('nii->ni', corrected.covariance), axis=0))
     assert (sd > 1000.0 * MICRO_G).any()
     return np.asarray(minutes(corrected.specific_force).std(axis=0))
@@ -61,6 +60,7 @@ def test_a_model_without_lags_leaves_a_drift_in_a_third_position():
 
 OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2')
 UP = np.array([0.48, -0.6, 0.64])
+FACES = np.vstack((np.eye(3), -np.eye(3)))
 SLOPE = np.array([1.0, -0.5, 2.0])
 
 
@@ -74,7 +74,7 @@ def one_position():
 
 def test_a_full_scale_that_the_bags_do_not_show_is_named(one_position):
     # WHY: the node dropped all samples above 2 g of a sensor of 16 g, and no command had said so.
-    (text,) = [f.message for f in one_position.findings if f.name == 'full-scale']
+    text = findings_of(one_position)['full-scale']
     assert text.startswith('samples of 19.613 m/s^2 (2 times gravity) or more')
     reduced = [reduce_bag(Rest(np.random.default_rng(1)).source(), OPTIONS)]
     stated = replace(OPTIONS, full_scale=156.9)
@@ -107,11 +107,8 @@ def tumbled(n):
 
 def ratios_of(calibration, low, high, slopes):
     """Return error / claimed sd of the drift of each axis between two temperatures."""
-    covariance, layout, pulls = (
-        calibration.posterior.covariance(),
-        parameter_layout(calibration),
-        [],
-    )
+    covariance, pulls = calibration.posterior.covariance(), []
+    layout = parameter_layout(calibration)
     for axis, block, slope in zip(calibration.static.axes(), layout.bias, slopes, strict=True):
         family = axis.bias_function
         along = np.subtract(family.basis(high), family.basis(low))
@@ -121,8 +118,8 @@ def ratios_of(calibration, low, high, slopes):
     return np.abs(pulls)
 
 
-def names_of(result):
-    return {finding.name for finding in result.findings}
+def findings_of(result):
+    return {finding.name: finding.message for finding in result.findings}
 
 
 def test_one_position_gives_bias_over_temperature_on_three_axes(one_position):
@@ -143,9 +140,7 @@ def test_one_position_leaves_the_scale_at_its_prior(one_position):
     for block in parameter_layout(calibration).scale:
         assert sd[block.static] == pytest.approx(0.05, rel=0.3)
     np.testing.assert_allclose(calibration.misalignment_sd, 1e-2, rtol=0.02)
-    assert 'keep their prior' in next(
-        finding.message for finding in one_position.findings if finding.name == 'positions'
-    )
+    assert 'keep their prior' in findings_of(one_position)['positions']
 
 
 def test_after_soaks_in_one_position_the_drift_error_is_within_three_claimed_sd(rng):
@@ -178,7 +173,7 @@ def test_rests_at_three_temperatures_give_the_bias_slope_despite_a_warm_up_of_th
     # The mean |f| of a rest has a noise of 1 ug. As the board warms up by 1 K, the temperature of
     # the sensor in a rest is uncertain by 0.1 K.
     np.testing.assert_allclose(slopes, 0.1 * MG * SLOPE, atol=0.002 * MG)
-    assert 'misfit' not in names_of(result)
+    assert 'misfit' not in findings_of(result)
     # Soaks do not determine the weights of lags, which can be as large as the bias slope: their
     # claimed sd is between half of the bias slope and the bias slope.
     variance, layout = np.diag(calibration.posterior.covariance()), parameter_layout(calibration)
@@ -229,7 +224,7 @@ def test_positions_without_a_thermometer_give_constants_and_wide_temperature_slo
     np.testing.assert_allclose([axis.bias for axis in axes], (0.1, -0.2, 0.3), atol=0.005)
     np.testing.assert_allclose([axis.scale_factor for axis in axes], 1.0, atol=0.001)
     assert calibration.response == ()
-    assert 'temperature' in names_of(result)
+    assert 'temperature' in findings_of(result)
     # Temperature slopes stay at their prior: 0, with sd 5 mm/s^2/K (bias) and 200 ppm/K (scale).
     assert not calibration.needs_temperature
     sd = np.sqrt(np.diag(calibration.posterior.covariance()))
@@ -242,20 +237,19 @@ def test_positions_without_a_thermometer_give_constants_and_wide_temperature_slo
     np.testing.assert_allclose(out.specific_force, [[0.0, 0.0, GRAVITY]], atol=0.02)
     left = np.array([0.05, 0.05, np.hypot(0.05, 2e-3 * GRAVITY)])
     # `left` [m/s^2]: temperature sd, 10 K, times sd of the slopes; sample noise: 0.02 m/s^2.
-    np.testing.assert_allclose(
-        np.sqrt(np.diagonal(out.covariance[0])), np.hypot(left, 0.02), rtol=0.05
-    )
+    sd = np.sqrt(np.diagonal(out.covariance[0]))
+    np.testing.assert_allclose(sd, np.hypot(left, 0.02), rtol=0.05)
 
 
 def test_a_fit_that_cannot_determine_the_repeatability_of_mountings_reports_its_assumption(rng):
     # The nine constants of a triad fit nine |f| exactly, so |f| shows no mounting offset.
-    assert 'mountings' in names_of(tumbled(9))
+    assert 'mountings' in findings_of(tumbled(9))
     stated = fit([turned(rng, positions(9, 3))], replace(OPTIONS, mounting_sd=1e-3))
-    assert 'mountings' not in names_of(stated)
+    assert 'mountings' not in findings_of(stated)
     # One recording of twelve positions has one turn-on, twelve recordings have twelve turn-ons.
-    assert 'mountings' in names_of(tumbled(12))
+    assert 'mountings' in findings_of(tumbled(12))
     twelve = fit([turned(rng, [up]) for up in positions(12, 3)], OPTIONS)
-    assert 'mountings' not in names_of(twelve)
+    assert 'mountings' not in findings_of(twelve)
 
 
 def test_counts_of_32_bits_are_fitted(rng):
@@ -316,7 +310,7 @@ def test_rests_of_one_mounting_do_not_show_how_well_mountings_repeat(rng):
     sd, sd_cut = (done.calibration.static.x.residual_sd_m_s2 for done in (whole, cut))
     # Nine values of |f| do not determine the mounting sd, which stays at its prior in both fits.
     assert sd_cut == pytest.approx(sd, rel=0.1)
-    assert 'mountings' in names_of(cut)
+    assert 'mountings' in findings_of(cut)
     # All rests of a mounting are left out together: nine mountings give nine left-out |f|.
     assert len(cut.fit.selected.score.norms.square) == 9
 
@@ -398,13 +392,11 @@ def test_turn_ons_between_six_faces_are_not_taken_for_a_misalignment(rng, size):
     # sd of the misalignments was 5 to 12 mrad.
     M = np.array([[1.0, 0.0, 0.0], [2e-3, 1.0, 0.0], [-2e-3, 1e-3, 1.0]])
     sensed = np.linalg.inv(M)
-    faces = np.vstack((np.eye(3), -np.eye(3)))
-    ups = np.tile(faces, (3, 1)) + 0.03 * rng.standard_normal((18, 3))
+    ups = np.tile(FACES, (3, 1)) + 0.03 * rng.standard_normal((18, 3))
     ups = ups / np.linalg.norm(ups, axis=1, keepdims=True) @ sensed.T
     bags = [turned(rng, some + 1e-3 * rng.standard_normal(3)) for some in ups.reshape(-1, size, 3)]
     calibration = fit(bags, OPTIONS).calibration
-    rows, columns = [1, 2, 2], [0, 0, 1]
-    error = (np.array(calibration.misalignment) - M)[rows, columns]
+    error = (np.array(calibration.misalignment) - M)[[1, 2, 2], [0, 0, 1]]
     sd = np.array(calibration.misalignment_sd)
     assert np.abs(error).max() < 5e-3
     assert np.abs(error / sd).max() < 3.0
@@ -419,10 +411,8 @@ def test_turn_ons_between_six_faces_are_not_taken_for_a_misalignment(rng, size):
 
 def test_the_claimed_sd_from_six_faces_contains_the_cross_axis_sensitivity_of_a_mems(rng):
     # |f| on six faces does not show the cross-axis sensitivities of 0.8, -0.6 and 0.5 %.
-    M = np.array([[1.0, 0.0, 0.0], [8e-3, 1.0, 0.0], [-6e-3, 5e-3, 1.0]])
-    sensed = np.linalg.inv(M)
-    faces = np.vstack((np.eye(3), -np.eye(3)))
-    calibration = fit([turned(rng, faces @ sensed.T)], OPTIONS).calibration
+    sensed = np.linalg.inv([[1.0, 0.0, 0.0], [8e-3, 1.0, 0.0], [-6e-3, 5e-3, 1.0]])
+    calibration = fit([turned(rng, FACES @ sensed.T)], OPTIONS).calibration
     corners = GRAVITY * positions(64, 5)
     corners = corners[np.abs(corners).min(axis=1) > 0.3 * GRAVITY]
     reading = corners @ sensed.T + (0.1, -0.2, 0.3)
@@ -435,14 +425,8 @@ def test_the_claimed_sd_from_six_faces_contains_the_cross_axis_sensitivity_of_a_
 
 def test_six_attitudes_that_hardly_determine_the_scale_factors_give_scale_factors_near_1(rng):
     # The squared x, y and z components of the attitudes are almost linearly dependent.
-    up = [
-        [-7, 88, 48],
-        [14, -89, -44],
-        [87, -16, 47],
-        [-32, 39, -86],
-        [-56, -45, 70],
-        [78, 22, -58],
-    ]
+    up = [[-7, 88, 48], [14, -89, -44], [87, -16, 47], [-32, 39, -86], [-56, -45, 70],
+          [78, 22, -58]]  # fmt: skip
     up /= np.linalg.norm(up, axis=1)[:, None]
     sensed = np.linalg.inv([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.02, 0.0, 1.0]])
     axes = fit([turned(rng, up @ sensed.T)], OPTIONS).calibration.axes
@@ -453,7 +437,7 @@ def test_six_attitudes_that_hardly_determine_the_scale_factors_give_scale_factor
 
 def test_samples_after_a_clock_that_was_set_back_are_counted(rng):
     source = turned(rng, positions(12, 3))
-    assert 'dropped' not in names_of(tumbled(12))
+    assert 'dropped' not in findings_of(tumbled(12))
     (block,) = source.blocks()
     stamps = block.accel_stamp_ns
     # In the middle of the recording the clock is set back by a quarter of the recording's length.
@@ -461,8 +445,7 @@ def test_samples_after_a_clock_that_was_set_back_are_counted(rng):
     stamps[n // 2 :] -= stamps[n // 4] - stamps[0]
     blocks = (replace(block, accel_stamp_ns=stamps),)
     back = fit([replace(source, blocks=lambda: iter(blocks))], OPTIONS)
-    message = next(finding.message for finding in back.findings if finding.name == 'dropped')
-    assert f'({n // 4}, 25 % of all)' in message
+    assert f'({n // 4}, 25 % of all)' in findings_of(back)['dropped']
 
 
 def test_rests_of_5_s_determine_the_white_noise(rng):

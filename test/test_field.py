@@ -37,16 +37,14 @@ def test_derivatives_of_a_rest_by_all_parameters_agree_with_finite_differences()
     values, scale = parameters_of(unit), np.array([axis.scale_factor for axis in unit.axes])
     covariance = unit.posterior.covariance()
     layout = parameter_layout(unit)
-    levels = {block.static: axis for axis, block in enumerate(layout.scale)}
-    levels |= {block.dynamic: axis for axis, block in enumerate(layout.scale)}
+    levels = {level for block in layout.scale for level in (block.static, block.dynamic)}
+    levels |= {block.static for block in layout.bias}
     # Test the derivatives by every other parameter. The block of parameters of a bias or scale has
     # an odd length, so each kind of parameter is tested either in the bias or in the scale.
     for k in range(0, layout.n_parameters, 2):
         step = 1e-7
         moved = values.copy()
-        if k in levels:
-            continue  # the derivatives by an axis's scale factor K are tested below
-        if k in {block.static for block in layout.bias}:
+        if k in levels:  # the derivatives by an axis's scale factor K are tested below
             continue
         moved[k] += step
         residual = series_of(logged, with_parameters(unit, scale, moved, covariance)).residual
@@ -54,9 +52,8 @@ def test_derivatives_of_a_rest_by_all_parameters_agree_with_finite_differences()
         assert np.allclose(slope, series.by_parameter[:, k], atol=2e-4 * abs(slope).max() + 1e-9)
     for axis, block in enumerate(layout.scale):
         factor = np.where(np.arange(3) == axis, 1.0 + 1e-6, 1.0)
-        residual = series_of(
-            logged, with_parameters(unit, scale * factor, values, covariance)
-        ).residual
+        changed = with_parameters(unit, scale * factor, values, covariance)
+        residual = series_of(logged, changed).residual
         slope = (series.residual - residual) / 1e-6
         by_level = series.by_level[:, axis + 3] * unit.gravity_m_s2
         assert np.allclose(slope, by_level, atol=1e-4)
@@ -84,10 +81,9 @@ def test_an_update_with_the_true_variances_equals_a_kalman_filter():
     rows = rows_of(series, 1e-9)
     to_file = np.zeros((parameter_layout(unit).n_parameters, 6))
     layout = parameter_layout(unit)
-    for axis in range(3):
-        to_file[[layout.bias[axis].static, layout.bias[axis].dynamic], axis] = field_units.K
-        places = [layout.scale[axis].static, layout.scale[axis].dynamic]
-        to_file[places, axis + 3] = 1.0 / field_units.G
+    for axis, (bias, scale) in enumerate(zip(layout.bias, layout.scale, strict=True)):
+        to_file[[bias.static, bias.dynamic], axis] = field_units.K
+        to_file[[scale.static, scale.dynamic], axis + 3] = 1.0 / field_units.G
     model = Model(rows, unit, float(field_units.DAY_ZERO))
     solved = solve(model, ageing, to_file, np.zeros((len(to_file), 3)), 0.0)
     for axis in range(3):
@@ -121,17 +117,14 @@ def test_updates_of_ageing_units_have_small_errors_of_at_most_1_4_claimed_sd_rms
         counts = field_units.measured(force, np.zeros(1), truth)[0] * field_units.K
         start, rest = history.rests[-1]
         thermal = (field_units.REFERENCE_C, *rest.state[1:])
-        after = series_of([(start, replace(rest, mean=tuple(counts), state=thermal))], unit)
-        new = series_of(
-            [(start, replace(rest, mean=tuple(counts), state=thermal))], updated.calibration
-        )
+        last = [(start, replace(rest, mean=tuple(counts), state=thermal))]
+        after, new = series_of(last, unit), series_of(last, updated.calibration)
         squares.append((float(after.residual[0]), float(new.residual[0])))
         ratios.append(float(new.residual[0] / new.claim[0]))
         if kind == 'level':
             assert abs(updated.ageing.turn_on / (20 * MICRO_G) - 1.0) < 0.5
     before, left = np.sqrt(np.mean(np.square(squares), axis=0)) / MICRO_G
-    # A Kalman filter with the true variances leaves |f| - g of 12 to 14 ug RMS
-    # (benchmarks/field.py).
+    # A Kalman filter with the true variances leaves 12 to 14 ug RMS (benchmarks/field.py).
     assert before > 100.0
     assert left < 30.0
     assert np.sqrt(np.mean(np.square(ratios))) < 1.4
@@ -151,18 +144,16 @@ def test_an_update_does_not_change_the_constants_of_axes_that_no_rest_observes()
     # The jump of the z reading is 300 ug; turn-on offsets (sd 20 ug) leave an error below 15 ug.
     assert updated.axis_changes[2].reading == pytest.approx(300.0 * MICRO_G, abs=15.0 * MICRO_G)
     layout = parameter_layout(unit)
-    old_sd, new_sd = (
-        np.sqrt(np.diag(cal.posterior.covariance()))[layout.bias[0].static] for cal in (unit, new)
-    )
-    assert new_sd > old_sd
+    old, aged = (np.diag(each.posterior.covariance()) for each in (unit, new))
+    assert aged[layout.bias[0].static] > old[layout.bias[0].static]
 
 
 def test_a_jump_is_distinguished_from_ageing(rng):
     unit = known()
     jumped = update(series_of(rests(unit, upright, jump_of(300.0, 10.0)), unit), unit)
     (change,) = jumped.changes
-    assert change.time == pytest.approx(series_of(
-        rests(unit, upright, no_error), unit).time[0] + 10.0, abs=0.4)  # fmt: skip
+    first = series_of(rests(unit, upright, no_error), unit).time[0]
+    assert change.time == pytest.approx(first + 10.0, abs=0.4)
     assert jumped.ageing.bias < 10.0 * MICRO_G
     steps = 60.0 / np.sqrt(3.0) * MICRO_G * rng.standard_normal((90, 3))
     walked = np.cumsum(steps, axis=0)
@@ -198,7 +189,7 @@ def stepped(history, size, day):
     ]
 
 
-@pytest.mark.parametrize('day', [15, 0])
+@pytest.mark.parametrize('day', [15, pytest.param(0, marks=pytest.mark.slow)])
 def test_a_change_of_gravity_is_not_taken_for_a_change_of_three_scales(day):
     # Bias and scale walk by 15 ug and 10 ppm per root day; from `day` on gravity is 300 ug larger.
     unit, size = field_units.calibration(), 300.0 * MICRO_G
@@ -250,29 +241,30 @@ def test_samples_of_another_unit_are_refused(first):
         refuse_another_unit(result)
 
 
+def known_with_curves():
+    unit = field_units.calibration()
+    return known(static=unit.static, dynamic=unit.dynamic)
+
+
+def on_z(rest, counts):
+    return replace(rest, mean=(*rest.mean[:2], rest.mean[2] + counts))
+
+
 def test_a_changed_curve_is_detected_and_corrected():
     # The slope of the z bias changes by 5 ug/K; the rests are at 15 to 25 degC.
-    unit = known(
-        static=field_units.calibration().static, dynamic=field_units.calibration().dynamic
-    )
+    unit = known_with_curves()
     logged = rests(unit, upright, no_error, days=30)
-    bent = [
-        (s, replace(r, mean=(*r.mean[:2], r.mean[2] + 300.0 * 5 * MICRO_G * (r.state[0] - 20.0))))
-        for s, r in logged
-    ]
+    bent = [(s, on_z(r, 300.0 * 5 * MICRO_G * (r.state[0] - 20.0))) for s, r in logged]
     result = update(series_of(bent, unit), unit)
     assert [change.time for change in result.changes] == [None]
-    curves = [
-        cal.static.z.bias_function.coefficients[1] / 300.0 for cal in (unit, result.calibration)
-    ]
-    assert curves[1] - curves[0] == pytest.approx(5.0 * MICRO_G, abs=1.5 * MICRO_G)
+    both = (unit, result.calibration)
+    before, after = (each.static.z.bias_function.coefficients[1] / 300.0 for each in both)
+    assert after - before == pytest.approx(5.0 * MICRO_G, abs=1.5 * MICRO_G)
 
 
 def test_the_sd_of_a_bias_slope_that_no_rest_observes_grows_by_1_ug_per_k_and_root_year():
     # Upright rests do not observe the x axis: its bias slope's sd grows by 1 ug/K per root year.
-    unit = known(
-        static=field_units.calibration().static, dynamic=field_units.calibration().dynamic
-    )
+    unit = known_with_curves()
     series = series_of(rests(unit, upright, no_error), unit)
     result, n = update(series, unit), len(series) // 10
     span = np.sort(series.temperature)[[n, -1 - n]]
@@ -285,10 +277,7 @@ def test_a_turn_on_that_contradicts_all_other_turn_ons_is_left_out():
     unit = known()
     logged = rests(unit, upright, jump_of(100.0, 8.0), days=15)
     wrong = logged[80][0]
-    bad = [
-        (s, replace(r, mean=(*r.mean[:2], r.mean[2] + 300.0 * 0.02)) if s == wrong else r)
-        for s, r in logged
-    ]
+    bad = [(s, on_z(r, 300.0 * 0.02) if s == wrong else r) for s, r in logged]
     result = update(series_of(bad, unit), unit)
     assert result.n_outliers == 1
     assert result.axis_changes[2].reading == pytest.approx(100.0 * MICRO_G, abs=20.0 * MICRO_G)
@@ -303,8 +292,9 @@ def test_a_wrong_clock_at_the_start_of_the_node_does_not_change_the_update(tmp_p
     last = logged[-1][0].start_ns
     expected = None
     for number, wrong in enumerate(({}, image, {last: 30 * 10**9})):
+        begins = [wrong.get(s.start_ns, s.start_ns) for s, _ in logged]
         of_image = [
-            (replace(s, start_ns=wrong.get(s.start_ns, s.start_ns)), rest) for s, rest in logged
+            (replace(s, start_ns=at), r) for at, (s, r) in zip(begins, logged, strict=True)
         ]
         read, source, _ = read_rests([write_log(tmp_path / str(number), of_image)], unit)
         assert source.name.startswith('rests until 2030-01-20T23:12:40')
@@ -315,8 +305,7 @@ def test_a_wrong_clock_at_the_start_of_the_node_does_not_change_the_update(tmp_p
 
 
 def test_rests_with_stamps_in_wrong_order_give_a_valid_covariance(rng):
-    # The stamps of a third of the turn-ons are wrong by up to 10 days, so rests change their
-    # order.
+    # Stamps of a third of the turn-ons are wrong by up to 10 days: rests change their order.
     unit = known()
     logged = rests(unit, upright, no_error)
     wrong = {s.start_ns: int(rng.choice((0, 0, 864e12 * rng.uniform(-1, 1)))) for s, _ in logged}
@@ -386,13 +375,12 @@ def test_wrong_arguments_and_logs_of_update_give_a_message(tmp_path, unit_file, 
     log = write_log(tmp_path / 'rests', rests(other, upright, no_error, days=2))
     new = ('-o', tmp_path / 'new.yaml')
     (tmp_path / 'empty').mkdir()
-    for arguments, text in (
-        (('update', unit_file, log, *new), 'rests: no rest of unit T-1'),
-        (('update', unit_file, log, *new), 'unit T-1 (counts): the rests are of T-2 (counts)'),
-        (('update', unit_file, tmp_path / 'empty', *new), 'empty: no rest log: expected a folder'),
-        (('update', unit_file, tmp_path / 'none', *new), 'none: no rest log: expected a folder'),
+    for path, text in (
+        (log, 'rests: no rest of unit T-1 (counts): the rests are of T-2 (counts)'),
+        (tmp_path / 'empty', 'empty: no rest log: expected a folder'),
+        (tmp_path / 'none', 'none: no rest log: expected a folder'),
     ):
-        assert text in cli(*arguments, code=1).stderr
+        assert text in cli('update', unit_file, path, *new, code=1).stderr
     bag = ROOT / 'bags' / 'held_out.mcap'
     assert 'cannot be mixed with bags' in cli('evaluate', log, bag, '-c', unit_file, code=2).stderr
     broken = write_log(tmp_path / 'broken', rests(unit, upright, jump_of(3000.0, 2.0), days=4))
@@ -445,7 +433,7 @@ def test_an_unknown_regime_after_a_turn_on_does_not_increase_the_noise_of_a_rest
     assert np.sqrt(series.noise.max()) < 8.0 * MICRO_G < early.claim.min()
 
 
-@pytest.mark.parametrize('lags', [0.0, 1.0])
+@pytest.mark.parametrize('lags', [pytest.param(0.0, marks=pytest.mark.slow), 1.0])
 def test_unknown_initial_lag_states_are_not_taken_for_scatter_of_rests(rng, lags):
     # A turn-on has three rests, in which 100, 70 and 40 % of the initial lag states remain. Random
     # walks grow by 15 ug (bias) and 10 ug (scale, at 1 g) per root day; sd of turn-ons: 20 ug, of

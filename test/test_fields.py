@@ -57,26 +57,20 @@ parts = st.tuples(words, st.integers(0, 255), floats)
 @given(
     rows=st.lists(
         st.tuples(words, st.lists(words, max_size=3), st.lists(parts, max_size=3), parts),
-        min_size=1,
-        max_size=6,
+        min_size=1, max_size=6,
     ),
     cells=st.lists(floats, min_size=2, max_size=4),
     is_little=st.booleans(),
-)
+)  # fmt: skip
 def test_any_number_of_any_message_layout_is_read(store, rows, cells, is_little):
     kind, part = 'lab_msgs/msg/Deep', store.types['lab_msgs/msg/Part']
     messages = [
         store.types[kind](
-            header(store, START_NS + row, frame),
-            names,
-            [part(*values) for values in own],
-            np.array([7, -8, row], np.int16),
-            np.array(cells, np.float32),
-            True,
-            part(*last),
+            header(store, START_NS + row, frame), names, [part(*values) for values in own],
+            np.array([7, -8, row], np.int16), np.array(cells, np.float32), True, part(*last),
         )
         for row, (frame, names, own, last) in enumerate(rows)
-    ]
+    ]  # fmt: skip
     many = serialized(store, kind, messages, is_little)
 
     def read(path):
@@ -114,9 +108,8 @@ def test_a_path_that_leads_to_no_number_is_refused(store, path, text):
 def test_a_message_that_ends_inside_a_field_is_refused_as_damaged(store):
     kind = 'px4_msgs/msg/SensorAccel'
     field = Field(kind, 'temperature', store.fielddefs)
-    whole = serialized(
-        store, kind, [store.types[kind](1, 2, 3, 0, 0, 0, 25, 0, np.zeros(3, 'u1'))]
-    )
+    message = store.types[kind](1, 2, 3, 0, 0, 0, 25, 0, np.zeros(3, 'u1'))
+    whole = serialized(store, kind, [message])
     torn = Messages.of([next(iter(whole))[:30]], [0], [0])
     assert field.read(whole)[1].tolist() == [25.0]
     with pytest.raises(RecordingError, match='ends inside a field'):
@@ -165,10 +158,8 @@ def driver_bag(path, store, storage=StoragePlugin.MCAP):
                 celsius.append(20.0 + row)
             head = header(store, stamp_ns, 'imu')
             force, still = vector(0.1, 0.2, 9.8 + 0.001 * row), vector(0, 0, 0)
-            imu = store.types['sensor_msgs/msg/Imu'](
-                head, level, zeros, still, zeros, force, zeros
-            )
-            write('/imu/data', log_ns, imu)
+            imu = store.types['sensor_msgs/msg/Imu']
+            write('/imu/data', log_ns, imu(head, level, zeros, still, zeros, force, zeros))
     return celsius
 
 
@@ -207,10 +198,9 @@ def test_two_fields_of_one_message_are_two_inputs(tmp_path, store):
 def test_info_names_topics_that_could_be_a_second_thermometer(tmp_path, store):
     driver_bag(tmp_path / 'bag', store)
     topics = Topics.named({'board': '/case'})
-    messages = [
-        text for text in survey_recording(tmp_path / 'bag', topics).findings if 'no case' in text
-    ]
-    assert messages[0].endswith('with --topic case=TOPIC: /fmu/out/sensor_accel:temperature')
+    findings = survey_recording(tmp_path / 'bag', topics).findings
+    message = next(text for text in findings if 'no case' in text)
+    assert message.endswith('with --topic case=TOPIC: /fmu/out/sensor_accel:temperature')
     both = Topics.named({'board': '/case', 'case': '/fmu/out/sensor_accel:temperature'})
     with open_recording(tmp_path / 'bag', both) as reader:
         assert unused_thermometers(reader) == []

@@ -68,9 +68,8 @@ def test_a_thermometer_on_two_topics_is_used_once():
     bags = []
     for copies in (('board',), ('board', 'case')):
         rng = np.random.default_rng(9)
-        bags.append(
-            [columns(recording(up, rng), f'rest{k}', copies) for k, up in enumerate(UPS[:3])]
-        )
+        records = [recording(up, rng) for up in UPS[:3]]
+        bags.append([columns(each, f'rest{k}', copies) for k, each in enumerate(records)])
     first, second = (tc.fit(each, gravity=G, input='m/s^2', groups=('curve',)) for each in bags)
     assert first.static == second.static
     assert first.axes == second.axes
@@ -90,9 +89,7 @@ def columns_of(slopes, shift=0.0):
 
 @pytest.mark.slow
 @pytest.mark.parametrize('shift', [300.0, -20000.0])
-def test_a_unit_that_has_changed_is_updated_although_its_drift_contradicts_the_prior(
-    shift, monkeypatch
-):
+def test_a_changed_unit_is_updated_although_its_drift_contradicts_the_prior(shift, monkeypatch):
     # WHY: the drift contradicted the prior, so the update excluded all new bags and kept the old
     # constants, whose error was 35 times their claimed sd.
     monkeypatch.setitem(globals(), 'KNEE_C', 5.0)

@@ -36,9 +36,8 @@ def sources_of(records, has_temperature=True, first=0):
 
 
 def fitted(unit, ups, seed, **options):
-    return fit(
-        sources_of(records_of(unit, ups, seed)), FitOptions(gravity=STANDARD_GRAVITY, **options)
-    )
+    sources = sources_of(records_of(unit, ups, seed))
+    return fit(sources, FitOptions(gravity=STANDARD_GRAVITY, **options))
 
 
 def constants(calibration):
@@ -51,10 +50,8 @@ def constants(calibration):
 
 def claimed(calibration):
     """Return the sd of bias [counts], the relative sd of K, and the sd of the elements of M."""
-    layout, sd = (
-        parameter_layout(calibration),
-        np.sqrt(np.diag(calibration.posterior.covariance())),
-    )
+    layout = parameter_layout(calibration)
+    sd = np.sqrt(np.diag(calibration.posterior.covariance()))
     bias, scale = ([block.static for block in blocks] for blocks in (layout.bias, layout.scale))
     return sd[bias], sd[scale], sd[layout.misalignment :]
 
@@ -76,9 +73,8 @@ def golovach():
 
 
 def pulls(found, unit):
-    (bias, scale, M), (bias_sd, scale_sd, M_sd) = (
-        constants(found.calibration), claimed(found.calibration)
-    )  # fmt: skip
+    bias, scale, M = constants(found.calibration)
+    bias_sd, scale_sd, M_sd = claimed(found.calibration)
     return np.concatenate(((bias - unit.bias_at_reference) / bias_sd,
                            (scale / unit.scale_factor - 1.0) / scale_sd,
                            (M - np.array(unit.M)[[1, 2, 2], [0, 0, 1]]) / M_sd))  # fmt: skip
@@ -140,8 +136,7 @@ def test_a_fit_has_all_positions_sources_sections_and_groups(response):
     judged = {(group.part, group.group) for group in calibration.evidence}
     # In the unit OWN_LAGS each axis depends on the temperature of a part that lags the board.
     assert {('bias', 'part'), ('scale', 'part')} <= judged
-    # A response term without weights exists only for the covariance and has no entry in
-    # `evidence`.
+    # A response term without weights exists only for the covariance, without entry in `evidence`.
     weighty = [term for term in calibration.response if any((*term.bias, *term.scale))]
     assert {term.group for term in weighty} <= {group for _, group in judged}
 
@@ -195,10 +190,8 @@ def test_the_claimed_sd_of_nine_positions_includes_turn_on_offsets(rng):
     # constants was 3 to 5 times too small.
     turn_ons = PLAIN.scale_factor * rng.normal(0.0, 50e-6 * STANDARD_GRAVITY, (9, 3))
     records = records_of(PLAIN, positions(9, 1), 1)
-    switched_on = [
-        replace(record, counts=record.counts + by)
-        for record, by in zip(records, turn_ons, strict=True)
-    ]
+    pairs = zip(records, turn_ons, strict=True)
+    switched_on = [replace(record, counts=record.counts + by) for record, by in pairs]
     options = FitOptions(gravity=STANDARD_GRAVITY, groups=('curve', 'set'))
     found = fit(sources_of(switched_on), options)
     # For a unit with the noise of PLAIN the prior sd of turn-ons is some 50 ug. The RMS of nine
@@ -220,32 +213,27 @@ def short(accel, board, name='bag'):
 
 
 @pytest.mark.parametrize(
-    ('accel', 'board', 'message'),
-    [
-        (np.zeros((0, 3)), np.zeros(0), 'no accelerometer samples'),
-        (
-            np.random.default_rng(1).normal(0, 300, (100, 3)),
-            np.full(30, 20.0),
-            'no still interval',
-        ),
-    ],
+    ('n', 'message'), [(0, 'no accelerometer samples'), (100, 'no still interval')]
 )
-def test_bags_without_rests_or_samples_are_refused(accel, board, message):
+def test_bags_without_rests_or_samples_are_refused(rng, n, message):
+    bag = short(rng.normal(0, 300, (n, 3)), np.full(n // 3, 20.0))
     with pytest.raises(FitError, match=f'bag: {message}'):
-        fit([short(accel, board)], FitOptions(gravity=STANDARD_GRAVITY))
+        fit([bag], FitOptions(gravity=STANDARD_GRAVITY))
 
 
-def faces(scale, offset, rng):
-    forces = (scale * (up + 1e-3 * rng.standard_normal((4000, 3))) + offset for up in FACES)
+def faces_of(samples):
     celsius = np.linspace(10.0, 40.0, 40)
-    return [short(accel, celsius, name=f'face{k}') for k, accel in enumerate(forces)]
+    return [short(accel, celsius, name=f'face{k}') for k, accel in enumerate(samples)]
 
 
 def test_accelerations_given_as_counts_are_refused(rng):
-    with pytest.raises(FitError, match=r'norm 9.81 and are not whole numbers: they look like m/s'):
-        fit(faces(9.81, 0.01, rng), FitOptions(gravity=9.81))
-    with pytest.raises(FitError, match='they look like g, not counts'):
-        fit(faces(1.0, 0.01, rng), FitOptions(gravity=9.81))
+    for scale, text in (
+        (9.81, r'norm 9.81 and are not whole numbers: they look like m/s'),
+        (1.0, 'they look like g, not counts'),
+    ):
+        forces = (scale * (up + 1e-3 * rng.standard_normal((4000, 3))) + 0.01 for up in FACES)
+        with pytest.raises(FitError, match=text):
+            fit(faces_of(forces), FitOptions(gravity=9.81))
 
 
 @pytest.mark.parametrize('n_averaged', [0, 1, 4000])
@@ -256,9 +244,7 @@ def test_counts_of_24_bits_that_a_driver_averages_are_fitted(n_averaged, rng):
         whole[:n_averaged] += 0.25
         return whole
 
-    celsius = np.linspace(10.0, 40.0, 40)
-    sources = [short(counts(up), celsius, name=f'face{k}') for k, up in enumerate(FACES)]
-    result = fit(sources, FitOptions(gravity=9.81))
+    result = fit(faces_of(map(counts, FACES)), FitOptions(gravity=9.81))
     messages = [finding.message for finding in result.findings]
     is_named = any(message.startswith('the samples are not whole numbers') for message in messages)
     assert is_named == (n_averaged > 0)
@@ -275,5 +261,4 @@ def test_misalignments_of_a_mems_unit_are_determined_by_nine_positions():
     # A fit with only the groups of columns that the unit needs takes half the time.
     options = FitOptions(gravity=STANDARD_GRAVITY, groups=('curve', 'set', 'gradient', 'board'))
     calibration = fit(sources_of(records), options).calibration
-    M = np.array(calibration.misalignment)
-    np.testing.assert_allclose(M, unit.M, atol=3e-4)
+    np.testing.assert_allclose(calibration.misalignment, unit.M, atol=3e-4)

@@ -42,9 +42,8 @@ def recorded(rng, up, name, targets):
     bias += np.outer(change, (9.0, -12.0, 6.0)) * (1.0 + 0.01 * t[:, None])
     force = GRAVITY * up * (1.0 + 6e-5 * t[:, None])
     stamps = 10**18 + np.rint(time * 1e9).astype(np.int64)
-    board, case = (
-        np.round(celsius + 0.003 * rng.standard_normal(len(time)), 4) for celsius in (board, case)
-    )
+    noise = 0.003 * rng.standard_normal((2, len(time)))
+    board, case = np.round(np.stack((board, case)) + noise, 4)
     accel = force + bias * MICRO + NOISE * rng.standard_normal((len(time), 3))
     # One reading in 10 s suffices for ramps of 1 K/min.
     readings = (stamps[::5], board[::5], stamps[::5] + 1, case[::5])

@@ -40,24 +40,16 @@ def good(rng):
     """Make windows of 18 positions, each with a ramp up, a ramp down and a soak in 80 min."""
     data, up = table_of(Truth(), 18, rng)
     case = np.interp(data.time, [0.0, 1800.0, 3000.0, 3600.0], [5.0, 45.0, 5.0, 5.0])
-    rate = np.interp(
-        data.time, [0.0, 1799.0, 1800.0, 3000.0, 3001.0], [1 / 45, 1 / 45, -1 / 30, -1 / 30, 0.0]
-    )
-    gradient = 600.0 * rate
+    ends = [0.0, 1799.0, 1800.0, 3000.0, 3001.0]
+    rate = np.interp(data.time, ends, [1 / 45, 1 / 45, -1 / 30, -1 / 30, 0.0])
+    gradient, nothing = 600.0 * rate, np.zeros((len(case), 0))
+    sets = Sets(Polynomial((0.0, 1.0)), Polynomial((0.0,)))
+    # The ramp down and the soak count as static: 62 % of the time, at all temperatures.
     windows = ThermalWindows(
-        model=Model(
-            '', Sets(Polynomial((0.0, 1.0)), Polynomial((0.0,))), (), (), DetectorSettings(), 20.0
-        ),
-        data=data,
-        temperature=case - gradient,
-        rate=rate,
-        # The ramp down and the soak count as static: 62 % of the time, at all temperatures.
-        weight=(rate > 0.0).astype(float),
-        gradient=gradient,
-        raw=np.zeros((len(case), 0)),
-        angular_rate=np.zeros((len(case), 0)),
-        typical_count=100.0,
-    )
+        model=Model('', sets, (), (), DetectorSettings(), 20.0), data=data,
+        temperature=case - gradient, rate=rate, weight=(rate > 0.0).astype(float),
+        gradient=gradient, raw=nothing, angular_rate=nothing, typical_count=100.0,
+    )  # fmt: skip
     return windows, up
 
 
@@ -117,9 +109,8 @@ def test_rests_at_room_temperature_are_sufficient_with_a_prior_of_the_unit(good)
     findings = findings_of(desk, up, prior=prior)
     assert not {'ramps', 'soaks', 'soak'} & {*findings}
     assert findings['span'].level == 'good'
-    assert (
-        'the prior gives the effect of temperature from 5 to 35 degC' in findings['span'].message
-    )
+    text = 'the prior gives the effect of temperature from 5 to 35 degC'
+    assert text in findings['span'].message
     warm = replace(desk, temperature=desk.temperature + 20.0)
     advised = findings_of(warm, up, prior=prior)['span']
     assert (advised.level, 'the bags reach 42 to 4' in advised.message) == ('advice', True)
@@ -162,12 +153,10 @@ def test_geometry_is_the_largest_sd_of_nine_parameters_per_sd_of_the_norm(rng):
     assert geometry(up, with_misalignment=True) == pytest.approx(scatter, rel=0.05)
 
 
-def judged(
-    raw, fitted, slow, left_out=None, span=30.0, drift=500.0, noise=0.1, sigma=0.1, **options
-):
+def judged(raw, fitted, slow, left=None, span=30.0, drift=500.0, noise=0.1, sigma=0.1, **options):
     steps = [
         residual_statistics(np.full(0 if rms is None else 9, (rms or 0.0) * MICRO_G))
-        for rms in (raw, raw, raw, fitted, left_out)
+        for rms in (raw, raw, raw, fitted, left)
     ]
     prior = Parts(sigma=sigma * MICRO_G, informative=None)
     fit = Parts(
@@ -185,9 +174,8 @@ def test_only_a_residual_that_no_initial_lag_state_explains_contradicts_the_prio
     # WHY: rests that began before the unit had settled gave the advice to check the prior.
     prior = calibration()
     assert 'prior' not in judged(10.0, 50.0, 1.0, prior=prior, sigma=10.0)
-    assert (
-        'contradict the prior' in judged(10.0, 50.0, 1.0, prior=prior, sigma=40.0)['prior'].message
-    )
+    findings = judged(10.0, 50.0, 1.0, prior=prior, sigma=40.0)
+    assert 'contradict the prior' in findings['prior'].message
 
 
 def test_the_residual_of_the_fit_is_reported():
@@ -248,9 +236,8 @@ def test_the_gradient_of_a_soak_does_not_depend_on_the_ramps(good, rng):
     assert middle == pytest.approx(-3.0, abs=0.01)
     assert sd == pytest.approx(0.01, rel=0.2)
     # Without a soak or without a case thermometer the gradient in a soak is unknown.
-    assert (
-        soak_gradient(replace(windows, rate=np.full_like(t, 0.5), gradient=gradient), None) is None
-    )
+    ramp = np.full_like(t, 0.5)
+    assert soak_gradient(replace(windows, rate=ramp, gradient=gradient), None) is None
     assert soak_gradient(replace(windows, rate=rate, gradient=np.zeros_like(t)), None) is None
     known = calibration(soak_gradient_k=(-2.0, 0.1))
     assert soak_gradient(replace(windows, rate=rate), known) == (-2.0, 0.1)

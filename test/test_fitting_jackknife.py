@@ -5,20 +5,10 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import fitting_truth
 import numpy as np
 import pytest
 from builders import source_of
-from fitting_truth import (
-    GROUPS,
-    MICRO,
-    NOMINAL,
-    Truth,
-    begin,
-    prior_of,
-    rows_of,
-    table_of,
-    without_starts,
-)
 
 from thermo_comp.fitting import FitOptions, fit_bags
 from thermo_comp.fitting.claim import claim_of
@@ -36,15 +26,15 @@ def ratios_to_sd(seed, effect_sd):
     Return error / fit's sd and error / claimed sd of the response weights. The biases change
     randomly by `effect_sd` from section to section, alike in all positions.
     """
-    truth, rng = Truth(), np.random.default_rng(seed)
-    windows, up = table_of(truth, 12, rng, n_windows=24)
+    truth, rng = fitting_truth.Truth(), np.random.default_rng(seed)
+    windows, up = fitting_truth.table_of(truth, 12, rng, n_windows=24)
     effect = effect_sd * rng.standard_normal((N_SECTIONS, 3))
-    windows = replace(windows, mean=windows.mean + NOMINAL * effect[windows.section])
-    regression, state = begin(without_starts(windows), up)
-    fitted = regression.solve(state, prior_of(truth))
+    windows = replace(windows, mean=windows.mean + fitting_truth.NOMINAL * effect[windows.section])
+    regression, state = fitting_truth.begin(fitting_truth.without_starts(windows), up)
+    fitted = regression.solve(state, fitting_truth.prior_of(truth))
     prior = replace(fitted.prior, sigma=white_noise(regression, fitted))
     fitted = regression.solve(fitted.state, prior)
-    used = np.array(GROUPS) != 'idle'
+    used = np.array(fitting_truth.GROUPS) != 'idle'
     missed = fitted.state.weights[0] - truth.on_bias * regression.rms
     places = fitted.layout.weights[0][:, used]
     chosen = SimpleNamespace(posterior=fitted, informative=(), lacks_effects=True)
@@ -52,7 +42,7 @@ def ratios_to_sd(seed, effect_sd):
     return [missed[:, used] / np.sqrt(np.diag(each)[places]) for each in covariances]
 
 
-@pytest.mark.parametrize('effect_sd', [0.0, 3.0 * MICRO, 10.0 * MICRO])
+@pytest.mark.parametrize('effect_sd', [0.0, 3.0 * fitting_truth.MICRO, 10.0 * fitting_truth.MICRO])
 def test_the_claimed_sd_covers_effects_that_the_model_lacks(effect_sd):
     ratios = np.array([ratios_to_sd(seed, effect_sd) for seed in range(10)])
     of_fit, of_claim = np.sqrt(np.mean(ratios**2, axis=(0, 2, 3)))
@@ -80,7 +70,9 @@ def ratio(path):
     collected = []
     for p in range(data.n_positions):
         kept = np.flatnonzero(data.position != p)
-        rest = Regression(rows_of(data, kept), STANDARD_GRAVITY, K / posterior.state.kappa)
+        rest = Regression(
+            fitting_truth.rows_of(data, kept), STANDARD_GRAVITY, K / posterior.state.kappa
+        )
         others = np.arange(data.n_positions) != p
         local = {name: getattr(posterior.state, name)[others] for name in ('up', 'offset', 'tilt')}
         state = rest.solve(replace(posterior.state, **local), posterior.prior, n_steps=3).state

@@ -95,10 +95,8 @@ def test_derivatives_of_nonlinear_terms_agree_with_finite_differences(rng):
             for column, place in enumerate(places):
                 step = np.zeros(layout.n)
                 step[place] = 1e-6
-                above, below = (
-                    regression.misfit(with_step(state, sign * step, layout), base)[p, axis]
-                    for sign in (1.0, -1.0)
-                )
+                states = (with_step(state, sign * step, layout) for sign in (1.0, -1.0))
+                above, below = (regression.misfit(moved, base)[p, axis] for moved in states)
                 expected = (below - above) / 2e-6
                 derived = derivatives[p, axis, :, column]
                 # The tolerance is the rounding error: 1e-14 / 1e-6 (step) * 95 m/s^2 (force).
@@ -124,9 +122,8 @@ def test_absent_terms_are_pruned_without_effect_on_the_other_parameters(rng):
     assert not posterior.state.nonlinear.any()
     for name in ('kappa', 'bias'):
         error = getattr(posterior.state, name) - getattr(truth, name)
-        assert (
-            np.abs(error / np.sqrt(posterior.variance[getattr(posterior.layout, name)])).max() < 4
-        )
+        sd = np.sqrt(posterior.variance[getattr(posterior.layout, name)])
+        assert np.abs(error / sd).max() < 4
 
 
 def test_the_odd_square_is_chosen_only_if_the_unit_has_it(rng):
@@ -152,11 +149,8 @@ def test_a_table_of_sections_is_read_as_begin_end_force_and_sd():
     assert at == [Magnitude(9.81), Magnitude(49.05, sd=0.001), Magnitude(G)]
     assert parse_sections('49.05') == (Section(0.0, math.inf, 49.05, 0.0),)
     for wrong, said in (
-        ('fast', 'expected numbers'),
-        ('1 2', 'must be above its sd'),
-        ('5 3 10', 'must end after its begin'),
-        ('1 2 3 4 5', 'one number in m/s'),
-        ('nan', 'finite'),
+        *(('fast', 'expected numbers'), ('1 2', 'must be above its sd'), ('nan', 'finite')),
+        *(('5 3 10', 'must end after its begin'), ('1 2 3 4 5', 'one number in m/s')),
     ):
         with pytest.raises(ValueError, match=said):
             parse_sections(wrong)
@@ -190,19 +184,19 @@ def test_a_force_given_by_the_user_overrides_the_force_in_the_bag(tmp_path):
     fast = turning.of(10**18 + 11 * 10**9, 10**18 + 19 * 10**9, 10**18, 10.0)
     assert fast.norm == pytest.approx(math.hypot(10.0, 50.0))
     assert turning.radius_part(fast) == pytest.approx(2500.0 / math.hypot(10, 50) * 0.005)
-    with pytest.raises(FitError, match='a rest needs 3'):
-        turning.of(10**18 + 30 * 10**9, 10**18 + 31 * 10**9, 10**18, 10.0)
-    with pytest.raises(FitError, match='need a positive rotation_radius_m'):
-        read('c')
-    with pytest.raises(FitError, match='0 topics are called spin'):
-        read('a', ForceOptions(None, 'spin', 2.0))
-    with pytest.raises(ValueError, match='`rotation` needs `radius`'):
-        ForceOptions(None, 'spin')
-    with pytest.raises(ValueError, match='without `rotation`'):
-        ForceOptions(radius=2.0)
     (tmp_path / 'bad.txt').write_text('a.mcap 0 5\n')
-    with pytest.raises(ThermoCompError, match=r'bad\.txt: a specific force must be'):
-        read('a', ForceOptions(str(tmp_path / 'bad.txt')))
+    late = 10**18 + 30 * 10**9, 10**18 + 31 * 10**9, 10**18, 10.0
+    for call, given, error, text in (
+        (turning.of, late, FitError, 'a rest needs 3'),
+        (read, ('c',), FitError, 'need a positive rotation_radius_m'),
+        (read, ('a', ForceOptions(None, 'spin', 2.0)), FitError, '0 topics are called spin'),
+        (ForceOptions, (None, 'spin'), ValueError, '`rotation` needs `radius`'),
+        (ForceOptions, (None, None, 2.0), ValueError, 'without `rotation`'),
+        (read, ('a', ForceOptions(f'{tmp_path}/bad.txt')), ThermoCompError,
+         r'bad\.txt: a specific force must be'),
+    ):  # fmt: skip
+        with pytest.raises(error, match=text):
+            call(*given)
 
 
 def test_a_constant_rotation_counts_as_a_rest_and_a_changing_rotation_does_not(rng):
@@ -250,10 +244,8 @@ def test_runs_of_a_centrifuge_determine_nonlinear_terms_that_a_later_fit_keeps()
         spin = Spin(time, rate, 1.0, inward)
         stations.append(Position(program, up / np.linalg.norm(up), spin))
     runs = arrays(unit, stations, 3, rate_hz=2.0)
-    sources = [
-        source(run, station.spin, f'run{k}')
-        for k, (run, station) in enumerate(zip(runs, stations, strict=True))
-    ]
+    pairs = enumerate(zip(runs, stations, strict=True))
+    sources = [source(run, station.spin, f'run{k}') for k, (run, station) in pairs]
     result = fit(sources, FitOptions(gravity=G, model='golovach'))
     terms = {term.name: term for term in nonlinear_coefficients(result.calibration)}
     for name, true in (('K2', unit.bend.square), ('K3', unit.bend.cube)):
@@ -277,9 +269,8 @@ def test_runs_of_a_centrifuge_determine_nonlinear_terms_that_a_later_fit_keeps()
     for coefficient in nonlinear_coefficients(again):
         before = terms[coefficient.name]
         assert np.abs(coefficient.value - before.value).max() < 3.0 * before.sd.max()
-    siblings = [
-        replace(again, unit=replace(again.unit, serial=f'{k}'), gyroscope=None) for k in range(3)
-    ]
+    units = [replace(again.unit, serial=f'{k}') for k in range(3)]
+    siblings = [replace(again, unit=unit, gyroscope=None) for unit in units]
     assert population(siblings).nonlinearity is None
     # A fit to positions at 1 g alone keeps the stated sd of K2, which is reported.
     alone = fit(tumble, FitOptions(gravity=G, model='golovach', k2_sd=5e-5))

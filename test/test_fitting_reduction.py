@@ -20,6 +20,7 @@ from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
 
 START_NS = 1_700_000_000_123_456_789
 RATE_HZ = 100
+UP = (0.0, 0.0, 3000.0)  # counts at rest, z up
 
 
 def stamps(n, rate_hz=RATE_HZ):
@@ -35,16 +36,11 @@ def block(accel, seconds=None):
 
 
 def split(whole, n_parts):
-    accel = np.array_split(np.arange(len(whole.accel)), n_parts)
-    board = np.array_split(np.arange(len(whole.board)), n_parts)
-    return [
-        ArrayBlock(
-            whole.accel_stamp_ns[a], whole.accel[a],
-            whole.board_stamp_ns[b], whole.board[b],
-            whole.case_stamp_ns[b], whole.case[b],
-        )
-        for a, b in zip(accel, board, strict=True)
-    ]  # fmt: skip
+    parts = [
+        np.array_split(getattr(whole, name), n_parts)
+        for name in ('accel_stamp_ns', 'accel', 'board_stamp_ns', 'board', 'case_stamp_ns', 'case')
+    ]
+    return [ArrayBlock(*part) for part in zip(*parts, strict=True)]
 
 
 def reduced(blocks, **options):
@@ -98,7 +94,7 @@ def test_the_estimated_interval_between_samples_is_right_to_0_1_percent(rng, cyc
 
 
 def test_windows_are_means_of_their_samples(rng):
-    samples = still(rng, 60.0, (0.0, 0.0, 3000.0))
+    samples = still(rng, 60.0, UP)
     (interval,) = reduced([block(samples)]).intervals
     assert interval.count.sum() == len(samples)
     assert len(interval.time) == 6
@@ -109,13 +105,11 @@ def test_windows_are_means_of_their_samples(rng):
 
 
 def test_positions_in_one_bag_are_separated(rng):
-    turn = np.linspace((0.0, 0.0, 3000.0), (3000.0, 0.0, 0.0), 3 * RATE_HZ)
+    turn = np.linspace(UP, (3000.0, 0.0, 0.0), 3 * RATE_HZ)
     turn += 40.0 * rng.standard_normal(turn.shape)
-    accel = np.vstack(
-        (still(rng, 40.0, (0.0, 0.0, 3000.0)), turn, still(rng, 30.0, (3000.0, 0.0, 0.0)))
-    )
-    first, second = reduced([block(accel)]).intervals
-    np.testing.assert_allclose(first.mean[0], (0.0, 0.0, 3000.0), atol=0.1)
+    parts = still(rng, 40.0, UP), turn, still(rng, 30.0, (3000.0, 0.0, 0.0))
+    first, second = reduced([block(np.vstack(parts))]).intervals
+    np.testing.assert_allclose(first.mean[0], UP, atol=0.1)
     np.testing.assert_allclose(second.mean[-1], (3000.0, 0.0, 0.0), atol=0.1)
     # Up to 1 s (two means) before and after the motion is left out of the rests.
     assert (first.end_ns - first.start_ns) * 1e-9 == pytest.approx(40.0, abs=1.6)
@@ -126,7 +120,7 @@ def test_vibrations_of_a_compressor_do_not_divide_a_position(rng):
     # WHY: vibration by the compressor counted as motion, and each pause as a position: 18 bags had
     # 1135 positions. WHAT: twelve vibrations of three times the noise belong to one rest, in which
     # a turn by 300 urad is detected.
-    accel = still(rng, 720.0, (0.0, 0.0, 3000.0))
+    accel = still(rng, 720.0, UP)
     for start in range(3000, 72000, 6000):
         accel[start : start + 3000] += 0.9 * rng.standard_normal((3000, 3))
     (only,) = reduced([block(accel)]).intervals
@@ -137,7 +131,7 @@ def test_vibrations_of_a_compressor_do_not_divide_a_position(rng):
 
 
 def test_bad_samples_are_counted_and_left_out(rng):
-    accel = still(rng, 30.0, (0.0, 0.0, 3000.0))
+    accel = still(rng, 30.0, UP)
     accel[10, 1] = np.nan
     accel[20, 2] = 32767.0
     bag = reduced([block(accel)])
@@ -148,7 +142,7 @@ def test_bad_samples_are_counted_and_left_out(rng):
 def test_readings_of_a_lost_thermometer_are_counted_and_left_out(rng):
     # WHY: with -127 degC in every 60th reading the estimated noise of the thermometer was 14 K,
     # and the error of the fit 25 times as large as without these readings.
-    whole = block(still(rng, 2000.0, (0.0, 0.0, 3000.0)))
+    whole = block(still(rng, 2000.0, UP))
     whole.board[:] = 20.0 + 0.02 * rng.standard_normal(len(whole.board))
     whole.board[30::60] = -127.0
     bag = reduced([whole])
@@ -169,13 +163,13 @@ def test_readings_of_a_lost_thermometer_are_counted_and_left_out(rng):
 
 def test_glitches_are_counted_and_end_no_rest(rng):
     # WHY: each wrong sample ended a rest, and with 1 % wrong samples a fit took minutes, not 2 s.
-    whole = block(still(rng, 2000.0, (0.0, 0.0, 3000.0)))
+    whole = block(still(rng, 2000.0, UP))
     whole.accel[50::100, 1] += 1500.0
     # A tap that changes ten samples is a motion, and ends the rest.
     whole.accel[100_000:100_010] += 1500.0 * np.array([[-1.0], [1.0]] * 5)
     bag = reduced([whole])
     # While the unit is turned by hand for 20 s, no sample counts as a glitch.
-    turned = block(still(rng, 200.0, (0.0, 0.0, 3000.0)))
+    turned = block(still(rng, 200.0, UP))
     turned.accel[9000:11_000] += 600.0 * rng.standard_normal((2000, 3))
     assert reduced([turned]).n_glitches == 0
     assert bag.n_glitches == len(whole.accel) // 100
@@ -188,7 +182,7 @@ def test_glitches_are_counted_and_end_no_rest(rng):
 def test_a_rest_is_found_in_samples_that_arrive_in_bursts(rng):
     # WHY: the averaging time followed from the median step of stamps, 0.3 ms, so no samples were
     # averaged between bursts, and a unit at rest for 22 min was reported as worn or driven.
-    whole = block(still(rng, 600.0, (0.0, 0.0, 3000.0)))
+    whole = block(still(rng, 600.0, UP))
     number = np.arange(len(whole.accel))
     for size in (20, 100, 200):
         # The mean rate is 100 Hz; within a burst the stamps are 0.3 ms apart.
@@ -200,7 +194,7 @@ def test_a_rest_is_found_in_samples_that_arrive_in_bursts(rng):
 
 
 def test_several_samples_with_one_stamp_are_reported(rng):
-    whole = block(still(rng, 600.0, (0.0, 0.0, 3000.0)))
+    whole = block(still(rng, 600.0, UP))
     stamps = whole.accel_stamp_ns[np.arange(len(whole.accel)) // 10 * 10]
     bag = reduced([replace(whole, accel_stamp_ns=stamps)])
     assert bag.n_repeated == bag.n_dropped == 0.9 * len(whole.accel)
@@ -211,7 +205,7 @@ def test_several_samples_with_one_stamp_are_reported(rng):
 @pytest.mark.parametrize('n', [0, 1, 70])
 def test_a_few_stamps_that_do_not_rise_are_reported(n, rng):
     # WHY: if less than 1 % of the stamps did not rise, `info` reported them, but `fit` did not.
-    whole = block(still(rng, 300.0, (0.0, 0.0, 3000.0)))
+    whole = block(still(rng, 300.0, UP))
     cycle_ns = int(np.median(np.diff(whole.accel_stamp_ns)))
     # The clock is set back by n cycles, so n samples have stamps that have occurred before.
     whole.accel_stamp_ns[20_000:] -= n * cycle_ns
@@ -224,7 +218,7 @@ def test_a_few_stamps_that_do_not_rise_are_reported(n, rng):
 
 
 def test_the_reduction_does_not_depend_on_the_origin_of_time(rng):
-    samples = still(rng, 30.0, (0.0, 0.0, 3000.0))
+    samples = still(rng, 30.0, UP)
     results = []
     for origin in (0, 1_900_000_000_000_000_000):
         accumulator = CellAccumulator(0.5, None)
@@ -241,7 +235,7 @@ def test_the_reduction_does_not_depend_on_the_origin_of_time(rng):
 )
 def test_windows_of_a_fit_have_the_stated_length(rate_hz, cell_s, window_s, rng):
     n = round(150 * rate_hz)
-    accel = np.array((0.0, 0.0, 3000.0)) + 0.3 * rng.standard_normal((n, 3))
+    accel = np.array(UP) + 0.3 * rng.standard_normal((n, 3))
     bag = reduced([ArrayBlock(stamps(n, rate_hz), accel)])
     (interval,) = bag.intervals
     assert bag.window_s == window_s
@@ -253,19 +247,16 @@ def test_windows_of_a_fit_have_the_stated_length(rate_hz, cell_s, window_s, rng)
 
 @pytest.mark.parametrize(('seconds', 'left'), [(24.0, 0), (26.0, 600)])
 def test_a_last_window_is_kept_if_it_is_at_least_half_full(seconds, left, rng):
-    (interval,) = reduced([block(still(rng, seconds, (0.0, 0.0, 3000.0)))]).intervals
+    (interval,) = reduced([block(still(rng, seconds, UP))]).intervals
     assert interval.n_whole == 2
     assert interval.count.tolist() == [1000.0, 1000.0, *([float(left)] if left else [])]
 
 
 def test_fast_readings_are_averaged(rng):
     n = 60 * RATE_HZ
-    celsius = 20.0 + 0.1 * rng.standard_normal(n)
-    whole = ArrayBlock(
-        stamps(n), still(rng, 60.0, (0.0, 0.0, 3000.0)),
-        stamps(n), celsius, stamps(n), celsius,
-    )  # fmt: skip
-    board = reduced([whole]).board
+    at, celsius = stamps(n), 20.0 + 0.1 * rng.standard_normal(n)
+    accel = still(rng, 60.0, UP)
+    board = reduced([ArrayBlock(at, accel, at, celsius, at, celsius)]).board
     assert len(board.value) <= n / 19
     assert board.value.mean() == pytest.approx(celsius.mean(), abs=1e-3)
 
@@ -316,8 +307,7 @@ def soak_ramp_soak(quantum, noise, rng):
 def test_thermometer_settings_are_estimated_from_readings(quantum, noise, rng):
     learned = learn_thermometer([soak_ramp_soak(quantum, noise, rng)], ThermometerSettings())
     assert learned.quantum_c == pytest.approx(quantum, rel=1e-6)
-    # Rounded readings show noise only where they pass a rounding edge slowly, at the end of the
-    # ramp.
+    # Rounded readings show noise only where they pass an edge slowly, at the end of the ramp.
     assert learned.noise_sd_c == pytest.approx(noise, rel=0.4 if quantum else 0.1)
     # Means over 60 s determine the lag of the thermometer, 300 s, to a third.
     assert learned.lag_s == pytest.approx(300.0, rel=0.35)
@@ -341,9 +331,8 @@ def test_the_lag_is_at_least_three_reading_intervals(rng):
     # 60 s and a lag of 50 s the estimated rate was 0 in all ramps.
     time = np.arange(0.0, 14400.0, 60.0)
     celsius = np.interp(time, [0.0, 3600.0, 5400.0], [5.0, 5.0, 35.0])
-    readings = Readings(
-        stamps(len(time), 1.0 / 60.0), celsius + 0.01 * rng.standard_normal(len(time))
-    )
+    celsius += 0.01 * rng.standard_normal(len(time))
+    readings = Readings(stamps(len(time), 1.0 / 60.0), celsius)
     assert learn_thermometer([readings], ThermometerSettings()).lag_s == pytest.approx(180.0)
 
 
@@ -359,7 +348,7 @@ def test_the_detector_settings_follow_the_slowest_ramp(rng):
     celsius = np.interp(time, [0.0, 7200.0, 25200.0], [10.0, 10.0, 55.0])
     celsius = celsius + 0.005 * rng.standard_normal(n)
     readings = Readings(stamps(n, 1.0), celsius)
-    bag = reduced([block(still(rng, 30.0, (0.0, 0.0, 3000.0)))])
+    bag = reduced([block(still(rng, 30.0, UP))])
     slow = learn_detector([replace(bag, temperatures={'board': readings, 'case': readings})])
     # The setting `smallest_ramp_k_min` is 0.7 times the rate of the slowest ramp (0.15 K/min).
     assert slow.smallest_ramp_k_min == pytest.approx(0.105, rel=0.05)

@@ -166,10 +166,9 @@ def test_the_mode_agrees_with_a_least_squares_fit_by_dense_matrices(solved):
     gradient = dense.jacobian(np.zeros(dense.n)).T @ at * np.sqrt(mode.variance)
     # At the mode the gradient of the objective is zero.
     assert np.abs(gradient).max() < 1e-4
-    other = least_squares(
-        dense.residual, np.zeros(dense.n), x_scale=np.sqrt(mode.variance), method='trf'
-    ).x
-    assert np.abs(other / np.sqrt(mode.variance)).max() < 1e-3
+    sd = np.sqrt(mode.variance)
+    other = least_squares(dense.residual, np.zeros(dense.n), x_scale=sd, method='trf').x
+    assert np.abs(other / sd).max() < 1e-3
 
 
 def test_covariance_and_evidence_agree_with_dense_linear_algebra(solved):
@@ -184,9 +183,8 @@ def test_covariance_and_evidence_agree_with_dense_linear_algebra(solved):
         hessian, sd, n = jacobian.T @ jacobian, np.sqrt(mode.variance), mode.layout.n_unit
         covariance = np.linalg.inv(hessian * np.outer(sd, sd))[:n, :n]
         # Of the derivatives' eight digits, correlations of 0.999 in the Hessian lose three.
-        np.testing.assert_allclose(
-            mode.covariance / np.outer(sd[:n], sd[:n]), covariance, atol=1e-4
-        )
+        correlation = mode.covariance / np.outer(sd[:n], sd[:n])
+        np.testing.assert_allclose(correlation, covariance, atol=1e-4)
         assert np.diag(covariance) == pytest.approx(1.0, rel=1e-4)
         # Laplace: -2 ln Z = misfit + ln det(noise) + ln det(prior) + ln det(Hessian). Directions
         # of the attitudes have no prior.
@@ -289,16 +287,14 @@ def test_the_left_out_error_of_a_position_is_that_of_a_fit_to_all_others(rng, gr
 
 @pytest.mark.parametrize(('groups', 'tolerance'), [(LINEAR, 0.002), (PRODUCTS, 0.05)])
 def test_the_left_out_error_of_a_section_is_that_of_a_fit_to_all_others(rng, groups, tolerance):
-    windows, up, regression, prior, whole, score = scored(
-        groups, 12, rng, n_windows=24, step_s=200.0
-    )
+    size = {'n_windows': 24, 'step_s': 200.0}
+    windows, up, regression, prior, whole, score = scored(groups, 12, rng, **size)
     for section in range(windows.section.max() + 1):
         left = windows.section == section
         force = regression.force(refit_of(whole, regression, prior, ~left))
-        expected = np.concatenate(
-            [force[left & at] - force[~left & at].mean(axis=0)
-             for at in (windows.position == p for p in range(12))]
-        )  # fmt: skip
+        places = (windows.position == p for p in range(12))
+        expected = [force[left & at] - force[~left & at].mean(axis=0) for at in places]
+        expected = np.concatenate(expected)
         size = np.sqrt(np.mean(expected**2))
         assert score.sections.square[section] == pytest.approx(size**2, rel=2.0 * tolerance)
     assert score.sections.rms == pytest.approx(np.sqrt(score.sections.square.mean()))
@@ -375,26 +371,23 @@ def test_published_huygens_coefficients_come_back(rng):
     )  # fmt: skip
     regression, state = begin(table, up)
     regression = Regression(table, GRAVITY, np.full(3, K0))
-    prior = prior_of(
-        Truth(), column_sd=np.repeat([[1e-2], [1e-3]], 4, axis=1), sigma=np.full(3, 1e-6 * MICRO)
-    )
+    sd, sigma = np.repeat([[1e-2], [1e-3]], 4, axis=1), np.full(3, 1e-6 * MICRO)
+    prior = prior_of(Truth(), column_sd=sd, sigma=sigma)
     mode = mode_of(regression, state, prior).state
     for axis in range(3):
         relative = np.append(1.0, mode.weights[1, axis] / regression.rms)
         scale = K0 * mode.kappa[axis] * relative
         shifted = np.polynomial.Polynomial([-293.15, 1.0])
         got = np.polynomial.Polynomial(scale)(shifted).coef * GRAVITY / counts_per_ampere
-        printed = [f'{got[0]:.5e}', f'{got[1]:.5e}', f'{got[2]:.5e}']
+        printed = [f'{each:.5e}' for each in got[:3]]
         assert printed == ['1.30675e-03', '-1.35046e-07', '4.02821e-10']
         # The published offset [g] is the fitted bias / (counts per g).
-        bias = K0 * polynomial.polyval(
-            t[:40], np.append(mode.bias[axis], mode.weights[0, axis] / regression.rms)
-        )
+        powers = np.append(mode.bias[axis], mode.weights[0, axis] / regression.rms)
+        bias = K0 * polynomial.polyval(t[:40], powers)
         ratio = bias / (polynomial.polyval(t[:40], scale) * GRAVITY)
         got = np.polynomial.Polynomial.fit(kelvin[:40], ratio, 2).convert().coef
-        assert f'{got[0]:.7e}' == '-8.9642327e-04'
-        assert f'{got[1]:.5e}' == '3.83652e-06'
-        assert f'{got[2]:.2e}' == '-7.61e-09'
+        printed = [f'{got[0]:.7e}', f'{got[1]:.5e}', f'{got[2]:.2e}']
+        assert printed == ['-8.9642327e-04', '3.83652e-06', '-7.61e-09']
 
 
 @pytest.mark.parametrize('noise', [Noise(), Noise(0.5, 1500.0)])
@@ -412,9 +405,8 @@ def test_scores_of_inactive_columns_agree_with_a_fit_in_which_they_are_active(no
     places = mode.layout.weights[:, :, asked].transpose(0, 2, 1).ravel()
     covariance, expected = mode.covariance[np.ix_(places, places)], np.linalg.inv(inactive.S)
     sd = np.sqrt(np.diag(covariance))
-    np.testing.assert_allclose(
-        covariance / np.outer(sd, sd), expected / np.outer(sd, sd), atol=0.01
-    )
+    outer = np.outer(sd, sd)
+    np.testing.assert_allclose(covariance / outer, expected / outer, atol=0.01)
     weights = mode.state.weights[:, :, asked].transpose(0, 2, 1).ravel()
     np.testing.assert_allclose(weights / sd, expected @ inactive.Q / sd, atol=0.05)
     gains = []
@@ -443,10 +435,8 @@ def test_inactive_and_active_columns_share_initial_lag_states(solved):
     fitted = regression.solve(posterior.state, wide, n_steps=0)
     places = fitted.layout.weights[1, :, inactive.column].ravel()
     expected = np.linalg.inv(fitted.covariance[np.ix_(places, places)])
-    sd = np.sqrt(np.diag(expected))
-    np.testing.assert_allclose(
-        inactive.S / np.outer(sd, sd), expected / np.outer(sd, sd), atol=1e-3
-    )
+    outer = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    np.testing.assert_allclose(inactive.S / outer, expected / outer, atol=1e-3)
 
 
 def test_only_a_matrix_made_indefinite_by_rounding_gets_diagonal_jitter(rng):
@@ -469,12 +459,9 @@ def test_tangent_basis_is_orthonormal(rng):
     np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=1e-14)
 
 
-def test_an_axis_with_equal_means_in_all_positions_is_refused():
+def test_positions_in_motion_and_an_axis_with_equal_means_in_all_positions_are_refused(rng):
     means = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     with pytest.raises(FitError, match='reads the same in all positions'):
         constant_calibration(means, GRAVITY, 1e-3)
-
-
-def test_positions_in_motion_are_refused(rng):
     with pytest.raises(FitError, match='not lie on an ellipsoid'):
         constant_calibration(rng.standard_normal((30, 3)), GRAVITY, 1e-3)

@@ -3,6 +3,7 @@
 """Selected model, prior sd, noises and claimed sd agree with the truth of simulated tables."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -80,9 +81,8 @@ def test_columns_without_an_effect_are_not_chosen(calm):
     np.testing.assert_array_equal(chosen.posterior.prior.column_sd > 0.0, [~IDLE, ~IDLE])
     assert chosen_groups(chosen) == {'curve', 'board'}
     evidence = group_evidence(regression, chosen.posterior)
-    assert {(group.part, group.group) for group in evidence} == {
-        (part, group) for part in ('bias', 'scale') for group in ('curve', 'board')
-    }
+    judged = {(group.part, group.group) for group in evidence}
+    assert judged == {*product(('bias', 'scale'), ('curve', 'board'))}
     assert not chosen.posterior.state.weights[..., IDLE].any()
 
 
@@ -99,10 +99,8 @@ def test_each_tried_model_has_a_left_out_error(calm):
     assert all(is_better(trial.score, selected.score) for trial in selected.trials[:2])
 
 
-@pytest.mark.parametrize(
-    ('where', 'is_chosen'), [('one bag', False), ('one section', False), ('all', True)]
-)
-def test_a_group_that_explains_one_bag_or_section_is_not_chosen(where, is_chosen):
+@pytest.mark.parametrize('where', ['one bag', 'one section', 'all'])
+def test_a_group_that_explains_one_bag_or_section_is_not_chosen(where):
     # The evidence favours the group 'idle' in all cases; the left-out error favours this group
     # only if its effect is in all bags and sections.
     truth = Truth()
@@ -115,7 +113,7 @@ def test_a_group_that_explains_one_bag_or_section_is_not_chosen(where, is_chosen
     table = replace(windows, mean=windows.mean + NOMINAL * added)
     _, chosen = selected_of(truth, table, up)
     assert any('idle' in trial.groups for trial in chosen.trials)
-    assert ('idle' in chosen_groups(chosen)) == is_chosen
+    assert ('idle' in chosen_groups(chosen)) == (where == 'all')
 
 
 @pytest.mark.parametrize(('n_positions', 'step_s'), [(10, 120.0), (12, 60.0), (12, 240.0)])
@@ -125,9 +123,8 @@ def test_a_lag_is_found_although_a_curve_without_the_lag_is_rejected(n_positions
     slope = 2e-5 * np.array([1.0, -2.0, 1.5])
     on_bias = np.outer(slope, [1.0, 0.0, 0.0, -1.0, 0.0, 0.0])
     truth = Truth(on_bias=on_bias, on_scale=np.zeros((3, 6)))
-    windows, up = table_of(
-        truth, n_positions, np.random.default_rng(5), n_windows=30, step_s=step_s
-    )
+    rng = np.random.default_rng(5)
+    windows, up = table_of(truth, n_positions, rng, n_windows=30, step_s=step_s)
     _, chosen = selected_of(truth, windows, up)
     assert chosen_groups(chosen) == {'curve', 'board'}
     assert chosen.score.rms < 1.2 * truth.sigma[0]
@@ -220,9 +217,7 @@ def test_the_bayes_factor_of_a_group_is_the_loss_of_evidence_if_the_group_is_rem
     prior = prior_of(truth, column_sd=column_sd(ALL, 3e-4, 3e-5))
     posterior = mode_of(regression, state, prior)
     evidence = group_evidence(regression, posterior)
-    assert [(group.part, group.group) for group in evidence] == [
-        (part, group) for part in ('bias', 'scale') for group in ALL
-    ]
+    assert [(each.part, each.group) for each in evidence] == [*product(('bias', 'scale'), ALL)]
     for row in evidence:
         rest = prior.column_sd.copy()
         rest[['bias', 'scale'].index(row.part), np.array(GROUPS) == row.group] = 0.0
@@ -290,10 +285,8 @@ def test_outliers_do_not_shift_the_fit(calm):
     # 2 % of the windows have errors of 100 sd, but affect the fit only like errors of 3 sd.
     assert np.abs((other.posterior.state.bias - calm_fit.posterior.state.bias) / sd).max() < 1.0
     np.testing.assert_allclose(other.posterior.prior.sigma, truth.sigma, rtol=0.2)
-    used, used_with_outliers = (
-        fitted.posterior.prior.column_sd[0] > 0.0 for fitted in (calm_fit, other)
-    )
-    np.testing.assert_array_equal(used_with_outliers, used)
+    sds = (fitted.posterior.prior.column_sd[0] for fitted in (calm_fit, other))
+    np.testing.assert_array_equal(*(sd > 0.0 for sd in sds))
 
 
 def test_quantised_window_means_are_not_down_weighted_as_outliers():
@@ -302,9 +295,8 @@ def test_quantised_window_means_are_not_down_weighted_as_outliers():
     windows, up = table_of(Truth(), 9, np.random.default_rng(2))
     regression, state = begin(windows, up)
     prior = prior_of(Truth(), (), offset_sd=1e-9)
-    values = np.random.default_rng(3).choice(
-        [-2.0, 0.0, 2.0], windows.mean.shape, p=[0.15, 0.7, 0.15]
-    )
+    rng = np.random.default_rng(3)
+    values = rng.choice([-2.0, 0.0, 2.0], windows.mean.shape, p=[0.15, 0.7, 0.15])
     values[100] = 50.0
     posterior = regression.solve(state, prior, n_steps=0)
     shifted = regression.residual(posterior.state, posterior.layout) - prior.sigma * values
@@ -354,9 +346,7 @@ def test_the_evidence_selects_the_sd_of_an_informative_prior(calm, offset):
     true = mean[places].copy()
     mean[places] += offset * sd[0]
     priors = [InformativePrior(mean, np.diag(1.0 / (part * sd))) for part in (1.0, 100.0)]
-    prior = replace(
-        constants(truth), column_sd=candidates.typical, informative=priors[-1]
-    )  # fmt: skip
+    prior = replace(constants(truth), column_sd=candidates.typical, informative=priors[1])
     fixed = replace(candidates, fixed=np.ones((2, 6), dtype=bool))
     chosen = fit_all(regression, state, prior, fixed, priors)
     assert chosen.posterior.prior.informative is priors[int(offset > 0.0)]
@@ -418,11 +408,8 @@ def test_the_sd_of_gravity_adds_a_common_error_to_all_scale_factors():
 def test_the_drift_of_scale_factors_determines_the_sd_of_turn_on_offsets():
     # WHY: nine constants fit |f| of nine positions exactly, so the estimated offset sd was
     # 5 ug instead of 300 ug, and the constants were wrong by 75 claimed sd.
-    truth = Truth(
-        offset_sd=300.0 * MICRO,
-        sigma=np.full(3, 0.5 * MICRO),
-        on_scale=np.outer([1.0, -0.7, 1.3], [1e-4, 0.0, 0.0, 0.0, 0.0, 0.0]),
-    )
+    on_scale = np.outer([1.0, -0.7, 1.3], [1e-4, 0.0, 0.0, 0.0, 0.0, 0.0])
+    truth = Truth(offset_sd=300.0 * MICRO, sigma=np.full(3, 0.5 * MICRO), on_scale=on_scale)
     windows, up = table_of(truth, 9, np.random.default_rng(2), n_windows=60)
     regression, state = begin(without_starts(windows), up)
     candidates = candidates_of(windows, ('curve', 'board'))

@@ -51,11 +51,9 @@ def bags(all_bags):
 
 
 def windows_of(bags):
-    columns = bank()
     sets = sets_of(OPTIONS, bags)
-    return thermal_windows(
-        bags, Model('response', sets, columns, ('case',), DetectorSettings(), 20.0)
-    )
+    model = Model('response', sets, bank(), ('case',), DetectorSettings(), 20.0)
+    return thermal_windows(bags, model)
 
 
 def test_a_rest_partly_in_the_range_of_the_model_is_used_there_only(bags):
@@ -90,11 +88,8 @@ def test_the_sets_differ_only_with_soaks_at_several_temperatures(bags):
 
 
 def test_lag_states_on_a_grid_equal_those_updated_by_each_reading(rng):
-    spec = MemorySpec(
-        ('case', 'tip'),
-        (('board', 60.0), ('board', 900.0), ('case', 240.0), ('tip', 7680.0)),
-        ((0.0, 0.4), (900.0, 0.8)),
-    )
+    lags = ('board', 60.0), ('board', 900.0), ('case', 240.0), ('tip', 7680.0)
+    spec = MemorySpec(('case', 'tip'), lags, ((0.0, 0.4), (900.0, 0.8)))
     n, step = 3000, 2
     board = 20.0 + np.cumsum(0.03 * rng.standard_normal(n))
     gradients = [np.cumsum(0.02 * rng.standard_normal(n)), 1.0 + 0.1 * rng.standard_normal(n)]
@@ -243,7 +238,11 @@ def test_curve_columns_of_a_fit_are_powers_of_temperature(
     assert all(column[0] == 0.0 for column in columns[sets.static.n_free :])
 
 
-@pytest.fixture(scope='module', params=['golovach', 'linear', 'exponential', 'spline'])
+#: Models that are fitted; the sets of `golovach` are polynomials like that of `linear`.
+MODELS = 'golovach', pytest.param('linear', marks=pytest.mark.slow), 'exponential', 'spline'
+
+
+@pytest.fixture(scope='module', params=MODELS)
 def fitted(request, all_bags):
     groups = ('curve', 'set', *(['board'] if request.param == 'exponential' else []))
     is_paper = request.param == 'golovach'
@@ -288,10 +287,8 @@ def test_a_calibration_file_corrects_windows_like_the_regression(fitted):
     state, prior = result.fit.posterior.state, result.fit.posterior.prior
     correction = Correction(calibration)
     pairs = correction.bias_scale(states_of(windows, calibration)).swapaxes(0, 1)
-    force = np.column_stack(
-        [(windows.data.mean[:, k] - bias) / scale for k, (bias, scale) in enumerate(pairs)]
-    )
-    force = force @ np.array(calibration.misalignment).T
+    bias, scale = np.transpose(pairs, (1, 2, 0))
+    force = (windows.data.mean - bias) / scale @ np.array(calibration.misalignment).T
     up = state.up[windows.data.position]
     left = force - STANDARD_GRAVITY * up
     along = np.sum(left * up, axis=1)

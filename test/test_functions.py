@@ -15,24 +15,17 @@ from thermo_comp.convert.exchange import export_calibration
 from thermo_comp.thermal.lags import Lag, Play
 from thermo_comp.thermal.memory import memory_on_grid
 from thermo_comp.thermal.state import BOARD, RATE, WEIGHT, Gradient, StateLayout
+from thermo_comp.unit import functions
 from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.correction import Correction
-from thermo_comp.unit.functions import (
-    CubicSpline,
-    Exponential,
-    Polynomial,
-    check_reference,
-    hold,
-    in_order,
-)
 from thermo_comp.unit.metrics import norm_residual, residual_statistics, statistics_by_regime
 from thermo_comp.unit.posterior import posterior_of
 from thermo_comp.unit.prediction import bias_scale_and_sd, in_a_soak, ramp_states
 
 KNOTS = (-15.0, -6.0, 0.0, 4.0, 15.0)
-FUNCTIONS = [Polynomial((1.0,)), Polynomial((0.0, 2e-3, -3e-5, 4e-7, 1e-9)),
-             CubicSpline(KNOTS, (1.5, 0.4, 0.0, -0.2, 0.9)),
-             Exponential(-0.5, (0.2, 0.3), (12.0, -7.0))]  # fmt: skip
+FUNCTIONS = [functions.Polynomial((1.0,)), functions.Polynomial((0.0, 2e-3, -3e-5, 4e-7, 1e-9)),
+             functions.CubicSpline(KNOTS, (1.5, 0.4, 0.0, -0.2, 0.9)),
+             functions.Exponential(-0.5, (0.2, 0.3), (12.0, -7.0))]  # fmt: skip
 temperatures = st.floats(-15.0, 15.0)
 
 
@@ -40,25 +33,25 @@ temperatures = st.floats(-15.0, 15.0)
 def test_in_order_adds_the_values_along_an_array_axis_one_by_one(seed, size, before, after):
     values = np.random.default_rng(seed).standard_normal((before, size, after))
     for order in 'CF':
-        total = in_order(np.array(values, order=order), 1)
+        total = functions.in_order(np.array(values, order=order), 1)
         for i, k in np.ndindex(total.shape):
             assert total[i, k] == sum(values[i, :, k].tolist())
 
 
 def test_a_polynomial_agrees_with_hand_numbers():
     # Eq. (10): the term with a4 is a4 t^4; Golovach's paper prints a4 t.
-    assert Polynomial((1.0, 2.0, 0.5, 0.25, 1.0)).value(3.0) == 1 + 6 + 4.5 + 6.75 + 81
+    assert functions.Polynomial((1.0, 2.0, 0.5, 0.25, 1.0)).value(3.0) == 1 + 6 + 4.5 + 6.75 + 81
 
 
 def test_an_exponential_agrees_with_hand_numbers():
-    function = Exponential(-2.0, (2.0,), (10.0,))
+    function = functions.Exponential(-2.0, (2.0,), (10.0,))
     assert function.value(0.0) == 0.0
     assert function.value(10.0) == pytest.approx(2.0 * (np.e - 1.0), rel=1e-15)
 
 
 def test_a_cubic_spline_equals_that_of_scipy():
     values = (1.5, 0.4, 0.0, -0.2, 0.9)
-    ours = CubicSpline(KNOTS, values)
+    ours = functions.CubicSpline(KNOTS, values)
     reference = ReferenceSpline(KNOTS, values, bc_type='natural')
     t = np.linspace(-15.0, 15.0, 301)
     # Both splines solve the same equations, so they differ by rounding.
@@ -67,7 +60,7 @@ def test_a_cubic_spline_equals_that_of_scipy():
 
 
 def test_a_spline_is_constant_beyond_its_ends():
-    spline = CubicSpline(KNOTS, (1.5, 0.4, 0.0, -0.2, 0.9))
+    spline = functions.CubicSpline(KNOTS, (1.5, 0.4, 0.0, -0.2, 0.9))
     assert spline.value(-100.0) == spline.value(-15.0)
     assert spline.value(100.0) == pytest.approx(0.9, abs=1e-15)
 
@@ -111,14 +104,14 @@ def test_the_value_of_a_function_is_linear_in_its_free_coefficients(function, t,
 @pytest.mark.parametrize(
     ('build', 'message'),
     [
-        (lambda: Polynomial(()), 'at least the value'),
-        (lambda: CubicSpline((0.0, 1.0), (0.0, 1.0)), 'at least 3 knots'),
-        (lambda: CubicSpline((-1.0, 0.0, 1.0), (0.0, 1.0)), 'one number per knot'),
-        (lambda: CubicSpline((0.0, 0.0, 1.0), (0.0, 0.0, 1.0)), 'must rise'),
-        (lambda: CubicSpline((1.0, 2.0, 3.0), (0.0, 0.0, 1.0)), 'must contain 0'),
-        (lambda: Exponential(0.0, (), ()), 'at least one number'),
-        (lambda: Exponential(0.0, (1.0,), (1.0, 2.0)), 'one number per amplitude'),
-        (lambda: Exponential(0.0, (1.0,), (0.0,)), 'at least 1 K'),
+        (lambda: functions.Polynomial(()), 'at least the value'),
+        (lambda: functions.CubicSpline((0.0, 1.0), (0.0, 1.0)), 'at least 3 knots'),
+        (lambda: functions.CubicSpline((-1.0, 0.0, 1.0), (0.0, 1.0)), 'one number per knot'),
+        (lambda: functions.CubicSpline((0.0, 0.0, 1.0), (0.0, 0.0, 1.0)), 'must rise'),
+        (lambda: functions.CubicSpline((1.0, 2.0, 3.0), (0.0, 0.0, 1.0)), 'must contain 0'),
+        (lambda: functions.Exponential(0.0, (), ()), 'at least one number'),
+        (lambda: functions.Exponential(0.0, (1.0,), (1.0, 2.0)), 'one number per amplitude'),
+        (lambda: functions.Exponential(0.0, (1.0,), (0.0,)), 'at least 1 K'),
     ],
 )
 def test_impossible_functions_are_refused(build, message):
@@ -127,15 +120,15 @@ def test_impossible_functions_are_refused(build, message):
 
 
 def test_hold_limits_values_to_a_range():
-    assert [hold(x, -1.0, 2.0) for x in (-3.0, 0.5, 4.0)] == [-1.0, 0.5, 2.0]
-    assert hold(np.array([-3.0, 0.5, 4.0]), -1.0, 2.0).tolist() == [-1.0, 0.5, 2.0]
+    assert [functions.hold(x, -1.0, 2.0) for x in (-3.0, 0.5, 4.0)] == [-1.0, 0.5, 2.0]
+    assert functions.hold(np.array([-3.0, 0.5, 4.0]), -1.0, 2.0).tolist() == [-1.0, 0.5, 2.0]
 
 
 @pytest.mark.parametrize('bad', [float('nan'), float('inf')])
 def test_a_curve_that_is_not_finite_is_refused(bad):
-    for function in (Polynomial((0.0, bad)), Exponential(bad, (1.0,), (9.0,))):
+    for function in (functions.Polynomial((0.0, bad)), functions.Exponential(bad, (1.0,), (9.0,))):
         with pytest.raises(ValueError, match='`bias_function` must be 0 at t = 0'):
-            check_reference('bias_function', function, 0.0)
+            functions.check_reference('bias_function', function, 0.0)
 
 
 def slope_and_lag(variances):

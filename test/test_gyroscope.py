@@ -39,17 +39,13 @@ FLOOR = 5.0 * MILLIDEGREE / np.sqrt(60.0)
 
 
 def block_of(record, K, rate=None):
-    stamps, board_ns, case_ns = (
-        START_NS + stamp_ns
-        for stamp_ns in (record.accel_stamp_ns, record.board_stamp_ns, record.case_stamp_ns)
-    )
-    n, nothing = len(stamps), np.zeros((len(stamps), 9))
+    stamps = START_NS + record.accel_stamp_ns
+    n, nothing, temperatures = len(stamps), np.zeros((len(stamps), 9)), {}
     rate = record.angular_rate if rate is None else rate
     imu = ImuColumns(np.zeros((n, 4)), nothing, rate, nothing, nothing)
-    temperatures = {
-        name: Readings(at, value, np.searchsorted(stamps, at))
-        for name, at, value in (('board', board_ns, record.board), ('case', case_ns, record.case))
-    }
+    for name in ('board', 'case'):
+        at = START_NS + getattr(record, f'{name}_stamp_ns')
+        temperatures[name] = Readings(at, getattr(record, name), np.searchsorted(stamps, at))
     return Block(stamps, record.counts / K, 'imu', imu, temperatures, {})
 
 
@@ -125,24 +121,17 @@ def test_a_gyroscope_does_not_change_the_accelerometer_s_fit(unit):
     options = replace(OPTIONS, groups=('curve', 'gradient'))
     plain = [source_of(record, unit.scale_factor) for record in records]
     with_rate = fit(plain, options)
-    silent = [np.zeros((len(record.counts), 3)) for record in records]
-    sources = [
-        source_of(o, unit.scale_factor, rate) for o, rate in zip(records, silent, strict=True)
-    ]
-    without = fit(sources, options)
+    silent = [source_of(o, unit.scale_factor, np.zeros((len(o.counts), 3))) for o in records]
+    without = fit(silent, options)
     assert with_rate.calibration.gyroscope is not None
     assert without.calibration.gyroscope is None
-    same = replace(
-        with_rate.calibration, gyroscope=None, provenance=without.calibration.provenance
-    )
+    provenance = without.calibration.provenance
+    same = replace(with_rate.calibration, gyroscope=None, provenance=provenance)
     assert same == without.calibration
     # A bag with NaN angular rates at rest counts as a bag without angular rates.
-    broken = [np.array(record.angular_rate) for record in records]
-    broken[0][len(broken[0]) // 2 :] = np.nan
-    sources = [
-        source_of(o, unit.scale_factor, rate, name)
-        for o, rate, name in zip(records, broken, ('first', 'second'), strict=True)
-    ]
+    broken = np.array(records[0].angular_rate)
+    broken[len(broken) // 2 :] = np.nan
+    sources = [source_of(records[0], unit.scale_factor, broken, 'first'), plain[1]]
     result = fit(sources, replace(options, groups=('curve',)))
     assert result.calibration.gyroscope is None
     (messages,) = (finding.message for finding in result.findings if finding.name == 'rate')
@@ -164,9 +153,8 @@ def test_residuals_about_position_means_do_not_depend_on_the_means(places, seed)
     rng = np.random.default_rng(seed)
     rate, level = rng.standard_normal((len(places), 3)), rng.standard_normal((5, 3))
     within = within_positions(rate, position)
-    np.testing.assert_allclose(
-        within_positions(rate + level[position], position), within, atol=1e-12
-    )
+    moved = within_positions(rate + level[position], position)
+    np.testing.assert_allclose(moved, within, atol=1e-12)
     for p in np.unique(position):
         np.testing.assert_allclose(within[position == p].sum(axis=0), 0.0, atol=1e-12)
 
@@ -185,9 +173,8 @@ def test_a_gyroscope_is_read_back_from_a_file_bit_for_bit():
     np.testing.assert_array_equal(sd_scale, 0.0)
     # At 20 degC the bias is its level; its variance is that of the level plus that of a turn-on.
     np.testing.assert_allclose(bias[1], (0.02 + 1e-5, -0.03, 0.01 + 1e-5))
-    np.testing.assert_allclose(
-        sd_bias[0], np.hypot((1e-5, 2e-5, 1e-5), np.sqrt(1.01e-10)), rtol=1e-5
-    )
+    expected = np.hypot((1e-5, 2e-5, 1e-5), np.sqrt(1.01e-10))
+    np.testing.assert_allclose(sd_bias[0], expected, rtol=1e-5)
     with pytest.raises(ValueError, match='`calibration` must have a gyroscope'):
         rate_triad(calibration())
 
@@ -196,20 +183,15 @@ def test_the_message_on_a_wrong_gyroscope_names_the_key():
     text = dump_calibration(rich_calibration())
     for old, new, said in (
         ('bias_rad_s: [0.02', 'bias_rad_s: [.nan', r'gyroscope\.bias_rad_s\[0\]'),
-        (
-            'noise_density_rad_s_sqrt_hz: [0.0001',
-            'noise_density_rad_s_sqrt_hz: [0.0',
-            r'gyroscope\.noise_density_rad_s_sqrt_hz\[0\]: .*greater than 0',
-        ),
+        ('noise_density_rad_s_sqrt_hz: [0.0001', 'noise_density_rad_s_sqrt_hz: [0.0',
+         r'gyroscope\.noise_density_rad_s_sqrt_hz\[0\]: .*greater than 0'),
         ('residual_sd_rad_s', 'residual_sd', r'gyroscope'),
-    ):
+    ):  # fmt: skip
         assert old in text
         with pytest.raises(CalibrationError, match=said):
             parse_calibration(text.replace(old, new).encode())
     gyro = rich_calibration().gyroscope
-    with pytest.raises(
-        ValueError, match=r'`posterior\.diagonal` must have one number per parameter'
-    ):
+    with pytest.raises(ValueError, match=r'`posterior\.diagonal` must have one number per param'):
         replace(gyro, response=gyro.response[1:])
     with pytest.raises(ValueError, match=r'`bias_function` must be 0 at t = 0 .*, got 1'):
         RateCurve(Polynomial((1.0, 2.0)))

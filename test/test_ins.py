@@ -35,9 +35,8 @@ def test_a_bias_causes_a_schuler_oscillation(axis):
 def test_levelling_makes_the_force_vertical(rng):
     force = rng.normal(0.0, 3.0, (20, 3)) + G * UP
     attitude = levelled(force)
-    np.testing.assert_allclose(
-        attitude @ attitude.transpose(0, 2, 1), [np.eye(3)] * 20, atol=1e-12
-    )
+    product = attitude @ attitude.transpose(0, 2, 1)
+    np.testing.assert_allclose(product, [np.eye(3)] * 20, atol=1e-12)
     expected = np.linalg.norm(force, axis=1)[:, None] * UP
     np.testing.assert_allclose((attitude @ force[..., None])[..., 0], expected, atol=1e-12)
 

@@ -44,18 +44,12 @@ def cut(whole, edges_s, pause_s=0.0):
     edges = [START_NS, *(START_NS + round(1e9 * edge) for edge in edges_s), 2 * START_NS]
     parts = []
     for number, (begin, end) in enumerate(pairwise(edges)):
-        accel, board = (
-            (stamps >= begin) & (stamps < end)
-            for stamps in (whole.accel_stamp_ns, whole.board_stamp_ns)
-        )
-        later = round(1e9 * number * pause_s)
-        parts.append(
-            ArrayBlock(
-                whole.accel_stamp_ns[accel] + later, whole.accel[accel],
-                whole.board_stamp_ns[board] + later, whole.board[board],
-                whole.case_stamp_ns[board] + later, whole.case[board],
-            )
-        )  # fmt: skip
+        later, arrays = round(1e9 * number * pause_s), []
+        for name in ('accel', 'board', 'case'):
+            stamps = getattr(whole, f'{name}_stamp_ns')
+            rows = (stamps >= begin) & (stamps < end)
+            arrays += [stamps[rows] + later, getattr(whole, name)[rows]]
+        parts.append(ArrayBlock(*arrays))
     return parts
 
 
@@ -76,9 +70,8 @@ def test_parts_of_a_rest_have_the_windows_of_the_whole_rest(rng, edges_s):
     (continued,) = again.intervals
     assert (again.start_ns, again.end_ns) == (bag.start_ns, bag.end_ns)
     assert again.n_samples == bag.n_samples
-    assert sorted(source.name for source in again.sources) == [
-        f'part{k}' for k in range(len(edges_s) + 1)
-    ]
+    names = sorted(source.name for source in again.sources)
+    assert names == [f'part{k}' for k in range(len(edges_s) + 1)]
     for name in ('board', 'case'):
         np.testing.assert_array_equal(getattr(again, name).stamp_ns, getattr(bag, name).stamp_ns)
         np.testing.assert_array_equal(getattr(again, name).value, getattr(bag, name).value)
@@ -144,22 +137,16 @@ def test_a_split_recording_gives_the_calibration_of_the_whole_recording():
     bag = thermo_comp.read(ROOT / 'bags/fit/01.mcap')
     parts = []
     for begin_s in np.arange(0.0, bag.time_s[-1], 1800.0):
-        inside = [
-            (time_s >= begin_s) & (time_s < begin_s + 1800.0)
-            for time_s in (bag.time_s, *(reading[0] for reading in bag.temperatures.values()))
-        ]
-        readings = {
-            name: (time_s[use], celsius[use])
-            for use, (name, (time_s, celsius)) in zip(
-                inside[1:], bag.temperatures.items(), strict=True
-            )
-        }
-        part = replace(bag, time_s=bag.time_s[inside[0]], counts=bag.counts[inside[0]])
+        readings = {}
+        for name, (time_s, celsius) in bag.temperatures.items():
+            use = (time_s >= begin_s) & (time_s < begin_s + 1800.0)
+            readings[name] = time_s[use], celsius[use]
+        use = (bag.time_s >= begin_s) & (bag.time_s < begin_s + 1800.0)
+        part = replace(bag, time_s=bag.time_s[use], counts=bag.counts[use])
         parts.append(replace(part, temperatures=readings, name=f'{begin_s:g} s'))
     # A fit of the column groups 'curve' and 'board' takes 1/5 of the time of a choice of groups.
-    whole, split = (
-        thermo_comp.fit(bags, gravity=9.80665, groups=('curve', 'board')) for bags in (bag, parts)
-    )
+    options = {'gravity': 9.80665, 'groups': ('curve', 'board')}
+    whole, split = (thermo_comp.fit(bags, **options) for bags in (bag, parts))
     assert len(split.provenance.sources) == len(parts)
     difference = np.subtract(*(
         unit.correct(bag.time_s, bag.counts, **bag.temperatures).specific_force

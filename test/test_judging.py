@@ -7,7 +7,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from builders import GRAVITY, axis_set, calibration, regime_set
+from builders import GRAVITY, axis_set, calibration, equal_axes, regime_set
 
 from thermo_comp.errors import RecordingError
 from thermo_comp.fitting.sources import digest
@@ -21,7 +21,7 @@ from thermo_comp.recording.reader import open_recording
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter, table_writer
 from thermo_comp.replay import replay
-from thermo_comp.unit.calibration import Axes, AxisReference, Unit
+from thermo_comp.unit.calibration import Unit
 from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.gravity import MICRO_G, parse_acceleration, ug_text
 from thermo_comp.unit.provenance import Provenance, ResidualSummary, Source
@@ -33,17 +33,7 @@ SLOPE = 2.0  # drift of the z axis [counts/K]
 
 
 def resting(
-    path,
-    temperature,
-    *,
-    minutes=10.0,
-    rate_hz=10.0,
-    noise=0.0,
-    shaken_s=None,
-    error=0.0,
-    serial='',
-    reading_s=1,
-    dead='',
+    path, temperature, *, minutes=10, rate_hz=10, noise=0, shaken=(), error=0, reading_s=1, dead=''
 ):
     """Write a bag of a unit at rest, z up, whose z axis drifts with its temperature."""
     rng = np.random.default_rng(3)
@@ -58,14 +48,13 @@ def resting(
     counts[:, ['xyz'.index(axis) for axis in dead]] = 0.0
     # Alternate x by 1e-9 counts, because an axis that repeats one value counts as broken.
     counts[::2, 0] += 1e-9
-    if shaken_s:
-        shaken = (seconds >= shaken_s[0]) & (seconds < shaken_s[1])
-        counts[shaken] += 300.0 * rng.standard_normal((int(shaken.sum()), 3))
-    with BagWriter(path, metadata={'serial': serial} if serial else None) as writer:
+    if shaken:
+        rows = (seconds >= shaken[0]) & (seconds < shaken[1])
+        counts[rows] += 300.0 * rng.standard_normal((int(rows.sum()), 3))
+    with BagWriter(path) as writer:
         since = np.arange(0, round(minutes * 60.0), reading_s)
-        readings = (
-            begin + (end - begin) * since / (minutes * 60.0) + 1e-7 * (since // reading_s % 2)
-        )
+        readings = begin + (end - begin) * since / (minutes * 60.0)
+        readings += 1e-7 * (since // reading_s % 2)
         for topic in (TOPICS.board, TOPICS.case):
             writer.write_temperature(topic, START_NS + since * 10**9, readings)
         writer.write_counts(TOPICS.counts, stamps, counts)
@@ -77,6 +66,12 @@ def corrected_by(slope, claim=0.0, **changes):
     parts = {name: axis_set(residual_sd_m_s2=claim) for name in 'xy'}
     part = regime_set(**parts, z=axis_set((0.0, slope), residual_sd_m_s2=claim))
     return dataclasses.replace(calibration(static=part, dynamic=part), **changes)
+
+
+def of_noise(sd):
+    """Make a calibration with white noise of `sd` per sample at 10 Hz [m/s^2]."""
+    unit = dataclasses.replace(calibration().unit, cycle_time_s=0.1)
+    return calibration(unit=unit, noise_density_m_s2_sqrt_hz=(sd * np.sqrt(0.1),) * 3)
 
 
 def judged(bag, calibration, **keys):
@@ -155,12 +150,12 @@ class TestWindows:
     def test_samples_too_slow_for_a_window_are_refused(self, tmp_path):
         bag = resting(tmp_path / 'bag', 20.0, rate_hz=1.0)
         with pytest.raises(
-            RecordingError, match='too low for windows of 10 s: give --window as 30 s or a '
+            RecordingError, match='low for windows of 10 s: give --window as 30 s '
         ):
             judged(bag, calibration(), window_s=10.0)
 
     def test_only_windows_at_rest_are_judged(self, tmp_path):
-        bag = resting(tmp_path / 'bag', 20.0, noise=0.3, shaken_s=(201.0, 222.0))
+        bag = resting(tmp_path / 'bag', 20.0, noise=0.3, shaken=(201.0, 222.0))
         windows = judged(bag, calibration(), window_s=10.0).windows
         inside = (windows.time > 196.0) & (windows.time < 227.0)
         assert not inside.any()
@@ -171,9 +166,7 @@ class TestWindows:
 
     def test_residuals_of_white_noise_agree_with_their_claimed_sd(self, tmp_path):
         # The calibration has the density of the bag's white noise, 0.3 counts per sample at 10 Hz.
-        density = 0.3 / K * np.sqrt(0.1)
-        unit = dataclasses.replace(calibration().unit, cycle_time_s=0.1)
-        knows = calibration(unit=unit, noise_density_m_s2_sqrt_hz=(density,) * 3)
+        knows = of_noise(0.3 / K)
         bag = resting(tmp_path / 'bag', 20.0, minutes=40.0, noise=0.3)
         windows = judged(bag, knows, window_s=10.0).windows
         ratio = windows.residual / windows.claimed_sd
@@ -183,10 +176,7 @@ class TestWindows:
     def test_the_limit_of_noise_at_rest_follows_from_the_calibration(self, tmp_path):
         # WHY: for a unit with a noise of 100 mg no window counted as rest (limit: 50 mg).
         bag = resting(tmp_path / 'bag', 20.0, noise=0.1 * K * GRAVITY)
-        density = 0.1 * GRAVITY * np.sqrt(0.1)
-        unit = dataclasses.replace(calibration().unit, cycle_time_s=0.1)
-        knows = calibration(unit=unit, noise_density_m_s2_sqrt_hz=(density,) * 3)
-        assert len(judged(bag, knows).windows) >= 8
+        assert len(judged(bag, of_noise(0.1 * GRAVITY)).windows) >= 8
         with pytest.raises(RecordingError, match='no window of 60 s at rest'):
             judged(bag, calibration())
 
@@ -196,10 +186,8 @@ class TestWindows:
         np.testing.assert_allclose(judgement.windows.residual, -1e-3, atol=1e-9)
 
     def test_the_figures_of_several_recordings_are_those_of_all_their_windows(self, tmp_path):
-        bags = [
-            resting(tmp_path / name, at, error=error)
-            for name, at, error in (('one', 19.0, 0.3), ('two', 30.0, -0.3))
-        ]
+        one = resting(tmp_path / 'one', 19.0, error=0.3)
+        bags = [one, resting(tmp_path / 'two', 30.0, error=-0.3)]
         evaluation = evaluate(bags, [('it', CLAIMING)])
         whole = evaluation.judgements['it'].sections['all']
         # Two bags with equal numbers of windows have residuals of +102 and -102 ug: the mean is 0.
@@ -268,9 +256,8 @@ class TestVerdict:
         assert unseen.headline_rms / MICRO_G == pytest.approx(50.0)
         assert unseen.reason.startswith('50 ug RMS of |f| - g, 1 mg raw')
         assert seen.headline_rms / MICRO_G == pytest.approx(300.0)
-        assert seen.reason.startswith(
-            '300 ug RMS of |f| - g on positions left out; in sample 50 ug RMS of |f| - g, 1 mg raw'
-        )
+        left_out = '300 ug RMS of |f| - g on positions left out; in sample '
+        assert seen.reason.startswith(f'{left_out}50 ug RMS of |f| - g, 1 mg raw')
         # The in-sample error is judged by the claimed sd, the left-out error by a tolerance.
         assert seen.verdict == unseen.verdict == 'valid'
         limited = judge(windows, unit, 100.0 * MICRO_G, is_seen=True)
@@ -302,9 +289,7 @@ class TestVerdict:
 
     def test_the_worse_regime_decides_the_verdict(self):
         windows = made(50.0, 1000.0, 60.0)
-        worse = windows.force.copy()
-        worse[:10, 2] = GRAVITY + 150.0 * MICRO_G
-        windows = dataclasses.replace(windows, force=worse)
+        windows.force[:10, 2] = GRAVITY + 150.0 * MICRO_G
         # Residuals: 150 ug in the dynamic regime, 84 ug RMS in all windows. Claimed sd: 60 ug.
         judgement = judge(windows, CLAIMING)
         assert judgement.sections['all'].ratio < 2.0
@@ -313,15 +298,14 @@ class TestVerdict:
 
     def test_windows_outside_the_ranges_do_not_change_the_verdict(self):
         windows = made(50.0, 1000.0, 60.0, outside=10)
-        wild = windows.force.copy()
-        wild[:10, 2] = GRAVITY + 5000.0 * MICRO_G
-        found = judge(dataclasses.replace(windows, force=wild), CLAIMING)
+        bad = windows.force.copy()
+        windows.force[:10, 2] = GRAVITY + 5000.0 * MICRO_G
+        found = judge(windows, CLAIMING)
         assert found.verdict == 'valid'
         assert found.sections['all'].n == 30
         assert found.sections['outside'].n == 10
         assert '10 windows of 60 s outside the calibrated ranges not judged: 5 mg' in found.reason
         # Only windows inside the ranges are judged; without such windows there is no verdict.
-        bad = windows.force.copy()
         bad[10:, 2] = GRAVITY + 500.0 * MICRO_G
         found = judge(dataclasses.replace(windows, force=bad), CLAIMING)
         assert found.verdict == 'recalibrate'
@@ -382,9 +366,8 @@ class TestShifts:
 
     def test_the_drift_of_an_axis_is_the_deviation_from_its_mean_in_a_position(self):
         windows = made(0.0, 1000.0, 60.0, n=40, dynamic=20)
-        force = windows.force.copy()
-        force[:20, 0] += 3e-5 * np.where(np.arange(20) % 2, 1.0, -1.0)
-        judgement = judge(dataclasses.replace(windows, force=force), CLAIMING)
+        windows.force[:20, 0] += 3e-5 * np.where(np.arange(20) % 2, 1.0, -1.0)
+        judgement = judge(windows, CLAIMING)
         np.testing.assert_allclose(judgement.axis_rms, [[0, 0, 0], [3e-5, 0, 0]], atol=1e-12)
 
 
@@ -406,8 +389,7 @@ def test_evaluate_reports_exchanged_thermometers_and_temperatures_out_of_range(r
 
 
 def test_an_axis_that_repeats_one_value_in_a_rest_is_named(tmp_path):
-    # WHY: a level axis hardly changes |f|, and a bag whose y axis repeated one number for an hour
-    # was judged as valid.
+    # WHY: a bag whose level y axis repeated one number, which hardly changes |f|, was valid.
     bag = resting(tmp_path / 'dead.mcap', 20.0, noise=5.0, dead='y')
     density = (5.0 / K * np.sqrt(0.1),) * 3
     noisy = corrected_by(SLOPE, noise_density_m_s2_sqrt_hz=density)
@@ -427,11 +409,9 @@ def test_a_bag_with_temperatures_in_kelvins_is_refused(tmp_path):
         judged(bag, CLAIMING)
 
 
-@pytest.mark.parametrize(
-    ('step', 'noise', 'is_refused'), [(0.0, 0.02, True), (0.005, 0.02, True), (0.01, 0.001, False)]
-)
-def test_a_constant_axis_of_an_imu_is_named_if_its_noise_exceeds_the_step(
-    tmp_path, rng, step, noise, is_refused
+@pytest.mark.parametrize(('step', 'noise'), [(0.0, 0.02), (0.005, 0.02), (0.01, 0.001)])
+def test_a_constant_axis_of_an_imu_is_named_if_its_noise_exceeds_a_step(
+    tmp_path, rng, step, noise
 ):
     n = 6000
     force = noise * rng.standard_normal((n, 3)) + (1.5 * step, 0.0, GRAVITY)
@@ -446,12 +426,9 @@ def test_a_constant_axis_of_an_imu_is_named_if_its_noise_exceeds_the_step(
         writer.write_imu(TOPICS.imu, stamps, force, np.zeros(9))
     unit = Unit('T-1', 'm/s^2', 80.0, 0.1)
     density = (noise * np.sqrt(0.1),) * 3
-    axes = Axes(*[AxisReference(1.0, 0.0)] * 3)
-    known = calibration(unit=unit, axes=axes, noise_density_m_s2_sqrt_hz=density)
-    if is_refused:
-        with pytest.raises(
-            RecordingError, match=r'imu\.mcap: dead axis: y reads exactly 0 for 0\.'
-        ):
+    known = calibration(unit=unit, axes=equal_axes(1.0), noise_density_m_s2_sqrt_hz=density)
+    if noise > step:
+        with pytest.raises(RecordingError, match=r'\.mcap: dead axis: y reads exactly 0 for 0\.'):
             judged(path, known)
     else:
         assert judged(path, known)

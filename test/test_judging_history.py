@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Changes between calibrations of a unit are right; `evaluate` and `report` agree."""
 
-import dataclasses
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -25,23 +25,19 @@ K = 300.0
 
 def dated(created, bias_ug=0.0, ppm=0.0, sd_ug=3.0):
     scale = K * (1.0 + 1e-6 * ppm)
-    axes = dataclasses.replace(
-        calibration().axes, z=AxisReference(scale, bias_ug * MICRO_G * scale)
-    )
+    axes = replace(calibration().axes, z=AxisReference(scale, bias_ug * MICRO_G * scale))
     part = regime_set(*[axis_set(residual_sd_m_s2=sd_ug * MICRO_G)] * 3)
     unit = calibration(axes=axes, static=part, dynamic=part)
-    provenance = dataclasses.replace(
-        unit.provenance, created=created, sources=(Source(created, created),)
-    )
-    return dataclasses.replace(unit, provenance=provenance)
+    sources = (Source(created, created),)
+    provenance = replace(unit.provenance, created=created, sources=sources)
+    return replace(unit, provenance=provenance)
 
 
 def test_changes_between_calibrations_and_their_sd_equal_those_found_by_hand():
     # Dates give the order of calibrations. The change of z bias has the sd hypot(3, 4) = 5 ug.
     drifts = drifts_of(history_of([dated('2026-02-01', 20.0, 50.0, 4.0), dated('2026-01-01')]))
-    assert [drift.constant for drift in drifts] == [
-        *('bias x', 'bias y', 'bias z', 'scale x', 'scale y', 'scale z')
-    ]
+    names = [f'{kind} {axis}' for kind in ('bias', 'scale') for axis in 'xyz']
+    assert [drift.constant for drift in drifts] == names
     *still, z = drifts[:3]
     assert (z.earlier, z.later, z.unit) == ('2026-01-01', '2026-02-01', 'ug')
     assert z.change == pytest.approx(20.0)
@@ -56,11 +52,10 @@ def test_changes_between_calibrations_and_their_sd_equal_those_found_by_hand():
 def test_calibrations_that_do_not_form_a_history_give_no_drift():
     unit = dated('2026-01-01')
     # One calibration, two of the same bags, or two of different units do not form a history.
-    other = dataclasses.replace(unit, unit=dataclasses.replace(unit.unit, serial='other'))
-    for calibrations in ([unit], [unit, unit], [unit, dataclasses.replace(other)]):
+    other = replace(unit, unit=replace(unit.unit, serial='other'))
+    for calibrations in ([unit], [unit, unit], [unit, other]):
         assert drifts_of(history_of(calibrations)) == []
-    import_ = dataclasses.replace(dated('2026-03-01', 500.0, sd_ug=0.0))
-    silent = drifts_of(history_of([unit, import_]))
+    silent = drifts_of(history_of([unit, dated('2026-03-01', 500.0, sd_ug=0.0)]))
     assert np.isnan([drift.sd for drift in silent]).all()
     assert not any(drift.is_sure for drift in silent)
 
@@ -69,13 +64,9 @@ def test_evaluate_and_report_print_the_history(cli, tmp_path, monkeypatch):
     undrawn = 'thermo_comp.report.page.drawn_figures'
     monkeypatch.setattr(undrawn, lambda figures: [(figure, '') for figure in figures])
     now = fitted().calibration
-    axes = dataclasses.replace(
-        now.axes, x=dataclasses.replace(now.axes.x, bias=now.axes.x.bias + 10.0)
-    )
-    provenance = dataclasses.replace(now.provenance, tested='2020-01-01T00:00:00Z', sources=())
-    save_calibration(
-        dataclasses.replace(now, axes=axes, provenance=provenance), tmp_path / 'a.yaml'
-    )
+    axes = replace(now.axes, x=replace(now.axes.x, bias=now.axes.x.bias + 10.0))
+    provenance = replace(now.provenance, tested='2020-01-01T00:00:00Z', sources=())
+    save_calibration(replace(now, axes=axes, provenance=provenance), tmp_path / 'a.yaml')
     save_calibration(now, tmp_path / 'b.yaml')
     bag = write_bag(tmp_path / 'held_out.mcap')
     given = ('-c', tmp_path / 'b.yaml', '-c', tmp_path / 'a.yaml', '--json')

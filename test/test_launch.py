@@ -97,10 +97,9 @@ def test_a_parameter_is_set_only_where_its_argument_was_given(tmp_path):
     unit = tmp_path / 'unit.yaml'
     save_calibration(calibration(unit=Unit('0042', 'm/s^2', 160.0, 0.01)), unit)
     mine = {'calibration_file': str(unit), 'serial': '0042', 'input': 'imu', 'frame_id': 'mine'}
-    counts = {'input': 'counts', 'calibration_file': str(tmp_path / 'counts.yaml')}
-    save_calibration(
-        calibration(unit=Unit('0042', 'counts', 32767.0, 0.01)), tmp_path / 'counts.yaml'
-    )
+    other = tmp_path / 'counts.yaml'
+    save_calibration(calibration(unit=Unit('0042', 'counts', 32767.0, 0.01)), other)
+    counts = {'input': 'counts', 'calibration_file': str(other)}
     some = [{}, {'frame_id': 'body'}, {'serial': '0042', **counts}]
     for arguments in some:
         files = []

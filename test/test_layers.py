@@ -20,30 +20,14 @@ PACKAGE = ROOT / 'thermo_comp'
 
 # Layer of each package (a folder or file in thermo_comp): a package imports no higher layer.
 LAYERS = {
-    '__init__': 0,  # public names, imported for type checkers
-    'errors': 0,
-    'typing': 0,
-    'files': 0,
-    'plain_yaml': 0,
-    'quantities': 0,
-    'topics': 0,
-    'thermal': 1,
-    'unit': 1,
-    'online': 2,
-    'text': 0,
-    'simulation': 2,
-    'recording': 2,
-    'fitting': 3,
-    'replay': 3,
-    'api': 4,
-    'field': 4,
-    'judging': 4,
-    'convert': 4,
-    'report': 5,
-    'fleet': 5,
-    'ros': 6,
-    'cli': 6,
-    '__main__': 6,
+    **dict.fromkeys(('__init__', 'errors', 'typing', 'files', 'plain_yaml', 'quantities'), 0),
+    **dict.fromkeys(('topics', 'text'), 0),
+    **dict.fromkeys(('thermal', 'unit'), 1),
+    **dict.fromkeys(('online', 'simulation', 'recording'), 2),
+    **dict.fromkeys(('fitting', 'replay'), 3),
+    **dict.fromkeys(('api', 'field', 'judging', 'convert'), 4),
+    **dict.fromkeys(('report', 'fleet'), 5),
+    **dict.fromkeys(('ros', 'cli', '__main__'), 6),
 }
 
 # The packages that may import each library; any package may import a library not listed here.
@@ -60,9 +44,7 @@ HOMES = {
 # Packages of mathematics, which must not read a clock, except for the files `CLOCK_EXCEPTIONS`.
 PURE = {'thermal', 'unit', 'online', 'simulation', 'fitting', 'field'}
 CLOCKS = {'time', 'datetime', 'sched', 'threading', 'asyncio'}
-CLOCK_EXCEPTIONS = {
-    'fitting/assembly.py'  # writes the date of a fit into the provenance
-}
+CLOCK_EXCEPTIONS = {'fitting/assembly.py'}  # writes the date of a fit into the provenance
 
 SOURCES = sorted(PACKAGE.rglob('*.py'))
 
@@ -101,9 +83,8 @@ def own_unit(name):
     parts = name.split('.')
     if parts[0] != 'thermo_comp':
         return None
-    known = len(parts) > 1 and (
-        (PACKAGE / parts[1]).is_dir() or (PACKAGE / f'{parts[1]}.py').is_file()
-    )
+    names = (parts[1], f'{parts[1]}.py') if len(parts) > 1 else ()
+    known = any((PACKAGE / name).exists() for name in names)
     return parts[1] if known else '__init__'
 
 

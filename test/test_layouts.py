@@ -38,11 +38,10 @@ def replayed(folder, kind):
         else:
             force = np.tile((0.1, 0.2, GRAVITY), (600, 1))
             writer.write_imu('imu/uncompensated', stamps, force, np.zeros(9))
-    unit = Unit('T-1', 'counts' if kind == 'counts' else 'm/s^2', 32767.0, 0.1)
-    scale = 300.0 if kind == 'counts' else 1.0
-    unit_ = calibration(unit=unit, axes=equal_axes(scale))
+    name, scale = ('counts', 300.0) if kind == 'counts' else ('m/s^2', 1.0)
+    known = calibration(unit=Unit('T-1', name, 32767.0, 0.1), axes=equal_axes(scale))
     output = folder / f'{kind}_corrected.mcap'
-    replay(source, unit_, output, keep_inputs=True)
+    replay(source, known, output, keep_inputs=True)
     return {name: topic[0] for name, topic in inspect_recording(output).topics.items()}
 
 
@@ -105,9 +104,8 @@ def test_topics_in_the_foxglove_script_and_diagnostics_panels_exist(topics):
 
 
 def test_foxglove_shows_every_panel_once():
-    shown = re.findall(
-        r'"(?:first|second)": "([^"]*)"', json.dumps(json.loads(FOXGLOVE.read_text())['layout'])
-    )
+    layout = json.dumps(json.loads(FOXGLOVE.read_text())['layout'])
+    shown = re.findall(r'"(?:first|second)": "([^"]*)"', layout)
     assert sorted(shown) == sorted(panels())
     kinds = {name.split('!')[0] for name in shown}
     assert {'Plot', 'StateTransitions', 'DiagnosticSummary'} <= kinds

@@ -133,11 +133,8 @@ def test_the_lag_of_a_part_agrees_with_a_solver_if_the_thermometer_lags(rng, sec
     def slope(t, nodes):
         u = np.interp(t, times, board)
         ahead = nodes[1] if second_s else u
-        return [
-            (u - nodes[0]) / thermometer_s,
-            (u - nodes[1]) / (second_s or 1.0),
-            (ahead - nodes[2]) / 900.0,
-        ]
+        lags = thermometer_s, second_s or 1.0, 900.0
+        return (np.array((u, u, ahead)) - nodes) / lags
 
     lag = Lag('board', 900.0, second_s, lead_s=thermometer_s)
     fine = np.arange(0.0, times[-1], 1.0)
@@ -249,10 +246,9 @@ def test_a_stuck_board_thermometer_adds_errors_to_the_lags_of_board_and_case():
     memory.board_step(0, 20.0)
     memory.banks['case'].step(0, 1.0)
     at = (0, 20.0, [1.0])
-    moving, board, both = (
-        np.array(memory.at(*at, still)[1::2])
-        for still in ((), ((2.0, 300.0), (0.0, 0.0)), ((2.0, 300.0), (2.0, 300.0)))
-    )
+    stuck, right = (2.0, 300.0), (0.0, 0.0)
+    some = (), (stuck, right), (stuck, stuck)
+    moving, board, both = (np.array(memory.at(*at, still)[1::2]) for still in some)
     share = 1.0 - np.exp(-300.0 / np.array([900.0, 600.0]))
     np.testing.assert_allclose(board - moving, (2.0 * share) ** 2)
     np.testing.assert_allclose(both - moving, (2.0 * share) ** 2 * [1.0, 2.0])

@@ -12,23 +12,12 @@ from conftest import ROOT
 
 pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
 
+import ros_helpers as ros
 from builders import calibration, rich_calibration, thermal_calibration
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
 from live_node import lossless
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from ros_helpers import (
-    CYCLE_NS,
-    DEEP,
-    SECOND_NS,
-    START_NS,
-    drive,
-    node_arguments,
-    node_in_thread,
-    stamp_of,
-    stamped,
-    standing,
-)
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Bool
 
@@ -38,9 +27,7 @@ from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.nonlinearity import Nonlinearity
 
 BEST_EFFORT = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
-LATCHED = QoSProfile(
-    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
-)
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 IMU_UNIT = Unit('T-1', 'm/s^2', 160.0, 0.01)
 
 
@@ -48,7 +35,7 @@ IMU_UNIT = Unit('T-1', 'm/s^2', 160.0, 0.01)
 def saved(tmp_path):
     def save(of, *overrides):
         save_calibration(of, tmp_path / 'unit.yaml')
-        return node_arguments(tmp_path / 'unit.yaml', *overrides)
+        return ros.node_arguments(tmp_path / 'unit.yaml', *overrides)
 
     return save
 
@@ -76,11 +63,11 @@ def diagnosis(peer):
 
 def test_the_node_takes_imu_input_and_can_switch_to_counts(peer, saved):
     unit = replace(calibration(), unit=IMU_UNIT)
-    with node_in_thread(*saved(unit, 'input:=imu', 'frame_id:=body')) as node:
+    with ros.node_in_thread(*saved(unit, 'input:=imu', 'frame_id:=body')) as node:
         heard = peer.listen(Imu, 'imu/data_raw')
-        driver = drive(peer, node, Imu, 'imu/uncompensated')
-        driver.temperatures(START_NS, 20.0, 20.0)
-        sent = stamped(Imu(), START_NS + 1, 'sensor')
+        driver = ros.drive(peer, node, Imu, 'imu/uncompensated')
+        driver.temperatures(ros.START_NS, 20.0, 20.0)
+        sent = ros.stamped(Imu(), ros.START_NS + 1, 'sensor')
         sent.angular_velocity.y = 0.125
         sent.orientation.x = 0.5
         sent.orientation_covariance[0] = 7.0
@@ -98,7 +85,7 @@ def test_the_node_takes_imu_input_and_can_switch_to_counts(peer, saved):
         assert both.successful, both.reason
         vectors = peer.publisher(Vector3Stamped, 'accel/counts')
         peer.join(node)
-        message = stamped(Vector3Stamped(), START_NS + 2, 'vector')
+        message = ros.stamped(Vector3Stamped(), ros.START_NS + 2, 'vector')
         message.vector.x = 150.0
         vectors.publish(message)
         peer.wait_for(lambda: len(heard) == 2, 'the vector')
@@ -107,14 +94,14 @@ def test_the_node_takes_imu_input_and_can_switch_to_counts(peer, saved):
 
 
 def test_the_regime_flag_is_latched_and_not_published_while_unknown(peer, saved):
-    with node_in_thread(*saved(calibration()), *lossless()) as node:
+    with ros.node_in_thread(*saved(calibration()), *lossless()) as node:
         heard = peer.listen(Imu, 'imu/data_raw')
         flags = peer.listen(Bool, 'regime/dynamic')
         stamped_flags = peer.listen(DiagnosticArray, 'regime/stamped')
         wait = diagnosis(peer)
-        driver = drive(peer, node)
-        driver.temperatures(START_NS, 20.0, 20.0)
-        driver.counts(START_NS + 1, 1.0, 2.0, 3.0)
+        driver = ros.drive(peer, node)
+        driver.temperatures(ros.START_NS, 20.0, 20.0)
+        driver.counts(ros.START_NS + 1, 1.0, 2.0, 3.0)
         _, status, values = wait(lambda _, values: values['samples out'] == '1')
         assert (status.level, values['regime']) == (DiagnosticStatus.OK, 'unknown')
         assert not flags
@@ -123,8 +110,8 @@ def test_the_regime_flag_is_latched_and_not_published_while_unknown(peer, saved)
             # Send samples and readings of 2 min at a time until the soak is recognised.
             for _ in range(120):
                 n += 1
-                driver.temperatures(START_NS + n * SECOND_NS, 20.0, 20.0)
-                driver.counts(START_NS + n * SECOND_NS, *standing(n))
+                driver.temperatures(ros.START_NS + n * ros.SECOND_NS, 20.0, 20.0)
+                driver.counts(ros.START_NS + n * ros.SECOND_NS, *ros.standing(n))
             peer.wait_for(lambda n=n: len(heard) == n + 1, 'the samples')
         peer.wait_for(lambda: flags, 'the flag')
         assert not flags[-1].data
@@ -134,41 +121,36 @@ def test_the_regime_flag_is_latched_and_not_published_while_unknown(peer, saved)
         # `regime/stamped`, the flag with the stamp of the deciding reading, is latched, too.
         latched = peer.listen(DiagnosticArray, 'regime/stamped', LATCHED)
         # A subscriber that joins later gets the latched messages, the newest last.
-        peer.wait_for(
-            lambda: (
-                len(stamped_flags) == len(flags)
-                and latched
-                and stamp_of(latched[-1]) == stamp_of(stamped_flags[-1])
-            ),
-            'the stamped flag',
-        )
+        peer.wait_for(lambda: latched and len(stamped_flags) == len(flags), 'the stamped flags')
+        last_ns = ros.stamp_of(stamped_flags[-1])
+        peer.wait_for(lambda: ros.stamp_of(latched[-1]) == last_ns, 'the last stamped flag')
         for array in (*stamped_flags, *latched):
             (status,) = array.status
             assert (status.message, status.hardware_id) == ('static', 'T-1')
-            assert (stamp_of(array) - START_NS) % SECOND_NS == 0
-        stamps = [stamp_of(array) for array in stamped_flags]
+            assert (ros.stamp_of(array) - ros.START_NS) % ros.SECOND_NS == 0
+        stamps = [ros.stamp_of(array) for array in stamped_flags]
         assert stamps == sorted(set(stamps))
-        assert stamps[-1] <= START_NS + n * SECOND_NS
+        assert stamps[-1] <= ros.START_NS + n * ros.SECOND_NS
 
 
 def test_diagnostics_name_faults_of_samples(peer, saved):
     wait = diagnosis(peer)
-    with node_in_thread(*saved(thermal_calibration())) as node:
+    with ros.node_in_thread(*saved(thermal_calibration())) as node:
         heard = peer.listen(Imu, 'imu/data_raw')
         begin_ns = time.time_ns()
         array, status, values = wait(lambda s, _: 'no board temperature' in s.message)
         assert status.level == DiagnosticStatus.ERROR
         assert status.name == '/thermo_comp: compensation'
         assert status.hardware_id == 'T-1'
-        assert begin_ns - SECOND_NS < stamp_of(array) <= time.time_ns()
+        assert begin_ns - ros.SECOND_NS < ros.stamp_of(array) <= time.time_ns()
         assert values['sample stamp [ns]'] == 'none'
-        driver = drive(peer, node)
-        stamp_ns = START_NS
+        driver = ros.drive(peer, node)
+        stamp_ns = ros.START_NS
         driver.temperatures(stamp_ns, 20.0, 20.0)
         nan = float('nan')
         bad = [(nan, 0.0, 0.0), (32767.0, 0.0, 0.0), (0.0, -32768.0, 0.0), (1.0, 2.0, 3.0)]
         for x, y, z in bad:
-            stamp_ns += CYCLE_NS
+            stamp_ns += ros.CYCLE_NS
             driver.counts(stamp_ns, x, y, z)
         _, status, values = wait(lambda _, values: values['saturated'] == '2')
         assert status.level == DiagnosticStatus.ERROR
@@ -180,32 +162,26 @@ def test_diagnostics_name_faults_of_samples(peer, saved):
         # A report without new saturated samples does not mention saturation.
         wait(lambda s, _: 'no samples are coming in' in s.message and 'sat' not in s.message)
         driver.temperatures(stamp_ns, 40.0, 40.0)
-        driver.counts(stamp_ns + CYCLE_NS, 1.0, 2.0, 3.0)
+        driver.counts(stamp_ns + ros.CYCLE_NS, 1.0, 2.0, 3.0)
         # A stamp that falls by over 1 s is a jump of time; one that falls by less is out of order.
         driver.counts(stamp_ns - 5, 1.0, 2.0, 3.0)
         _, status, _ = wait(lambda s, _: 'out of order' in s.message)
-        for late_ns in (10 * SECOND_NS, 9 * SECOND_NS):
-            driver.counts(START_NS - late_ns, 1.0, 2.0, 3.0)
+        for late_ns in (10 * ros.SECOND_NS, 9 * ros.SECOND_NS):
+            driver.counts(ros.START_NS - late_ns, 1.0, 2.0, 3.0)
         wait(lambda s, _: 'jumps of time backwards, estimators reset: 1' in s.message)
 
 
 def test_diagnostics_contain_noise_density_and_bias_sd(peer, saved):
     wait, unit = diagnosis(peer), rich_calibration()
-    with node_in_thread(*saved(unit)) as node:
-        driver = drive(peer, node)
-        driver.temperatures(START_NS, 20.0, 20.0)
-        driver.counts(START_NS + 1, *standing(0))
+    with ros.node_in_thread(*saved(unit)) as node:
+        driver = ros.drive(peer, node)
+        driver.temperatures(ros.START_NS, 20.0, 20.0)
+        driver.counts(ros.START_NS + 1, *ros.standing(0))
         _, _, values = wait(lambda _, values: values['samples out'] == '1')
         for axis in 'xyz':
             # An INS needs noise density and bias sd as well as the covariance of each sample.
-            density, whole, bias = (
-                float(values[f'{name} {axis} {of}'])
-                for name, of in (
-                    ('noise density', '[m/s^2/sqrt(Hz)]'),
-                    ('sd', '[m/s^2]'),
-                    ('bias sd', '[m/s^2]'),
-                )
-            )
+            density = float(values[f'noise density {axis} [m/s^2/sqrt(Hz)]'])
+            whole, bias = (float(values[f'{name} {axis} [m/s^2]']) for name in ('sd', 'bias sd'))
             assert density == unit.noise_density_m_s2_sqrt_hz['xyz'.index(axis)]
             counts = getattr(unit.axes, axis).scale_factor
             noise = density**2 / unit.unit.cycle_time_s + 1.0 / 6.0 / counts**2
@@ -223,14 +199,13 @@ def test_diagnostics_contain_noise_density_and_bias_sd(peer, saved):
 
 @pytest.mark.parametrize('was_fitted_with_case', [False, True])
 def test_a_missing_case_is_reported_only_if_the_fit_had_a_case(peer, saved, was_fitted_with_case):
-    seen = DetectorSettings(case=ThermometerSettings(noise_sd_c=0.05))
-    unit = thermal_calibration()
-    unit = replace(unit, detector=seen) if was_fitted_with_case else unit
+    case = {'case': ThermometerSettings(noise_sd_c=0.05)} if was_fitted_with_case else {}
+    unit = replace(thermal_calibration(), detector=DetectorSettings(**case))
     wait = diagnosis(peer)
-    with node_in_thread(*saved(unit)) as node:
-        driver = drive(peer, node)
-        driver.temperatures(START_NS, 20.0)
-        driver.counts(START_NS, *standing(0))
+    with ros.node_in_thread(*saved(unit)) as node:
+        driver = ros.drive(peer, node)
+        driver.temperatures(ros.START_NS, 20.0)
+        driver.counts(ros.START_NS, *ros.standing(0))
         _, status, values = wait(lambda _, values: values['samples out'] == '1')
         assert ('case temperature lost' in status.message) == was_fitted_with_case
         assert values['case age [s]'] == 'inf'
@@ -240,12 +215,12 @@ def test_diagnostics_name_faults_of_temperatures(peer, saved):
     wait = diagnosis(peer)
     # The nonlinear terms of this unit were fitted to forces below 1 g.
     unit = replace(thermal_calibration(), nonlinearity=Nonlinearity((1.0, 5.0), 1e-4))
-    with node_in_thread(*saved(unit, 'temperature_timeout:=20', 'case_timeout:=10')) as node:
-        driver = drive(peer, node)
+    with ros.node_in_thread(*saved(unit, 'temperature_timeout:=20', 'case_timeout:=10')) as node:
+        driver = ros.drive(peer, node)
         # 50 degC are 15 K above the calibrated range.
         for k in range(5):
-            driver.temperatures(START_NS + k * SECOND_NS, 50.0, 50.0)
-            driver.counts(START_NS + k * SECOND_NS, *standing(k))
+            driver.temperatures(ros.START_NS + k * ros.SECOND_NS, 50.0, 50.0)
+            driver.counts(ros.START_NS + k * ros.SECOND_NS, *ros.standing(k))
         _, status, values = wait(lambda _, values: values['samples out'] == '5')
         assert 'board temperature +15' in status.message
         assert 'above the largest |f| of the fit' in status.message
@@ -254,12 +229,12 @@ def test_diagnostics_name_faults_of_temperatures(peer, saved):
         assert float(values['temperature excess [K]']) == pytest.approx(15.0, abs=0.1)
         assert values['board temperature [degC]'].startswith('50.0')
         assert float(values['sd x [m/s^2]']) > 0.0
-        driver.temperatures(START_NS + 15 * SECOND_NS, 50.0)
-        driver.counts(START_NS + 15 * SECOND_NS, *standing(15))
+        driver.temperatures(ros.START_NS + 15 * ros.SECOND_NS, 50.0)
+        driver.counts(ros.START_NS + 15 * ros.SECOND_NS, *ros.standing(15))
         _, status, _ = wait(lambda s, _: 'case temperature lost' in s.message)
-        driver.counts(START_NS + 30 * SECOND_NS, *standing(30))
+        driver.counts(ros.START_NS + 30 * ros.SECOND_NS, *ros.standing(30))
         wait(lambda s, _: 'board temperature 15.0 s old, but still' in s.message)
-        driver.counts(START_NS + 40 * SECOND_NS, *standing(40))
+        driver.counts(ros.START_NS + 40 * ros.SECOND_NS, *ros.standing(40))
         _, status, values = wait(lambda s, _: '25.0 s old, nothing is published' in s.message)
         assert status.level == DiagnosticStatus.ERROR
         assert values['stale'] == '1'
@@ -267,11 +242,11 @@ def test_diagnostics_name_faults_of_temperatures(peer, saved):
 
 def test_a_node_with_constants_needs_no_thermometer(peer, saved):
     wait = diagnosis(peer)
-    with node_in_thread(*saved(calibration())) as node:
+    with ros.node_in_thread(*saved(calibration())) as node:
         heard = peer.listen(Imu, 'imu/data_raw')
-        driver = drive(peer, node)
+        driver = ros.drive(peer, node)
         for k in range(20):
-            driver.counts(START_NS + k * CYCLE_NS, *standing(k))
+            driver.counts(ros.START_NS + k * ros.CYCLE_NS, *ros.standing(k))
         _, status, values = wait(lambda _, values: values['samples out'] == '20')
         # The diagnostics may arrive before the last samples, which have a different topic.
         peer.wait_for(lambda: len(heard) == 20)
@@ -283,36 +258,35 @@ def test_a_node_with_constants_needs_no_thermometer(peer, saved):
 
 def test_the_sample_rate_is_compared_with_the_calibrated_rate(peer, saved):
     wait = diagnosis(peer)
-    with node_in_thread(*saved(calibration())) as node:
-        driver = drive(peer, node)
-        driver.temperatures(START_NS, 20.0, 20.0)
+    with ros.node_in_thread(*saved(calibration())) as node:
+        driver = ros.drive(peer, node)
+        driver.temperatures(ros.START_NS, 20.0, 20.0)
         # The unit's cycle is 10 ms; the samples have stamps 20 ms apart.
         for k in range(50):
-            driver.counts(START_NS + 2 * k * CYCLE_NS, *standing(k))
+            driver.counts(ros.START_NS + 2 * k * ros.CYCLE_NS, *ros.standing(k))
         wait(lambda _, values: values['samples in'] == '50')
         for k in range(50, 100):
-            driver.counts(START_NS + 2 * k * CYCLE_NS, *standing(k))
+            driver.counts(ros.START_NS + 2 * k * ros.CYCLE_NS, *ros.standing(k))
         _, _, values = wait(lambda s, _: 'calibrated for 100' in s.message)
         assert float(values['sample rate [Hz]']) == pytest.approx(50.0, rel=0.1)
 
 
-@pytest.mark.parametrize('qos', [DEEP, BEST_EFFORT], ids=['reliable', 'best effort'])
+@pytest.mark.parametrize('qos', [ros.DEEP, BEST_EFFORT], ids=['reliable', 'best effort'])
 def test_the_node_connects_to_peers_of_any_reliability(peer, saved, qos):
-    with node_in_thread(*saved(calibration())) as node:
+    with ros.node_in_thread(*saved(calibration())) as node:
         heard = peer.listen(Imu, 'imu/data_raw', qos)
-        driver = drive(peer, node, qos=qos)
-        driver.temperatures(START_NS, 20.0)
-        driver.counts(START_NS, *standing(0))
+        driver = ros.drive(peer, node, qos=qos)
+        driver.temperatures(ros.START_NS, 20.0)
+        driver.counts(ros.START_NS, *ros.standing(0))
         peer.wait_for(lambda: heard, 'the sample')
 
 
 def test_the_node_uses_the_namespace_and_remapped_topics(peer, saved):
     args = ['-r', '__ns:=/imu0', '-r', 'accel/counts:=/adc/raw', '-r', 'imu/data_raw:=imu/clean']
-    with node_in_thread(*saved(calibration()), *args) as node:
+    with ros.node_in_thread(*saved(calibration()), *args) as node:
         topics = dict(node.node.get_topic_names_and_types())
-        assert {'/adc/raw', '/imu0/imu/clean', '/imu0/temperature/board', '/diagnostics'} <= set(
-            topics
-        )
+        named = {'/adc/raw', '/imu0/imu/clean', '/imu0/temperature/board', '/diagnostics'}
+        assert named <= set(topics)
         assert '/accel/counts' not in topics
         names = {name for name, _ in node.node.get_service_names_and_types()}
         assert '/imu0/thermo_comp/set_parameters' in names

@@ -15,29 +15,14 @@ import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
 
+import ros_helpers as ros
 from builders import calibration
 from diagnostic_msgs.msg import DiagnosticStatus
 from node_process import OVER_UDP, NodeProcess
+from rcl_interfaces import srv
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterValue
-from rcl_interfaces.srv import (
-    DescribeParameters,
-    GetParameters,
-    GetParameterTypes,
-    ListParameters,
-    SetParameters,
-    SetParametersAtomically,
-)
 from rclpy.parameter import Parameter
-from ros_helpers import (
-    CYCLE_NS,
-    START_NS,
-    TIMEOUT,
-    Samples,
-    node_arguments,
-    node_in_thread,
-    status_with,
-)
 
 from thermo_comp.errors import CalibrationError
 from thermo_comp.plain_yaml import NODE_LIMIT
@@ -45,6 +30,8 @@ from thermo_comp.ros.parameters import PARAMETERS_LIMIT
 from thermo_comp.ros.reader import Reader, read_within
 from thermo_comp.text import one_line
 from thermo_comp.unit.calibration_file import save_calibration
+
+SLOW = pytest.mark.slow
 
 
 def odd(name, kind):
@@ -72,9 +59,9 @@ STRANGE = [
 
 @pytest.mark.parametrize('together', [False, True], ids=['each', 'together'])
 def test_any_request_is_answered_and_samples_go_on(peer, unit, together):
-    with node_in_thread(*node_arguments(unit)) as node:
-        samples = Samples(peer, node)
-        kind = SetParametersAtomically if together else SetParameters
+    with ros.node_in_thread(*ros.node_arguments(unit)) as node:
+        samples = ros.Samples(peer, node)
+        kind = srv.SetParametersAtomically if together else srv.SetParameters
         name = f'thermo_comp/{"set_parameters_atomically" if together else "set_parameters"}'
         for message in STRANGE:
             answer = peer.call(kind, name, kind.Request(parameters=[message]))
@@ -100,17 +87,17 @@ def test_any_request_is_answered_and_samples_go_on(peer, unit, together):
 @pytest.mark.parametrize(
     ('kind', 'field'),
     [
-        (GetParameters, 'names'),
-        (GetParameterTypes, 'names'),
-        (DescribeParameters, 'names'),
-        (ListParameters, 'prefixes'),
+        (srv.GetParameters, 'names'),
+        (srv.GetParameterTypes, 'names'),
+        (srv.DescribeParameters, 'names'),
+        (srv.ListParameters, 'prefixes'),
     ],
 )
 def test_parameter_requests_of_any_length_are_answered(peer, unit, kind, field):
     # WHY: a request with 100 000 names delayed the samples by more than a second.
     name = 'thermo_comp/' + re.sub('(?<!^)(?=[A-Z])', '_', kind.__name__).lower()
-    with node_in_thread(*node_arguments(unit)) as node:
-        samples = Samples(peer, node)
+    with ros.node_in_thread(*ros.node_arguments(unit)) as node:
+        samples = ros.Samples(peer, node)
 
         def ask(*names):
             answer = str(peer.call(kind, name, kind.Request(**{field: list(names)})))
@@ -128,14 +115,14 @@ def test_parameter_requests_of_any_length_are_answered(peer, unit, kind, field):
 
 def test_a_callback_that_fails_is_logged_counted_and_survived(peer, unit):
     # An unexpected exception in a service, a timer or a subscription must not end the node.
-    with node_in_thread(*node_arguments(unit)) as node:
-        samples = Samples(peer, node)
+    with ros.node_in_thread(*ros.node_arguments(unit)) as node:
+        samples = ros.Samples(peer, node)
 
         def fail(*_):
             raise ZeroDivisionError('nobody foresaw this')
 
         node._loop.call_soon(fail)
-        status = status_with(peer, samples.reports, 'callbacks failed')
+        status = ros.status_with(peer, samples.reports, 'callbacks failed')
         assert status.level == DiagnosticStatus.ERROR
         samples.go_on()
         keep, node._requests._apply = node._requests._apply, fail
@@ -144,7 +131,7 @@ def test_a_callback_that_fails_is_logged_counted_and_survived(peer, unit):
         node._requests._apply = keep
         keep, node._relay._take_readings = node._relay._take_readings, fail
         n_failures = node._loop.n_failures
-        samples.driver.temperatures(START_NS + samples.n_sent * CYCLE_NS, 20.0, 20.0)
+        samples.driver.temperatures(ros.START_NS + samples.n_sent * ros.CYCLE_NS, 20.0, 20.0)
         peer.poll(lambda: node._loop.n_failures > n_failures, 'the failure')
         node._relay._take_readings = keep
         samples.go_on()
@@ -165,7 +152,7 @@ NOT_CALIBRATIONS = {
 
 def test_no_content_of_a_file_that_is_no_calibration_is_quoted(peer, unit, tmp_path):
     other = tmp_path / 'other'
-    with node_in_thread(*node_arguments(unit)):
+    with ros.node_in_thread(*ros.node_arguments(unit)):
         for content, rule in NOT_CALIBRATIONS.items():
             other.write_text(content)
             (result,) = peer.set_parameters(calibration_file=str(other))
@@ -184,7 +171,7 @@ def test_a_calibration_outside_the_calibration_directory_is_refused(peer, unit, 
     (folder / 'link.yaml').symlink_to(outside)
     (folder / 'up').symlink_to(tmp_path)
     (folder / 'good.yaml').symlink_to('unit.yaml')
-    with node_in_thread(*node_arguments(inside, f'calibration_directory:={folder}')):
+    with ros.node_in_thread(*ros.node_arguments(inside, f'calibration_directory:={folder}')):
         for name in (outside, folder / '../outside.yaml', folder / 'link.yaml', '/etc/shadow'):
             (result,) = peer.set_parameters(calibration_file=str(name))
             expected = 'must be in the folder that the parameter `calibration_directory` names'
@@ -222,7 +209,7 @@ def test_a_calibration_reader_that_hangs_is_ended(unit):
     with pytest.raises(CalibrationError, match=r'cannot be read: no answer within 0\.3 s'):
         reader.read(str(unit), '')
     assert process.returncode == -signal.SIGKILL
-    reader._limit_s = TIMEOUT
+    reader._limit_s = ros.TIMEOUT
     assert reader.read(str(unit), '').calibration == calibration()
     reader.close()
     with pytest.raises(CalibrationError, match='the process that reads it ended'):
@@ -238,14 +225,14 @@ def test_a_calibration_file_that_hangs_at_the_start_is_refused(monkeypatch):
 
 
 def test_while_a_calibration_file_hangs_other_parameters_can_be_set(peer, unit):
-    with node_in_thread(*node_arguments(unit)) as node:
-        samples = Samples(peer, node)
+    with ros.node_in_thread(*ros.node_arguments(unit)) as node:
+        samples = ros.Samples(peer, node)
         assert peer.set_parameters(calibration_file=str(unit))[0].successful
         node._reader._limit_s = 3.0
         node._reader._process.send_signal(signal.SIGSTOP)
         name = 'thermo_comp/set_parameters'
         message = Parameter('calibration_file', value=str(unit)).to_parameter_msg()
-        request = SetParameters.Request(parameters=[message])
+        request = srv.SetParameters.Request(parameters=[message])
         hanging = peer._clients[name].call_async(request)
         (result,) = peer.set_parameters(frame_id='body')
         assert result.successful
@@ -254,14 +241,12 @@ def test_while_a_calibration_file_hangs_other_parameters_can_be_set(peer, unit):
         peer.poll(hanging.done, 'the answer')
         (refused,) = hanging.result().results
         assert refused.reason == f'{unit}: cannot be read: no answer within 3 s'
-        node._reader._limit_s = TIMEOUT
+        node._reader._limit_s = ros.TIMEOUT
         assert peer.set_parameters(calibration_file=str(unit))[0].successful
         samples.go_on()
 
 
-@pytest.mark.parametrize(
-    'number', [signal.SIGTERM, pytest.param(signal.SIGKILL, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize('number', [signal.SIGTERM, pytest.param(signal.SIGKILL, marks=SLOW)])
 def test_while_a_calibration_file_hangs_the_node_can_be_ended(peer, unit, number):
     with NodeProcess('-p', f'calibration_file:={unit}', **OVER_UDP) as node:
         assert peer.set_parameters(calibration_file=str(unit))[0].successful
@@ -270,7 +255,7 @@ def test_while_a_calibration_file_hangs_the_node_can_be_ended(peer, unit, number
         os.kill(int(reader), signal.SIGSTOP)
         message = Parameter('calibration_file', value=str(unit)).to_parameter_msg()
         client = peer._clients['thermo_comp/set_parameters']
-        client.call_async(SetParameters.Request(parameters=[message]))
+        client.call_async(srv.SetParameters.Request(parameters=[message]))
         assert peer.set_parameters(frame_id='body')[0].successful
         began = time.monotonic()
         code = node.stop(number)
@@ -297,23 +282,22 @@ raise SystemExit(node.main(['node', '--ros-args', '-p', 'calibration_file:=gone.
 
 def test_a_node_that_hangs_at_the_start_ends_with_one_signal():
     # WHY: the first SIGTERM had no effect; a second SIGTERM was necessary.
-    with subprocess.Popen(
-        [sys.executable, '-c', HANGING], stdout=subprocess.PIPE, text=True
-    ) as process:
+    words = [sys.executable, '-c', HANGING]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout.readline() == 'reads\n'
         began = time.monotonic()
         process.send_signal(signal.SIGTERM)
-        assert process.wait(TIMEOUT) == 0
+        assert process.wait(ros.TIMEOUT) == 0
         assert time.monotonic() - began < 2.0
 
 
 def test_parameters_written_by_param_dump_are_set_by_param_load(peer, unit):
-    with node_in_thread(*node_arguments(unit)) as node:
+    with ros.node_in_thread(*ros.node_arguments(unit)) as node:
         names = [parameter for parameter in node.node._parameters]  # noqa: C416
-        request = GetParameters.Request(names=names)
-        values = peer.call(GetParameters, 'thermo_comp/get_parameters', request).values
+        request = srv.GetParameters.Request(names=names)
+        values = peer.call(srv.GetParameters, 'thermo_comp/get_parameters', request).values
         assert len(values) == len(names) > 20
         dumped = [ParameterMessage(name=n, value=v) for n, v in zip(names, values, strict=True)]
-        loaded = SetParameters.Request(parameters=dumped)
-        results = peer.call(SetParameters, 'thermo_comp/set_parameters', loaded).results
+        loaded = srv.SetParameters.Request(parameters=dumped)
+        results = peer.call(srv.SetParameters, 'thermo_comp/set_parameters', loaded).results
         assert [result.reason for result in results if not result.successful] == []

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from recording_helpers import imu_columns
 
 pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
 
@@ -27,7 +28,7 @@ from thermo_comp.unit.calibration_file import save_calibration
 TOPICS = Topics()
 START_NS = 1_767_225_600_000_000_000
 RATE_HZ = 1
-MINUTES = 24
+MINUTES = 18
 UNIT = Unit('T-1', 'counts', 32767.0, 1.0 / RATE_HZ)
 
 
@@ -44,8 +45,8 @@ def thermal_test(path, imu=False, has_case=True):
     n = MINUTES * 60 * RATE_HZ
     stamps = START_NS + np.arange(1, n + 1) * (1_000_000_000 // RATE_HZ)
     seconds = np.arange(0.0, MINUTES * 60.0, 2.0)
-    case = np.interp(seconds, [0.0, 600.0, 1200.0], [15.0, 15.0, 25.0])
-    board = np.interp(seconds - 100.0, [0.0, 600.0, 1200.0], [16.0, 16.0, 26.0])
+    case = np.interp(seconds, [0.0, 400.0, 800.0], [15.0, 15.0, 25.0])
+    board = np.interp(seconds - 100.0, [0.0, 400.0, 800.0], [16.0, 16.0, 26.0])
     reading_ns = START_NS + (seconds * 1e9).astype(np.int64)
     # The unit rests with z up; the counts follow from the scale factors of `rich_calibration`.
     accel = np.array([5.0, -3.0, 310.0 * 9.80665]) + rng.integers(-4, 5, (n, 3))
@@ -61,7 +62,7 @@ def thermal_test(path, imu=False, has_case=True):
             late = late_ns * (rng.random(len(values)) < 0.3)
             writer.write_temperature(topic, reading_ns, noisy, reading_ns + late)
         if imu:
-            rest = ImuColumns(*(rng.standard_normal((n, k)) for k in (4, 9, 3, 9, 9)))
+            rest = imu_columns(rng, n)
             rest.angular_velocity_covariance[::10, 0] = -1.0
             covariance = rest.linear_acceleration_covariance
             force = accel / [300.0, -295.0, 310.0]
@@ -73,13 +74,13 @@ def thermal_test(path, imu=False, has_case=True):
 
 def output_of(path):
     with AnyReader([path]) as reader:
-        wanted = [c for c in reader.connections if c.topic.endswith(REGIME.name)]
-        flags = [
-            bool(reader.deserialize(data, connection.msgtype).data)
-            for connection, _, data in reader.messages(wanted)
-        ]
-        wanted = [c for c in reader.connections if c.topic.endswith(STAMPED.name)]
-        stamped = [bytes(data) for _, _, data in reader.messages(wanted)]
+
+        def messages(topic):
+            wanted = [link for link in reader.connections if link.topic.endswith(topic.name)]
+            return [(link.msgtype, bytes(data)) for link, _, data in reader.messages(wanted)]
+
+        flags = [bool(reader.deserialize(data, kind).data) for kind, data in messages(REGIME)]
+        stamped = [data for _, data in messages(STAMPED)]
     topics = Topics(imu=IMU_OUT.name, input='imu')
     return read_recording(path, topics, require=('accel',)).columns, flags, stamped
 
@@ -91,15 +92,13 @@ def assert_same(live, offline):
     assert out.accel_stamp_ns.tolist() == expected.accel_stamp_ns.tolist()
     different = np.flatnonzero((out.accel != expected.accel).any(axis=1))
     assert different.tolist() == []
-    assert out.imu is not None
-    assert expected.imu is not None
     for name in ImuColumns._fields:
         assert getattr(out.imu, name).tobytes() == getattr(expected.imu, name).tobytes(), name
     # There is one regime flag for each case reading, so equal flags mean equal switching times.
-    assert (len(flags), flags) == (len(expected_flags), expected_flags)
-    assert False in flags
-    assert True in flags
-    assert (len(stamped), stamped) == (len(flags), expected_stamped)
+    assert flags == expected_flags
+    assert {*flags} == {False, True}
+    assert stamped == expected_stamped
+    assert len(stamped) == len(flags)
 
 
 def run(calibration, bag, folder, *node_args, **keys):

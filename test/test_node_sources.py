@@ -12,49 +12,39 @@ import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
 
+import ros_helpers as ros
 from builders import calibration
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
 from node_process import OVER_UDP
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from ros_helpers import (
-    CYCLE_NS,
-    DEEP,
-    SECOND_NS,
-    START_NS,
-    Samples,
-    drive,
-    node_arguments,
-    node_in_thread,
-    stamp_of,
-    stamped,
-    standing,
-    status_with,
-)
 from sensor_msgs.msg import Imu, Temperature
 
 from thermo_comp.ros.waitloop import Sources
+from thermo_comp.unit.calibration import Unit
 from thermo_comp.unit.calibration_file import save_calibration
 
 
 def contested(peer, heard, topic, send):
     """Send by two publishers until the node reports two publishers; return the node's status."""
     text = f'2 publishers on {topic}, the topic is not used until only one of them sends'
-    status = status_with(peer, heard, text, send)
+    status = ros.status_with(peer, heard, text, send)
     assert status.level == DiagnosticStatus.ERROR
     return status
 
 
 def test_samples_of_a_second_publisher_are_never_published(peer, unit):
     # WHY: the node corrected and published samples of a second driver, in a different attitude.
-    with node_in_thread(*node_arguments(unit)) as node:
-        samples = Samples(peer, node)
-        other = peer.node.create_publisher(Vector3Stamped, 'accel/counts', DEEP)
+    with ros.node_in_thread(*ros.node_arguments(unit)) as node:
+        samples = ros.Samples(peer, node)
+        other = peer.node.create_publisher(Vector3Stamped, 'accel/counts', ros.DEEP)
         peer.poll(other.get_subscription_count, 'the second publisher')
 
         def both():
             samples.send(1)
-            strange = stamped(Vector3Stamped(), START_NS + samples.n_sent * CYCLE_NS - 5)
+            strange = ros.stamped(
+                Vector3Stamped(), ros.START_NS + samples.n_sent * ros.CYCLE_NS - 5
+            )
             strange.vector.x, strange.vector.y = 2000.0 + samples.n_sent % 3, -2000.0
             other.publish(strange)
 
@@ -68,7 +58,7 @@ def test_samples_of_a_second_publisher_are_never_published(peer, unit):
         before = len(samples.heard)
         peer.poll(lambda: (samples.send(1), len(samples.heard) > before)[1], 'samples again')
         assert all(abs(imu.linear_acceleration.x) < 1.0 for imu in samples.heard)
-        assert all(stamp_of(imu) % CYCLE_NS == 0 for imu in samples.heard)
+        assert all(ros.stamp_of(imu) % ros.CYCLE_NS == 0 for imu in samples.heard)
 
 
 #: A driver process: once it has a subscriber it sends samples at 100 Hz; frame_id: its name.
@@ -117,7 +107,7 @@ def driver_process(name):
 
 def test_after_a_driver_was_killed_output_continues_within_two_seconds(peer, unit):
     # WHY: after a driver was killed, the node published nothing for 20 s, until DDS removed it.
-    with node_in_thread(*node_arguments(unit)) as node:
+    with ros.node_in_thread(*ros.node_arguments(unit)) as node:
         diagnostics = peer.listen(DiagnosticArray, '/diagnostics')
         heard = peer.listen(Imu, 'imu/data_raw')
 
@@ -132,7 +122,7 @@ def test_after_a_driver_was_killed_output_continues_within_two_seconds(peer, uni
         with driver_process('second') as (_, began_ns):
             peer.wait_for(lambda: of('second'), 'samples of the second driver')
             assert node._relay.samples.count_publishers() == 2
-            assert (stamp_of(of('second')[0]) - began_ns) * 1e-9 < 2.0
+            assert (ros.stamp_of(of('second')[0]) - began_ns) * 1e-9 < 2.0
             text = '2 publishers on /accel/counts, of which one sends'
             warned = DiagnosticStatus.WARN
             peer.wait_for(
@@ -171,76 +161,73 @@ def test_without_sequence_numbers_samples_of_two_publishers_are_never_used():
     sources = Sources()
     assert sources.first_of_single_source(1, [None] * 3, [0, 1, 2]) == 0
     for k in range(5):
-        assert sources.first_of_single_source(2, [None] * 3, [k * SECOND_NS] * 3) == 3
-    assert sources.first_of_single_source(1, [None] * 3, [9 * SECOND_NS] * 3) == 3
-    assert sources.first_of_single_source(1, [None] * 3, [9 * SECOND_NS] * 3) == 0
+        assert sources.first_of_single_source(2, [None] * 3, [k * ros.SECOND_NS] * 3) == 3
+    assert sources.first_of_single_source(1, [None] * 3, [9 * ros.SECOND_NS] * 3) == 3
+    assert sources.first_of_single_source(1, [None] * 3, [9 * ros.SECOND_NS] * 3) == 0
 
 
 def test_readings_of_a_second_publisher_are_not_used(peer, unit):
-    with node_in_thread(*node_arguments(unit)) as node:
-        samples = Samples(peer, node)
-        other = peer.node.create_publisher(Temperature, 'temperature/board', DEEP)
+    with ros.node_in_thread(*ros.node_arguments(unit)) as node:
+        samples = ros.Samples(peer, node)
+        other = peer.node.create_publisher(Temperature, 'temperature/board', ros.DEEP)
         peer.poll(other.get_subscription_count, 'the second publisher')
 
         def both():
             reading = Temperature(temperature=20.5)
-            other.publish(stamped(reading, START_NS + samples.n_sent * CYCLE_NS))
+            other.publish(ros.stamped(reading, ros.START_NS + samples.n_sent * ros.CYCLE_NS))
             samples.send(10)
 
         contested(peer, samples.reports, '/temperature/board', both)
         board = node._relay.running.compensator.thermal.tracker.board
         assert board.temperature == pytest.approx(20.0, abs=1e-6)
-        assert board.stamp_ns < START_NS + 20 * CYCLE_NS
+        assert board.stamp_ns < ros.START_NS + 20 * ros.CYCLE_NS
 
 
 def test_a_driver_with_incompatible_qos_or_type_is_named(peer, unit):
     reliable = 'qos_overrides./accel/counts.subscription.reliability:=reliable'
-    with node_in_thread(*node_arguments(unit, reliable)):
+    with ros.node_in_thread(*ros.node_arguments(unit, reliable)):
         heard = peer.listen(DiagnosticArray, '/diagnostics')
         unheard = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
         peer.node.create_publisher(Vector3Stamped, 'accel/counts', unheard)
-        peer.node.create_publisher(Imu, 'temperature/case', DEEP)
-        status = status_with(peer, heard, 'of a publisher on /accel/counts are not received: ')
+        peer.node.create_publisher(Imu, 'temperature/case', ros.DEEP)
+        status = ros.status_with(peer, heard, 'of a publisher on /accel/counts are not received: ')
         assert status.level == DiagnosticStatus.ERROR
         assert 'est effort publisher and reliable subscription' in status.message
         text = 'on /temperature/case are not received: its type is sensor_msgs/msg/Imu'
-        status_with(peer, heard, text)
+        ros.status_with(peer, heard, text)
 
 
 def test_reports_more_frequent_than_samples_report_no_missing_samples(peer, tmp_path):
     # WHY: with a diagnostics_period below the sample interval, reports between samples were ERROR.
-    from thermo_comp.unit.calibration import Unit
-
     slow = tmp_path / 'slow.yaml'
     # An error is reported after 5 cycles without a sample, 1.5 s, which no busy machine causes.
     save_calibration(calibration(unit=Unit('T-1', 'counts', 32767.0, 0.3)), slow)
-    with node_in_thread(*node_arguments(slow, 'diagnostics_period:=0.01')) as node:
+    with ros.node_in_thread(*ros.node_arguments(slow, 'diagnostics_period:=0.01')) as node:
         heard = peer.listen(DiagnosticArray, '/diagnostics')
-        driver = drive(peer, node)
+        driver = ros.drive(peer, node)
         imu = peer.listen(Imu, 'imu/data_raw')
         peer.poll(node._relay.samples.count_publishers, 'the driver')
         for k in range(5):
-            stamp_ns = START_NS + k * SECOND_NS
+            stamp_ns = ros.START_NS + k * ros.SECOND_NS
             driver.temperatures(stamp_ns, 20.0, 20.0)
-            driver.counts(stamp_ns, *standing(k))
+            driver.counts(stamp_ns, *ros.standing(k))
             n = len(imu)
             peer.wait_for(lambda n=n: len(imu) > n, 'the sample')
             del heard[:]
             peer.wait_for(lambda: len(heard) > 10, 'reports')
             messages = [array.status[0].message for array in heard[1:10]]
             assert not any('no samples' in text for text in messages), messages
-        status_with(peer, heard, 'no samples are coming in')
+        ros.status_with(peer, heard, 'no samples are coming in')
 
 
 def test_the_warning_of_a_reading_a_day_ahead_ends(peer, unit):
     # WHY: after a temperature with a stamp one day ahead, the status stayed WARN for a day.
-    with node_in_thread(*node_arguments(unit)) as node:
-        samples = Samples(peer, node)
-        samples.driver.temperatures(START_NS + 86_400 * SECOND_NS, 25.0)
+    with ros.node_in_thread(*ros.node_arguments(unit)) as node:
+        samples = ros.Samples(peer, node)
+        samples.driver.temperatures(ros.START_NS + 86_400 * ros.SECOND_NS, 25.0)
         samples.n_sent += 1  # samples alone, without temperature readings
         samples.send(5)
-        status_with(peer, samples.reports, 's ahead of the samples')
+        ros.status_with(peer, samples.reports, 's ahead of the samples')
         samples.go_on()
-        peer.wait_for(
-            lambda: 'ahead' not in samples.reports[-1].status[0].message, 'the end of the warning'
-        )
+        reports = samples.reports
+        peer.wait_for(lambda: 'ahead' not in reports[-1].status[0].message, 'the warning to end')

@@ -180,7 +180,9 @@ def test_misspelt_parameters_of_the_node_are_named(unit, capfd):
         assert printed.count('there is no parameter') == 1
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    'number', [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
+)
 def test_a_signal_during_the_start_ends_the_node_cleanly(unit, number):
     # Send the signal as soon as the middleware has started its first thread.
     with NodeProcess('-p', f'calibration_file:={unit}') as node:

@@ -162,9 +162,8 @@ def test_rests_in_the_field_depend_on_every_nonlinear_coefficient():
     layout, covariance = parameter_layout(unit), unit.posterior.covariance()
     assert (series.claim > 0.0).all()
     for k in range(layout.nonlinear, layout.misalignment):
-        moved = with_parameters(
-            unit, scale, values + step * (np.arange(len(values)) == k), covariance
-        )
+        changed = values + step * (np.arange(len(values)) == k)
+        moved = with_parameters(unit, scale, changed, covariance)
         slope = (series.residual - series_of(logged, moved).residual) / step
         # The derivatives neglect d(K2 f^2)/df, which gives them a relative error of 2 * K2 * 1 g.
         assert np.allclose(slope, series.by_parameter[:, k], atol=1e-3 * abs(slope).max() + 1e-7)

@@ -85,10 +85,8 @@ def test_no_source_file_exceeds_the_limit_of_lines():
 def test_the_manifest_lists_only_dependencies_of_the_node():
     # Commands have further dependencies, which come from PyPI.
     keys = {node.text for node in MANIFEST.iter('exec_depend')}
-    assert {key for key in keys if key and key.startswith('python3-')} == {
-        'python3-numpy',
-        'python3-yaml',
-    }
+    libraries = {key for key in keys if key.startswith('python3-')}
+    assert libraries == {'python3-numpy', 'python3-yaml'}
     install = setup_literals()['INSTALL']
     assert isinstance(install, list)
     assert all('>=' in requirement for requirement in install), 'no floor'
@@ -141,6 +139,5 @@ def test_ament_pep257_finds_nothing():
 @pytest.mark.filterwarnings('ignore')
 def test_ament_xmllint_finds_nothing():
     linter = pytest.importorskip('ament_xmllint.main')
-    assert (
-        linter.main(argv=[str(ROOT / name) for name in ('package.xml', 'config', 'launch')]) == 0
-    )
+    paths = [str(ROOT / name) for name in ('package.xml', 'config', 'launch')]
+    assert linter.main(argv=paths) == 0

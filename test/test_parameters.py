@@ -31,9 +31,8 @@ def test_every_parameter_is_described():
         for entry in fields(NodeConfig):
             shown = node.describe_parameter(entry.name)
             assert shown.description == entry.metadata['description']
-            assert shown.read_only == (
-                entry.name in {'calibration_directory', 'topics', 'rest_log'}
-            )
+            read_only = {'calibration_directory', 'topics', 'rest_log'}
+            assert shown.read_only == (entry.name in read_only)
             assert shown.type == Parameter.Type.from_parameter_value(entry.default).value
             assert bool(shown.floating_point_range) == isinstance(entry.default, float)
             assert bool(shown.integer_range) == isinstance(entry.default, int)

@@ -66,10 +66,8 @@ def test_a_part_contains_exactly_the_messages_inside(bag, begin, end, n_messages
 
 def test_a_part_by_stamps_equals_a_part_by_seconds(bag):
     start = START_NS * 1e-9
-    (by_stamp, since), (by_time, _) = (
-        part_of(bag, start + 20.0, start + 50.0),
-        part_of(bag, 20, 50),
-    )
+    by_stamp, since = part_of(bag, start + 20.0, start + 50.0)
+    by_time, _ = part_of(bag, 20, 50)
     assert since == pytest.approx(20.0)
     for stamped, other in zip(by_stamp, by_time, strict=True):
         np.testing.assert_array_equal(stamped.accel, other.accel)

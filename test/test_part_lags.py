@@ -10,25 +10,11 @@ import numpy as np
 import pytest
 import second_simulator
 import strangers
+import strangers_cases as cases
 from accuracy import errors, fit_and_correct
 from simulation_helpers import slow
 from strangers_baselines import minutes
-from strangers_cases import (
-    FULL_SCALE,
-    HALF,
-    WARM,
-    WARM_HELD,
-    Study,
-    coarse_thermometer,
-    consumer_grade,
-    gradient,
-    navigation,
-    one_test,
-    positions,
-    program,
-    soaks,
-    third_node,
-)
+from strangers_cases import program
 from strangers_units import GRAVITY, UG, rng_of, spread
 
 from thermo_comp.fitting.population import population
@@ -47,17 +33,17 @@ HELD = program(12, 20, (31, 0.7, 30), (17, 1.5, 15)), program(30, 20, (8, 1.2, 3
 SOAKS = tuple(program(celsius, 25.0) for celsius in (8.0, 19.0, 34.0))
 
 
-def study_of(*name, up=9, corners=HALF, held=HELD, grade=navigation, **given):
+def study_of(*name, up=9, corners=cases.HALF, held=HELD, grade=cases.navigation, **given):
     """Return a unit and its bags: for a fit, in directions `up` (or their number); held-out."""
     rng = rng_of(*name)
     unit = grade(rng, **given)
-    is_mems = grade is not navigation
+    is_mems = grade is not cases.navigation
     # At 10 Hz the noise of a MEMS sample is about a count, so rounding averages out.
-    keys, options = ({'rate_hz': 10.0}, MEMS_SCALE) if is_mems else ({}, FULL_SCALE)
+    keys, options = ({'rate_hz': 10.0}, MEMS_SCALE) if is_mems else ({}, cases.FULL_SCALE)
     up = spread(up, rng) if isinstance(up, int) else up
-    bags = positions(unit, corners, up, rng, **keys)
-    test = one_test(positions(unit, held, spread(2, rng), rng, **keys))
-    return unit, Study('', bags, test, options)
+    bags = cases.positions(unit, corners, up, rng, **keys)
+    test = cases.one_test(cases.positions(unit, held, spread(2, rng), rng, **keys))
+    return unit, cases.Study('', bags, test, options)
 
 
 @pytest.fixture(scope='module')
@@ -85,12 +71,8 @@ def soaked(grade):
 
 
 def taus_of(calibration):
-    return [
-        sorted(
-            {term.tau_s for term in calibration.response if term.kind == 'board' and term.bias[k]}
-        )
-        for k in range(3)
-    ]
+    terms = [term for term in calibration.response if term.kind == 'board']
+    return [sorted({term.tau_s for term in terms if term.bias[k]}) for k in range(3)]
 
 
 def judged(calibration, study):
@@ -147,7 +129,7 @@ def test_lags_of_the_thermometers_themselves_are_fitted(sensors):
 @pytest.mark.slow
 @pytest.mark.parametrize('number', [0, 1, 3])
 def test_with_a_coarse_or_noisy_thermometer_the_fit_is_as_good_as_a_cubic_by_scipy(number):
-    study = list(coarse_thermometer(1))[number]
+    study = list(cases.coarse_thermometer(1))[number]
     ours = judged(strangers.fitted(study), study)
     bags = [minutes(bag) for bag in study.tests['']]
     correct = strangers.scipy_baselines(study)['cubic']
@@ -171,10 +153,10 @@ def test_lags_of_a_noisy_sensor_are_fitted_to_bags_of_one_warm_up():
     # WHY: the fit chose a spline of 60 nodes and twice the true lag: the force error was 80 ug.
     thaw = program(-18.0, 5.0, (22.0, 40.0, 100.0)), program(-18.0, 5.0, (22.0, 40.0, 80.0))
     rng = rng_of('noisy thaw', 2)
-    unit = navigation(rng, part_s=np.array([657.0, 797.0, 1389.0]))
+    unit = cases.navigation(rng, part_s=np.array([657.0, 797.0, 1389.0]))
     unit = replace(unit, density=30.0, bias_curve=5.0 * unit.bias_curve, counts=0.0)
-    bags = positions(unit, thaw, spread(12, rng), rng)
-    study = Study('', bags, {}, {'input': 'm/s^2'})
+    bags = cases.positions(unit, thaw, spread(12, rng), rng)
+    study = cases.Study('', bags, {}, {'input': 'm/s^2'})
     taus = np.array(taus_of(strangers.fitted(study)))
     assert taus == pytest.approx(unit.part_s[:, None], rel=0.03)
 
@@ -221,7 +203,7 @@ def test_no_lag_is_fitted_to_a_unit_without_lags():
 def test_the_lags_of_parts_are_found_beside_an_effect_of_the_gradient():
     # WHY: an effect of the gradient was fitted by a lag of 223 s instead of 163 s; in a soak the
     # force error was 167 ug, the claimed sd 15 ug.
-    (study,) = gradient(1)
+    (study,) = cases.gradient(1)
     calibration = strangers.fitted(study)
     assert {term.group for term in calibration.response} == {'part', 'gradient'}
     assert judged(calibration, study).norm < 2.0
@@ -255,12 +237,13 @@ def test_two_lags_in_series_are_fitted_as_two_stages():
             setattr(record, name, getattr(record, name)[::10])
     # A fit with only the groups of columns that the simulated unit needs takes half the time.
     groups = ('curve', 'board', 'part', 'product', 'square')
-    result = fit_and_correct(records, tests, full_scale=FULL_SCALE['full_scale'], groups=groups)
+    result = fit_and_correct(
+        records, tests, full_scale=cases.FULL_SCALE['full_scale'], groups=groups
+    )
     least, _ = second_simulator.floor_of(tests)
     assert errors(result.specific_force, result.sd, tests).norm < 2.0 * least
-    stages = {
-        (term.tau_s, term.second_tau_s) for term in result.calibration.response if term.tau_s
-    }
+    terms = result.calibration.response
+    stages = {(term.tau_s, term.second_tau_s) for term in terms if term.tau_s}
     # The simulator's steps of 2 s add a second to each time constant.
     near = pytest.approx(2.0 * unit.head_s[0], rel=0.01)
     assert any(tau + second == near for tau, second in stages)
@@ -270,7 +253,7 @@ def test_two_lags_in_series_are_fitted_as_two_stages():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('grade', [consumer_grade, navigation])
+@pytest.mark.parametrize('grade', [cases.consumer_grade, cases.navigation])
 def test_norms_of_soaks_determine_the_curve_over_temperature(grade):
     # Within a soak the board drifts by 0.01 K; over the soaks' 26 K |f| changes by some mg.
     _, study, score = soaked(grade)
@@ -287,7 +270,7 @@ def test_six_faces_in_three_soaks_determine_the_curve_at_other_temperatures():
     # was 40 mg, the unit's drift 10 mg. With a stated `mounting_sd` the fit divided by zero.
     _, study = study_of(
         'faces in soaks', 1, up=FACES.repeat(3, axis=0), corners=SOAKS, held=program(19.0, 90.0),
-        grade=lambda rng: replace(consumer_grade(rng), misalignment=np.zeros(3)),
+        grade=lambda rng: replace(cases.consumer_grade(rng), misalignment=np.zeros(3)),
     )  # fmt: skip
     for stated in ({}, {'mounting_sd': 3e-4}):
         # Means over 25 min have a noise of 4 ug; rounding to 0.5 mg adds errors of some 40 ug.
@@ -299,7 +282,7 @@ def test_six_faces_in_three_soaks_determine_the_curve_at_other_temperatures():
 def test_the_claimed_sd_between_two_soaks_includes_the_undetermined_curve():
     # WHY: soaks at two temperatures do not determine a curve over temperature. The covariance
     # lacked the uncertainty of the curve's shape: the claimed sd was 1/8 of the error.
-    given = {'held': program(19.0, 90.0), 'grade': consumer_grade}
+    given = {'held': program(19.0, 90.0), 'grade': cases.consumer_grade}
     _, study = study_of('two soaks', up=18, corners=SOAKS[::2], **given)
     assert judged(strangers.fitted(study), study).ratio < 2.0
 
@@ -314,9 +297,9 @@ def test_the_claimed_sd_includes_a_curve_that_soaks_do_not_determine():
 @pytest.mark.slow
 def test_one_bag_of_ramps_beside_soaks_determines_the_lags():
     # WHY: lags do not change the errors of left-out soaks, so the columns of lags were rejected.
-    unit, alone, score = soaked(navigation)
+    unit, alone, score = soaked(cases.navigation)
     rng = rng_of('soaks and a ramp')
-    (ramps,) = positions(unit, HALF, spread(1, rng), rng)
+    (ramps,) = cases.positions(unit, cases.HALF, spread(1, rng), rng)
     study = replace(alone, bags=(*alone.bags, replace(ramps, name='ramps')))
     calibration = strangers.fitted(study)
     assert np.array(taus_of(calibration)) == pytest.approx(unit.part_s[:, None], rel=0.02)
@@ -328,17 +311,17 @@ def test_a_bias_decay_after_power_on_is_not_fitted_by_a_lag():
     # WHY: all bags of the fit start at 22 degC, and lags were fitted to a decay of the bias after
     # power-on: in bags that start at other temperatures the force error was 1.7 mg.
     rng = rng_of('power-on', 4)
-    unit = consumer_grade(rng)
+    unit = cases.consumer_grade(rng)
 
     def decaying(bag):
         change = UG * np.exp(-bag.time_s / 600.0)[:, None] * [1400.0, -100.0, 0.0]
         return replace(bag, samples=np.rint(bag.samples + unit.counts * change))
 
     fit, held = (
-        tuple(map(decaying, positions(unit, way, spread(n, rng), rng, rate_hz=10.0)))
-        for way, n in ((WARM, 12), (WARM_HELD, 4))
+        tuple(map(decaying, cases.positions(unit, way, spread(n, rng), rng, rate_hz=10.0)))
+        for way, n in ((cases.WARM, 12), (cases.WARM_HELD, 4))
     )
-    study = Study('', fit, one_test(held), {'full_scale': 32767.0})
+    study = cases.Study('', fit, cases.one_test(held), {'full_scale': 32767.0})
     # The bias decay has an RMS of 0.32 mg over a bag, and a smaller mean, which constants absorb.
     assert judged(strangers.fitted(study), study).vector < np.sqrt(2.0) * 320.0
 
@@ -350,7 +333,7 @@ def lags_of(calibration):
 @pytest.mark.slow
 def test_lags_of_a_unit_with_a_hidden_node_are_those_of_the_bank():
     # The bias of each axis depends on its part and on a hidden node without a thermometer.
-    study = next(third_node(0))
+    study = next(cases.third_node(0))
     # The six stated groups of columns make the fit 1.5 times as fast as a choice of groups.
     groups = ('curve', 'part', 'board', 'gradient_lag', 'product', 'square')
     calibration = strangers.fitted(replace(study, bags=study.bags[:8]), groups=groups)
@@ -361,7 +344,7 @@ def test_lags_of_a_unit_with_a_hidden_node_are_those_of_the_bank():
 def test_a_fit_to_soaks_has_no_fitted_lag_and_no_range_of_the_gradient():
     # Soaks do not show how far case and board differ in ramps, so a large difference in a later
     # ramp must not be reported as a loose thermometer.
-    study = next(soaks(1))
+    study = next(cases.soaks(1))
     calibration = strangers.fitted(replace(study, bags=study.bags[:9]))
     assert lags_of(calibration) <= {*FINE_TAUS}
     assert calibration.rest_gradient_range_k is None

@@ -170,10 +170,8 @@ def test_readings_that_may_repeat_by_chance_are_no_fault():
 @cache
 def in_its_chamber(preset, sensor):
     """Simulate a unit; return its readings: (stamp [ns], 0 for board or 1 for case, degC)."""
-    settings = SENSORS[sensor]
-    unit = unit_preset(preset, 1).with_thermometers(
-        noise_sd=settings.noise_sd_c, quantum=settings.quantum_c, rate_hz=0.5
-    )
+    sd, quantum = SENSORS[sensor].noise_sd_c, SENSORS[sensor].quantum_c
+    unit = unit_preset(preset, 1).with_thermometers(noise_sd=sd, quantum=quantum, rate_hz=0.5)
     run = simulate(unit, rippled(parse_cyclogram('fast')), (0.0, 0.0, 1.0), rate_hz=0.02, seed=1)
     readings = [(int(s), 0, float(v)) for s, v in zip(run.board_stamp_ns, run.board, strict=True)]
     readings += [(int(s), 1, float(v)) for s, v in zip(run.case_stamp_ns, run.case, strict=True)]

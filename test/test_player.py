@@ -14,14 +14,13 @@ pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
 
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
-from recording_helpers import ACCEL, BOARD, Message, write_rosbag1
+from recording_helpers import ACCEL, BOARD, Message, imu_columns, write_rosbag1
 from ros_helpers import TIMEOUT, stamp_of
 from rosbags.highlevel import AnyReader
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, Temperature
 
 from thermo_comp.errors import RecordingError, ThermoCompError
-from thermo_comp.recording.blocks import ImuColumns
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.ros import player
@@ -41,9 +40,8 @@ def bag_of(path, n, rng):
     with BagWriter(path) as writer:
         writer.write_counts(TOPICS.counts, stamps, rng.integers(-9, 9, (n, 3)), 'imu_link')
         for topic in (TOPICS.board, TOPICS.case):
-            writer.write_temperature(
-                topic, stamps[::10] - 7, rng.normal(20, 1, len(stamps[::10])), frame_id='ntc'
-            )
+            celsius = rng.normal(20, 1, len(stamps[::10]))
+            writer.write_temperature(topic, stamps[::10] - 7, celsius, frame_id='ntc')
     return path
 
 
@@ -116,9 +114,8 @@ def test_the_player_waits_for_a_slow_subscriber_which_loses_no_message(tmp_path,
     with BagWriter(tmp_path / 'bag.mcap') as writer:
         stamps = START_NS + np.arange(7000) * CYCLE_NS
         writer.write_counts(TOPICS.counts, stamps, rng.integers(-9, 9, (7000, 3)), 'imu_link')
-    with subprocess.Popen(
-        [sys.executable, '-c', SLOW_LISTENER], stdout=subprocess.PIPE, text=True
-    ) as listener:
+    words = [sys.executable, '-c', SLOW_LISTENER]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as listener:
         try:
             # On a busy machine the process of the listener may need a long time to start.
             report = play(tmp_path / 'bag.mcap', rate=0.0, wait_s=TIMEOUT)
@@ -143,7 +140,7 @@ def test_play_names_topics_without_subscriber_and_best_effort_subscribers(peer, 
 
 def test_imu_messages_are_played_under_the_names_of_the_bag(peer, tmp_path, rng):
     stamps = START_NS + np.arange(300) * CYCLE_NS
-    rest = ImuColumns(*(rng.standard_normal((300, k)) for k in (4, 9, 3, 9, 9)))
+    rest = imu_columns(rng, 300)
     with BagWriter(tmp_path / 'bag') as writer:
         covariance = rest.linear_acceleration_covariance
         force = rng.standard_normal((300, 3))
@@ -194,9 +191,7 @@ def test_the_player_ends_if_a_subscriber_takes_no_message(peer, tmp_path, rng, m
     peer.node.create_subscription(Vector3Stamped, 'accel/counts', block, UNLIMITED)
     monkeypatch.setattr(player, 'PATIENCE', 0.5)
     try:
-        with pytest.raises(
-            ThermoCompError, match='/accel/counts: a subscriber has not acknowledged'
-        ):
+        with pytest.raises(ThermoCompError, match='counts: a subscriber has not acknowledged'):
             play(tmp_path / 'bag', rate=0.0)
         assert held.is_set()
     finally:

@@ -60,22 +60,16 @@ def test_exactly_known_parameters_have_zero_variance():
 @pytest.mark.parametrize(
     ('matrix', 'message'),
     [
-        ([[-1.0]], 'must not have a negative variance'),
-        ([[np.nan]], 'must not have a negative variance'),
-        ([[1.0, 2.0], [2.0, 1.0]], 'must be positive semidefinite'),
-        ([[1.0, np.inf], [np.inf, 1.0]], 'must be positive semidefinite'),
-        ([[1.0, np.nan], [np.nan, 1.0]], 'must be positive semidefinite'),
-        ([[0.0, 1.0], [1.0, 1.0]], 'must be positive semidefinite'),
+        *(([[bad]], '`covariance` must not have a negative variance') for bad in (-1.0, np.nan)),
+        *(([[1.0, bad], [bad, 1.0]], '`covariance` must be positive semidefinite')
+          for bad in (2.0, np.inf, np.nan)),
+        ([[0.0, 1.0], [1.0, 1.0]], '`covariance` must be positive semidefinite'),
+        ([[1e80]], '`factor` must hold finite numbers'),  # too large for single precision
     ],
-)
-def test_a_matrix_that_is_not_a_covariance_is_refused(matrix, message):
-    with pytest.raises(ValueError, match=f'`covariance` {message}'):
+)  # fmt: skip
+def test_a_matrix_that_is_no_covariance_in_single_precision_is_refused(matrix, message):
+    with pytest.raises(ValueError, match=message):
         posterior_of(np.array(matrix))
-
-
-def test_numbers_too_large_for_single_precision_are_refused():
-    with pytest.raises(ValueError, match='`factor` must hold finite numbers'):
-        posterior_of(np.array([[1e80]]))
 
 
 def test_a_negative_variance_is_refused():
@@ -98,22 +92,16 @@ def test_the_order_of_parameters_equals_one_found_by_hand():
     )
     layout = parameter_layout(value)
     # Bias parameters of x: static level, t, t^2; dynamic level, three knots; two response weights.
-    assert layout.bias[0] == Block(0, 3, 7, 9)
-    assert layout.scale[0] == Block(9, 10, 11, 13)
-    assert layout.bias[1] == Block(13, 14, 15, 17)
-    assert layout.scale[1] == Block(17, 18, 19, 21)
-    assert layout.bias[2] == Block(21, 22, 23, 25)
-    assert layout.scale[2] == Block(25, 27, 28, 30)
+    assert layout.bias == [Block(0, 3, 7, 9), Block(13, 14, 15, 17), Block(21, 22, 23, 25)]
+    assert layout.scale == [Block(9, 10, 11, 13), Block(17, 18, 19, 21), Block(25, 27, 28, 30)]
     assert (layout.misalignment, layout.n_parameters) == (30, 33)
 
 
 def whole_bank(sensors):
     curve = axis_set((0.0, 0.1, 0.01, 1e-3), (1.0, 1e-5, 1e-6, 1e-7))
     axes = regime_set(curve, curve, curve)
-    terms = tuple(
-        term(**{**vars(column), 'range': (-9.0, 9.0)}, bias=(1 / 3,) * 3, scale=(1e-7 / 3,) * 3)
-        for column in bank(sensors)
-    )
+    keys = {'range': (-9.0, 9.0), 'bias': (1 / 3,) * 3, 'scale': (1e-7 / 3,) * 3}
+    terms = tuple(term(**{**vars(column), **keys}) for column in bank(sensors))
     value = calibration(static=axes, dynamic=axes, sensors=sensors, response=terms)
     n = parameter_layout(value).n_parameters
     factor = np.random.default_rng(5).normal(size=(n, n)) / 3.0

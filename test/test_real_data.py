@@ -89,9 +89,8 @@ def test_the_freezer_run_is_refused_for_its_jumps(real_data, work):
     sources, _ = fit_sources([freezer_bag(real_data, work)])
     with pytest.raises(FitError, match='not a function of temperature') as refused:
         fit(sources, OPTIONS)
-    jumps = re.findall(
-        r'at ([\d.]+) s the sensor jumped by \+([\d.]+) mg along gravity', str(refused.value)
-    )
+    pattern = r'at ([\d.]+) s the sensor jumped by \+([\d.]+) mg along gravity'
+    jumps = re.findall(pattern, str(refused.value))
     # Times in the message begin with the first sample, 1.5 s after time 0 of the log.
     assert [float(at) for at, _ in jumps] == pytest.approx([365.4, 465.4, 511.6], abs=0.2)
     assert [float(size) for _, size in jumps] == pytest.approx([20.0, 17.0, 2.0], abs=4.0)
@@ -123,9 +122,8 @@ def test_the_error_of_the_freezer_run_on_held_out_minutes(
     raw, left = [], []
     for first in sets:
         held_out = parts[first::n_sets]
-        seen = [
-            fit_sources([bag], Topics(part=part))[0][0] for part in parts if part not in held_out
-        ]
+        others = [Topics(part=part) for part in parts if part not in held_out]
+        seen = [fit_sources([bag], topics)[0][0] for topics in others]
         calibration = fit(seen, OPTIONS).calibration
         for part in held_out:
             # Some held-out parts have no minute at rest, because the freezer was knocked.

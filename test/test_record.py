@@ -10,7 +10,7 @@ import sys
 
 import numpy as np
 import pytest
-from conftest import ROOT
+from conftest import ROOT, ran
 from triads import triad
 
 from thermo_comp.errors import RecordingError
@@ -84,8 +84,7 @@ def check_positions(result):
 
 def check_fit(result, cli, folder):
     """Run the fit that `record` printed, and compare its constants with the true constants."""
-    # The model `golovach` is sufficient for constants; a model with a response takes ten times as
-    # long.
+    # The model `golovach` is sufficient for constants; a response takes ten times as long.
     given = '--gravity 9.80665 --model golovach'
     words = shlex.split(result['command'].replace('--gravity G', given))
     assert words.pop(0) == 'thermo_comp'
@@ -99,9 +98,8 @@ def check_fit(result, cli, folder):
     assert scale / UNIT.scale_factor == pytest.approx(1.0, abs=5.0 * max(result['scale_sd']))
     true_bias = np.array(UNIT.bias_at_reference) / UNIT.scale_factor
     assert bias == pytest.approx(true_bias, abs=5.0 * 9.80665 * max(result['bias_sd_g']))
-    assert np.array(calibration.misalignment) == pytest.approx(
-        UNIT.M, abs=5.0 * max(result['misalignment_sd_rad'])
-    )
+    limit = 5.0 * max(result['misalignment_sd_rad'])
+    assert np.array(calibration.misalignment) == pytest.approx(UNIT.M, abs=limit)
 
 
 CRASH = """
@@ -165,9 +163,8 @@ class TestGrowing:
         bags = tmp_path / 'bags'
         for number, part in enumerate((UPS[:2], UPS[2:3]), 1):
             bag = write_session(tmp_path / f'part{number}.mcap', part)
-            finished = cli(
-                'record', bag, '--positions', '3', '--soak', '80s', '-o', bags, '--json', code=None
-            )
+            words = ('--positions', '3', '--soak', '80s', '-o', bags, '--json')
+            finished = cli('record', bag, *words, code=None)
             result = json.loads(finished.stdout)
             assert finished.returncode == (0 if result['is_complete'] else 1)
             assert result['n_good'] == (2, 3)[number - 1]
@@ -180,17 +177,15 @@ class TestGrowing:
         printed = cli('record', session, '--soak', '45', *out, code=2).stderr
         assert "--soak: expected a duration like 45min, 1.5h or 30s, got '45'" in printed
         (tmp_path / 'file').write_text('')
-        assert (
-            'cannot be written' in cli('record', session, '-o', tmp_path / 'file', code=1).stderr
-        )
+        printed = cli('record', session, '-o', tmp_path / 'file', code=1).stderr
+        assert 'cannot be written' in printed
 
 
 def test_a_bag_left_by_a_crash_is_reported_and_completed(session, cli, tmp_path):
     # WHY: after a killed run the next run did not report the hidden file with its last bag.
     bags = tmp_path / 'bags'
-    killed = subprocess.run(
-        [sys.executable, '-c', CRASH, session, bags, str(START_NS + 200 * 10**9)], check=False
-    )
+    words = ('-c', CRASH, session, bags, START_NS + 200 * 10**9)
+    killed = ran(sys.executable, *words)
     assert killed.returncode == -signal.SIGKILL
     (left,) = leftovers(bags)
     assert leftovers(bags) == {left: 1}

@@ -48,10 +48,8 @@ def small_bag(compression, use_chunking=True):
     """Return a bag of 24 messages in three chunks, and the last chunk's position and length."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'bag.mcap')
-        write_mcap(
-            path, regular_messages(24), chunk_size=600, compression=compression,
-            use_chunking=use_chunking,
-        )  # fmt: skip
+        keys = {'compression': compression, 'use_chunking': use_chunking}
+        write_mcap(path, regular_messages(24), chunk_size=600, **keys)
         position, length = chunk_places(path)[-1] if use_chunking else (0, 0)
         return path.read_bytes(), position, length
 
@@ -144,9 +142,8 @@ def test_the_message_names_the_cut_file_of_a_directory(tmp_path):
     write_rosbag2(tmp_path / 'bag', messages[:20])
     write_mcap(tmp_path / 'bag' / 'bag_1.mcap', messages[20:])
     metadata = tmp_path / 'bag' / 'metadata.yaml'
-    metadata.write_text(
-        metadata.read_text().replace('- bag.mcap', '- bag.mcap\n  - bag_1.mcap', 1)
-    )
+    text = metadata.read_text()
+    metadata.write_text(text.replace('- bag.mcap', '- bag.mcap\n  - bag_1.mcap', 1))
     torn = tmp_path / 'bag' / 'bag_1.mcap'
     torn.write_bytes(torn.read_bytes()[:-20])
     info = inspect_recording(tmp_path / 'bag')

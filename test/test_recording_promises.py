@@ -10,19 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import recording_helpers as rec
 import yaml
 import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from recording_helpers import (
-    ACCEL,
-    BOARD,
-    CASE,
-    IMU_IN,
-    regular_messages,
-    write_mcap,
-    write_rosbag2,
-)
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -32,17 +24,21 @@ from thermo_comp.recording.reader import inspect_recording, open_recording, read
 
 
 def whole(folder, storage='mcap', compression=''):
-    write_rosbag2(folder / 'bag', regular_messages(400), storage=storage, compression=compression)
+    rec.write_rosbag2(
+        folder / 'bag', rec.regular_messages(400), storage=storage, compression=compression
+    )
     return folder / 'bag'
 
 
 def test_rows_deleted_from_a_database_are_reported(tmp_path, cli):
     bag = whole(tmp_path, 'sqlite3')
     with sqlite3.connect(bag / 'bag.db3') as database:
-        (topic,) = database.execute('select id from topics where name = ?', (ACCEL,)).fetchone()
+        (topic,) = database.execute(
+            'select id from topics where name = ?', (rec.ACCEL,)
+        ).fetchone()
         query = 'delete from messages where id > 100 and topic_id = ?'
         n_left = 400 - database.execute(query, (topic,)).rowcount
-    text = f'{ACCEL}: {n_left} of 400 listed messages are in the bag'
+    text = f'{rec.ACCEL}: {n_left} of 400 listed messages are in the bag'
     assert inspect_recording(bag).truncated == text
     assert text in cli('info', bag, code=1).stdout
     calibration = Path(__file__).parent.parent / 'config' / 'calibration.example.yaml'
@@ -52,14 +48,14 @@ def test_rows_deleted_from_a_database_are_reported(tmp_path, cli):
 
 
 def test_a_conversion_reports_messages_that_the_bag_lacks(tmp_path, cli):
-    messages = regular_messages(400, accel=IMU_IN)
+    messages = rec.regular_messages(400, accel=rec.IMU_IN)
     for message in messages:
-        if message.topic == IMU_IN:  # `convert` requires |f| = g at rest
+        if message.topic == rec.IMU_IN:  # `convert` requires |f| = g at rest
             message.numbers = (*message.numbers[:25], 0.0, 0.0, 9.81, *message.numbers[28:])
-    write_rosbag2(tmp_path / 'bag', messages, storage='sqlite3')
+    rec.write_rosbag2(tmp_path / 'bag', messages, storage='sqlite3')
     with sqlite3.connect(tmp_path / 'bag' / 'bag.db3') as database:
         database.execute('delete from messages where id > 400')
-    topics = ('--topic', f'board={BOARD}', '--topic', f'case={CASE}')
+    topics = ('--topic', f'board={rec.BOARD}', '--topic', f'case={rec.CASE}')
     done = cli('convert', tmp_path / 'bag', '-o', tmp_path / 'o.mcap', *topics, code=1)
     assert 'listed messages are in the bag' in done.stderr
 
@@ -79,17 +75,17 @@ def test_a_topic_that_only_the_metadata_list_is_reported(tmp_path, storage):
 
 
 def test_missing_messages_are_reported_at_the_end_of_the_first_reading(tmp_path):
-    write_mcap(tmp_path / 'bag.mcap', regular_messages(40))
+    rec.write_mcap(tmp_path / 'bag.mcap', rec.regular_messages(40))
     with open_recording(tmp_path / 'bag.mcap') as reader:
-        kind = reader.info.topics[ACCEL][0]
-        reader.info = replace(reader.info, topics={**reader.info.topics, ACCEL: (kind, 64)})
+        kind = reader.info.topics[rec.ACCEL][0]
+        reader.info = replace(reader.info, topics={**reader.info.topics, rec.ACCEL: (kind, 64)})
         for _ in range(2):  # a second pass over the bag must not add a second message
             assert sum(map(len, reader.blocks())) == 40
-        assert reader.info.truncated == f'{ACCEL}: 40 of 64 listed messages are in the bag'
+        assert reader.info.truncated == f'{rec.ACCEL}: 40 of 64 listed messages are in the bag'
 
 
 def test_a_compressed_file_is_read_up_to_its_damage(tmp_path):
-    write_rosbag2(tmp_path / 'bag', regular_messages(8000), compression='FILE')
+    rec.write_rosbag2(tmp_path / 'bag', rec.regular_messages(8000), compression='FILE')
     bag = tmp_path / 'bag'
     (packed,) = bag.glob('*.zstd')
     data = packed.read_bytes()
@@ -99,7 +95,7 @@ def test_a_compressed_file_is_read_up_to_its_damage(tmp_path):
         recording = read_recording(bag)
         message = recording.info.truncated or ''
         assert 0 < len(recording.columns) < 8000
-        for topic, n_all in ((ACCEL, 8000), (BOARD, 1000), (CASE, 1000)):
+        for topic, n_all in ((rec.ACCEL, 8000), (rec.BOARD, 1000), (rec.CASE, 1000)):
             n_read = recording.info.topics[topic][1]
             assert f'{topic}: {n_read} of {n_all} listed messages' in message
     assert f'{packed.name} is unreadable after' in message
@@ -130,7 +126,7 @@ def test_a_compressed_message_expands_within_limits(tmp_path):
         bomb = zstandard.compress(bytes(1 << 28))
         database.execute('update messages set data = ? where id = 1', (bomb,))
     with pytest.raises(
-        RecordingError, match=r'bag\.db3: damaged: its content exceeds the limit of 67108864 bytes'
+        RecordingError, match=r'\.db3: damaged: its content exceeds .* 67108864 by'
     ):
         read_recording(bag)
 
@@ -139,9 +135,8 @@ def test_a_compressed_message_expands_within_limits(tmp_path):
 def test_a_chunk_of_a_ros1_bag_expands_within_limits(tmp_path, packing, monkeypatch):
     # WHY: reading a ROS 1 bag of 10 kB used 1 GB of memory.
     store, kind = get_typestore(Stores.ROS1_NOETIC), 'sensor_msgs/msg/Temperature'
-    header, stamp = (
-        store.types[name] for name in ('std_msgs/msg/Header', 'builtin_interfaces/msg/Time')
-    )
+    header = store.types['std_msgs/msg/Header']
+    stamp = store.types['builtin_interfaces/msg/Time']
     monkeypatch.setattr('thermo_comp.recording.chunks.MAX_CHUNK_BYTES', 1 << 22)
     for n_bytes, is_read in ((1 << 20, True), (1 << 23, False)):
         path = tmp_path / f'{n_bytes}.bag'
@@ -159,9 +154,7 @@ def test_a_chunk_of_a_ros1_bag_expands_within_limits(tmp_path, packing, monkeypa
             columns = read_recording(path, require=('board',)).columns
             assert columns.temperatures['board'].celsius.tolist() == [20.5]
         else:
-            with pytest.raises(
-                RecordingError, match='damaged: its content exceeds the limit of 4194304 bytes'
-            ):
+            with pytest.raises(RecordingError, match='its content exceeds the limit of 4194304 b'):
                 read_recording(path, require=('board',))
 
 
@@ -243,9 +236,8 @@ def records(draw):
 def index_of(entries):
     pieces = []
     for channel in sorted({entry[2] for entry in entries}):
-        rows = b''.join(
-            struct.pack('<QQ', log_ns, at) for at, _, own, log_ns in entries if own == channel
-        )
+        own = [entry for entry in entries if entry[2] == channel]
+        rows = b''.join(struct.pack('<QQ', log_ns, at) for at, *_, log_ns in own)
         pieces.append(struct.pack('<BQHI', 7, len(rows) + 6, channel, len(rows)) + rows)
     return b''.join(pieces)
 
@@ -254,27 +246,27 @@ def index_of(entries):
 @given(data=records(), cut=st.integers(0, 200), tail=st.binary(max_size=30), drawn=st.data())
 def test_a_scan_with_a_right_or_false_index_equals_a_plain_loop(data, cut, tail, drawn):
     """WHY: an index that points into the content of a message could give false samples."""
+    others = []
+
+    def keep(_, content):
+        others.append(content)
+
     torn = data[: len(data) - cut] + tail
     wanted, wanted_others, wanted_end = one_by_one(torn)
     if all(log_ns < 2**63 for _, _, _, log_ns in wanted):
-        others = []
-        messages, reason = scan_records(
-            np.frombuffer(torn, np.uint8), lambda _, content: others.append(content)
-        )
+        others.clear()
+        messages, reason = scan_records(np.frombuffer(torn, np.uint8), keep)
         # If zeros follow a message, its end may be lost, too, so the scan leaves out the message.
         is_wiped = len(torn) >= wanted_end + 9 and torn[wanted_end] == 0
         assert listed(messages) == (wanted[:-1] if is_wiped else wanted)
         assert others == wanted_others
         assert (reason == '') == (wanted_end == len(torn))
     wanted, wanted_others, _ = one_by_one(data)
-    places = drawn.draw(
-        st.lists(st.integers(0, len(data)) | st.sampled_from([e[0] for e in wanted]), max_size=20)
-    )
+    place = st.integers(0, len(data)) | st.sampled_from([entry[0] for entry in wanted])
+    places = drawn.draw(st.lists(place, max_size=20))
     kept = drawn.draw(st.sampled_from([wanted, wanted[:-1], wanted[1:], []]))
     index = index_of([*kept, *((at, 0, 1, 0) for at in places)])
-    others = []
-    messages = locate(
-        np.frombuffer(data, np.uint8), memoryview(index), lambda _, content: others.append(content)
-    )
+    others.clear()
+    messages = locate(np.frombuffer(data, np.uint8), memoryview(index), keep)
     assert listed(messages) == wanted
     assert others == wanted_others

@@ -8,54 +8,33 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import recording_helpers as rec
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import IndexType
-from recording_helpers import (
-    ACCEL,
-    BOARD,
-    CASE,
-    IMU_IN,
-    OTHER,
-    START_NS,
-    Message,
-    assert_columns,
-    read_with_rosbags,
-    regular_messages,
-    serialize,
-    write_mcap,
-    write_rosbag1,
-    write_rosbag2,
-)
 
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording.reader import open_recording, read_recording
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter
 
-WIDTHS = {ACCEL: 3, IMU_IN: 37, BOARD: 2, CASE: 2, OTHER: 0}
+WIDTHS = {rec.ACCEL: 3, rec.IMU_IN: 37, rec.BOARD: 2, rec.CASE: 2, rec.OTHER: 0}
 
 
 @st.composite
-def bags(draw, accel=ACCEL, lowest=-3):
+def bags(draw, accel=rec.ACCEL, lowest=-3):
     """Draw messages with equal or falling log times, several frames and both byte orders."""
     frames = draw(st.lists(st.text('abcxyz_/é', max_size=24), min_size=1, max_size=3))
-    topics = (accel, BOARD, CASE, OTHER)
+    topics = (accel, rec.BOARD, rec.CASE, rec.OTHER)
     messages = []
-    log_ns = START_NS
+    log_ns = rec.START_NS
     for topic in draw(st.lists(st.sampled_from(topics), min_size=1, max_size=60)):
         log_ns += draw(st.integers(lowest, 4)) * 1000
-        messages.append(
-            Message(
-                topic,
-                log_ns,
-                draw(st.integers(0, 2**31 * 10**9 - 1)),
-                draw(st.sampled_from(frames)),
-                tuple(draw(st.floats(width=64)) for _ in range(min(WIDTHS[topic], 3)))
-                + tuple(float(k) for k in range(3, WIDTHS[topic])),
-                draw(st.booleans()) if draw(st.booleans()) else True,
-            )
-        )
+        stamp_ns, frame = draw(st.integers(0, 2**31 * 10**9 - 1)), draw(st.sampled_from(frames))
+        numbers = [draw(st.floats(width=64)) for _ in range(min(WIDTHS[topic], 3))]
+        numbers += map(float, range(3, WIDTHS[topic]))
+        is_little = draw(st.booleans()) if draw(st.booleans()) else True
+        messages.append(rec.Message(topic, log_ns, stamp_ns, frame, tuple(numbers), is_little))
     return messages
 
 
@@ -81,36 +60,33 @@ def read(path):
 def test_any_file_gives_its_messages_in_order_of_log_time(messages, **options):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'bag.mcap')
-        write_mcap(path, messages, **options)
+        rec.write_mcap(path, messages, **options)
         recording = read(path)
-        assert_columns(recording.columns, in_reading_order(messages))
+        rec.assert_columns(recording.columns, in_reading_order(messages))
         assert recording.info.truncated is None
         assert recording.info.n_messages == len(messages)
         assert recording.info.start_ns == min(message.log_ns for message in messages)
         assert recording.info.end_ns == max(message.log_ns for message in messages)
-        if (
-            options['use_chunking']
-            and options['index_types'] == IndexType.ALL
-            and options['repeat']
-        ):
+        is_indexed = options['index_types'] == IndexType.ALL
+        if options['use_chunking'] and is_indexed and options['repeat']:
             # rosbags must read the file in the expected order; versions of rosbags sort messages
             # with equal log times differently.
-            order = [(log_ns, topic) for topic, log_ns, _ in read_with_rosbags(path)]
+            order = [(log_ns, topic) for topic, log_ns, _ in rec.read_with_rosbags(path)]
             wanted = [(m.log_ns, m.topic) for m in in_reading_order(messages)]
             assert [log_ns for log_ns, _ in order] == [log_ns for log_ns, _ in wanted]
             assert sorted(order) == sorted(wanted)
 
 
 @settings(max_examples=25, deadline=None)
-@given(messages=bags(accel=IMU_IN), chunk_size=st.sampled_from([500, 3000, 1 << 20]))
+@given(messages=bags(accel=rec.IMU_IN), chunk_size=st.sampled_from([500, 3000, 1 << 20]))
 def test_every_number_of_an_imu_message_arrives(messages, chunk_size):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'bag.mcap')
-        write_mcap(path, messages, chunk_size=chunk_size, compression='lz4')
+        rec.write_mcap(path, messages, chunk_size=chunk_size, compression='lz4')
         columns = read(path).columns
         ordered = in_reading_order(messages)
-        assert_columns(columns, ordered)
-        numbers = [m.numbers for m in ordered if m.topic == IMU_IN]
+        rec.assert_columns(columns, ordered)
+        numbers = [m.numbers for m in ordered if m.topic == rec.IMU_IN]
         if not numbers:
             assert columns.imu is None or len(columns.imu.orientation) == 0
             return
@@ -134,9 +110,9 @@ def test_directories_written_by_rosbags_are_read(messages, storage, compression)
     compression = '' if storage == 'sqlite3' and compression == 'STORAGE' else compression
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'bag')
-        write_rosbag2(path, messages, storage=storage, compression=compression)
+        rec.write_rosbag2(path, messages, storage=storage, compression=compression)
         recording = read(path)
-        assert_columns(recording.columns, messages)
+        rec.assert_columns(recording.columns, messages)
         assert recording.info.storage == storage
         assert recording.info.n_messages == len(messages)
 
@@ -147,38 +123,37 @@ def test_bags_of_ros_1_are_read(messages):
     # All log times differ: for equal log times a ROS 1 bag has no order between topics.
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'bag.bag')
-        write_rosbag1(path, messages)
+        rec.write_rosbag1(path, messages)
         recording = read(path)
-        assert_columns(recording.columns, messages)
+        rec.assert_columns(recording.columns, messages)
         assert recording.info.storage == 'ros1'
 
 
-@pytest.mark.parametrize('accel', [ACCEL, IMU_IN])
+@pytest.mark.parametrize('accel', [rec.ACCEL, rec.IMU_IN])
 def test_raw_messages_have_the_bytes_of_the_bag(tmp_path, accel):
-    messages = regular_messages(accel=accel)
-    write_mcap(tmp_path / 'bag.mcap', messages, chunk_size=900)
-    write_rosbag2(tmp_path / 'bag', messages, storage='sqlite3')
-    write_rosbag1(tmp_path / 'bag.bag', messages)
+    messages = rec.regular_messages(accel=accel)
+    rec.write_mcap(tmp_path / 'bag.mcap', messages, chunk_size=900)
+    rec.write_rosbag2(tmp_path / 'bag', messages, storage='sqlite3')
+    rec.write_rosbag1(tmp_path / 'bag.bag', messages)
     for name in ('bag.mcap', 'bag', 'bag.bag'):
         with open_recording(tmp_path / name) as reader:
-            content = {
-                reader.topics[k]: raw for b in reader.blocks(raw=True) for k, raw in b.raw.items()
-            }
-        assert set(content) == {accel, BOARD, CASE}
+            (block,) = reader.blocks(raw=True)
+            content = {reader.topics[role]: raw for role, raw in block.raw.items()}
+        assert set(content) == {accel, rec.BOARD, rec.CASE}
         for topic, raw in content.items():
             wanted = [m for m in messages if m.topic == topic]
-            assert list(raw) == [serialize(m) for m in wanted]
+            assert list(raw) == [rec.serialize(m) for m in wanted]
             assert raw.log_ns.tolist() == [m.log_ns for m in wanted]
 
 
 def test_blocks_end_where_the_frame_changes_and_together_have_all_messages(tmp_path):
-    messages = regular_messages(60)
+    messages = rec.regular_messages(60)
     for row, message in enumerate(messages):
         message.frame_id = 'front' if row % 30 < 11 else 'a_longer_name'
-    write_mcap(tmp_path / 'bag.mcap', messages, chunk_size=1500)
+    rec.write_mcap(tmp_path / 'bag.mcap', messages, chunk_size=1500)
     with open_recording(tmp_path / 'bag.mcap') as reader:
         blocks = list(reader.blocks())
-    frames = [message.frame_id for message in messages if message.topic == ACCEL]
+    frames = [message.frame_id for message in messages if message.topic == rec.ACCEL]
     assert [frame for block in blocks for frame in [block.frame_id] * len(block)] == frames
     before, n_accel = 0, 0
     for block in blocks:
@@ -188,39 +163,39 @@ def test_blocks_end_where_the_frame_changes_and_together_have_all_messages(tmp_p
         before += len(after)
         n_accel += len(block)
     assert (before, n_accel) == (8, 60)
-    assert_columns(read(tmp_path / 'bag.mcap').columns, messages)
+    rec.assert_columns(read(tmp_path / 'bag.mcap').columns, messages)
 
 
 def test_too_many_overlapping_chunks_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr('thermo_comp.recording.mcap_file._MAX_HELD_BYTES', 4000)
-    messages = regular_messages(200)
+    messages = rec.regular_messages(200)
     # Each chunk has every 40th message, so it overlaps all other chunks in time.
     combed = [message for begin in range(40) for message in messages[begin::40]]
-    write_mcap(tmp_path / 'bag.mcap', combed, chunk_size=400)
+    rec.write_mcap(tmp_path / 'bag.mcap', combed, chunk_size=400)
     with pytest.raises(RecordingError, match=r'too many of its chunks overlap in time'):
         read(tmp_path / 'bag.mcap')
 
 
 def test_raw_messages_of_overlapping_chunks_are_in_order_of_log_time(tmp_path):
-    messages = regular_messages(60)
+    messages = rec.regular_messages(60)
     shuffled = [m for pair in zip(messages[1::2], messages[::2], strict=False) for m in pair]
     for row, message in enumerate(messages):
         message.frame_id = 'abc'[row % 3] * (1 + row % 5)
-    write_mcap(tmp_path / 'bag.mcap', shuffled, chunk_size=250)
+    rec.write_mcap(tmp_path / 'bag.mcap', shuffled, chunk_size=250)
     with open_recording(tmp_path / 'bag.mcap') as reader:
         blocks = list(reader.blocks(raw=True))
     serialized = [content for block in blocks for content in block.raw.get('accel', ())]
-    wanted = [m for m in sorted(shuffled, key=lambda m: m.log_ns) if m.topic == ACCEL]
-    assert serialized == [serialize(m) for m in wanted]
+    wanted = [m for m in sorted(shuffled, key=lambda m: m.log_ns) if m.topic == rec.ACCEL]
+    assert serialized == [rec.serialize(m) for m in wanted]
     frames = [block.frame_id for block in blocks for _ in range(len(block))]
     assert frames == [m.frame_id for m in wanted]
 
 
 def test_the_files_of_a_split_bag_are_read_in_order(tmp_path):
-    messages = regular_messages(90)
-    write_rosbag2(tmp_path / 'bag', messages[:50])
-    write_mcap(tmp_path / 'bag' / 'bag_1.mcap', messages[50:80])
-    write_mcap(tmp_path / 'bag' / 'bag_10.mcap', messages[80:])
+    messages = rec.regular_messages(90)
+    rec.write_rosbag2(tmp_path / 'bag', messages[:50])
+    rec.write_mcap(tmp_path / 'bag' / 'bag_1.mcap', messages[50:80])
+    rec.write_mcap(tmp_path / 'bag' / 'bag_10.mcap', messages[80:])
     metadata = tmp_path / 'bag' / 'metadata.yaml'
     text = metadata.read_text()
     listed = text.replace(
@@ -230,12 +205,11 @@ def test_the_files_of_a_split_bag_are_read_in_order(tmp_path):
     assert listed != text
     metadata.write_text(listed)
     recording = read(tmp_path / 'bag')
-    assert_columns(recording.columns, messages)
+    rec.assert_columns(recording.columns, messages)
     assert recording.info.truncated is None
     assert recording.info.n_messages == len(messages)
 
-    # Without metadata.yaml, as after the end of a recorder by a signal, numbers in the file names
-    # give the order.
+    # Without metadata.yaml, as after a killed recorder, numbers in the file names give the order.
     (tmp_path / 'bag' / 'bag.mcap').rename(tmp_path / 'bag' / 'bag_0.mcap')
     (tmp_path / 'bag' / 'bag_1.mcap').rename(tmp_path / 'bag' / 'bag_2.mcap')
     for text in (None, ''):
@@ -243,7 +217,7 @@ def test_the_files_of_a_split_bag_are_read_in_order(tmp_path):
         if text is not None:
             metadata.write_text(text)
         recording = read(tmp_path / 'bag')
-        assert_columns(recording.columns, messages)
+        rec.assert_columns(recording.columns, messages)
         assert recording.info.truncated == (
             'metadata.yaml is missing, the recording was not finished'
         )
@@ -258,29 +232,33 @@ def test_a_folder_of_several_bags_is_refused(tmp_path):
 
 
 def test_databases_without_metadata_are_read(tmp_path):
-    messages = regular_messages()
-    write_rosbag2(tmp_path / 'bag', messages, storage='sqlite3')
+    messages = rec.regular_messages()
+    rec.write_rosbag2(tmp_path / 'bag', messages, storage='sqlite3')
     (tmp_path / 'bag' / 'metadata.yaml').unlink()
     recording = read(tmp_path / 'bag')
-    assert_columns(recording.columns, messages)
+    rec.assert_columns(recording.columns, messages)
     assert 'metadata.yaml is missing' in str(recording.info.truncated)
     shutil.copy(tmp_path / 'bag' / 'bag.db3', tmp_path / 'bare.db3')
-    assert_columns(read(tmp_path / 'bare.db3').columns, messages)
+    rec.assert_columns(read(tmp_path / 'bare.db3').columns, messages)
 
 
 def test_a_topic_is_found_under_its_namespace(tmp_path):
     path = tmp_path / 'bag.mcap'
-    write_mcap(path, regular_messages(8))
+    rec.write_mcap(path, rec.regular_messages(8))
     with open_recording(path, Topics(counts='counts', board='/temperature/board/')) as reader:
-        assert reader.topics == {'accel': ACCEL, 'board': BOARD, 'case': CASE}
+        assert reader.topics == {'accel': rec.ACCEL, 'board': rec.BOARD, 'case': rec.CASE}
 
 
 def written(path, *topics, counts='accel/counts'):
     with BagWriter(path) as bag:
-        bag.write_counts(counts, START_NS + np.arange(3), np.zeros((3, 3)))
+        bag.write_counts(counts, rec.START_NS + np.arange(3), np.zeros((3, 3)))
         for row, topic in enumerate(topics):
-            bag.write_temperature(topic, [START_NS + 1], [20.0 + row])
+            bag.write_temperature(topic, [rec.START_NS + 1], [20.0 + row])
     return path
+
+
+def celsius_of(temperatures):
+    return {name: part.celsius.tolist() for name, part in temperatures.items()}
 
 
 def test_further_thermometers_are_found_beside_the_board(tmp_path):
@@ -288,9 +266,7 @@ def test_further_thermometers_are_found_beside_the_board(tmp_path):
     topics = [f'imu0/temperature/{name}' for name in names]
     path = written(tmp_path / 'bag', *topics, 'temperature/lid', counts='imu0/accel/counts')
     temperatures = read_recording(path).columns.temperatures
-    assert {name: part.celsius.tolist() for name, part in temperatures.items()} == {
-        'board': [20.0], 'case': [21.0], 'lid': [22.0],
-    }  # fmt: skip
+    assert celsius_of(temperatures) == {'board': [20.0], 'case': [21.0], 'lid': [22.0]}
     assert temperatures['lid'].after.tolist() == [2]
 
 
@@ -299,16 +275,15 @@ def test_topics_can_be_named_by_input(tmp_path):
     names = {'counts': '/raw', 'board': 't1', 'temperature/case': 't2', 'temperature/magnet': 't3'}
     found = read_recording(path, Topics.named(names))
     assert found.info.chosen is None
-    assert {name: seen.celsius.tolist() for name, seen in found.columns.temperatures.items()} == {
-        'board': [20.0], 'case': [21.0], 'lid': [23.0], 'magnet': [22.0],
-    }  # fmt: skip
+    expected = {'board': [20.0], 'case': [21.0], 'lid': [23.0], 'magnet': [22.0]}
+    assert celsius_of(found.columns.temperatures) == expected
     with pytest.raises(RecordingError, match=r'/t9: no such topic.*--topic temperature/magnet='):
         open_recording(path, Topics.named({**names, 'temperature/magnet': '/t9'}))
     with pytest.raises(RecordingError, match=r'/raw: the topic has type geometry_msgs/msg/Vector'):
         open_recording(path, Topics.named({**names, 'temperature/magnet': '/raw'}))
     for wrong in ('bord', 'temperature/', 'temperature/A b', 'magnet'):
         with pytest.raises(
-            ValueError, match=f'`{wrong}` is not an input; expected counts, imu, board'
+            ValueError, match=f'`{wrong}` is not an input; expected counts, imu, bo'
         ):
             Topics.named({wrong: '/t1'})
     with pytest.raises(ValueError, match='`case` needs the name of a topic'):
@@ -349,7 +324,7 @@ def test_a_message_names_both_thermometers_if_neither_has_the_default_topic(tmp_
 def test_a_recording_can_be_read_twice_with_equal_results(tmp_path, monkeypatch):
     monkeypatch.setattr('thermo_comp.recording.blocks.BLOCK_MESSAGES', 100)
     path = tmp_path / 'bag.mcap'
-    write_mcap(path, regular_messages(2000), chunk_size=2000)
+    rec.write_mcap(path, rec.regular_messages(2000), chunk_size=2000)
     with open_recording(path) as reader:
         first = next(iter(reader.blocks()))  # the first pass stops after one block
         again = next(iter(reader.blocks()))
@@ -360,7 +335,7 @@ def test_a_recording_can_be_read_twice_with_equal_results(tmp_path, monkeypatch)
 def test_blocks_of_a_recording_have_similar_sizes(tmp_path, monkeypatch, n_messages):
     monkeypatch.setattr('thermo_comp.recording.blocks.BLOCK_MESSAGES', n_messages)
     path = tmp_path / 'bag.mcap'
-    write_mcap(path, regular_messages(2000), chunk_size=2000)
+    rec.write_mcap(path, rec.regular_messages(2000), chunk_size=2000)
     with open_recording(path) as reader:
         blocks = list(reader.blocks())
     sizes = [block.n_messages for block in blocks]
@@ -370,8 +345,8 @@ def test_blocks_of_a_recording_have_similar_sizes(tmp_path, monkeypatch, n_messa
 
 
 def test_a_closed_recording_refuses_to_read(tmp_path):
-    write_mcap(tmp_path / 'bag.mcap', regular_messages())
-    write_rosbag1(tmp_path / 'bag.bag', regular_messages())
+    rec.write_mcap(tmp_path / 'bag.mcap', rec.regular_messages())
+    rec.write_rosbag1(tmp_path / 'bag.bag', rec.regular_messages())
     for name in ('bag.mcap', 'bag.bag'):
         with open_recording(tmp_path / name) as reader:
             pass

@@ -7,21 +7,8 @@ import struct
 
 import numpy as np
 import pytest
+import recording_helpers as rec
 from mcap.opcode import Opcode
-from recording_helpers import (
-    ACCEL,
-    BOARD,
-    BOOL,
-    CASE,
-    OTHER,
-    START_NS,
-    Message,
-    regular_messages,
-    serialize,
-    write_mcap,
-    write_rosbag1,
-    write_rosbag2,
-)
 from test_recording_damage import read, whole_file
 
 from thermo_comp.errors import RecordingError
@@ -42,7 +29,7 @@ def text(value):
 
 def declared(encoding='cdr', kind='geometry_msgs/msg/Vector3Stamped'):
     schema = struct.pack('<H', 1) + text(kind) + text('ros2msg') + text('')
-    channel = struct.pack('<HH', 1, 1) + text(ACCEL) + text(encoding) + text('')
+    channel = struct.pack('<HH', 1, 1) + text(rec.ACCEL) + text(encoding) + text('')
     return b''.join(
         struct.pack('<BQ', opcode, len(body)) + body
         for opcode, body in ((Opcode.SCHEMA, schema), (Opcode.CHANNEL, channel))
@@ -62,7 +49,7 @@ def declared(encoding='cdr', kind='geometry_msgs/msg/Vector3Stamped'):
 def test_messages_of_a_wrong_layout_are_refused(tmp_path, data, reason):
     path = tmp_path / 'bag.mcap'
     path.write_bytes(whole_file(declared(), short_message(data)))
-    with pytest.raises(RecordingError, match=rf'bag\.mcap: {ACCEL}: .*{reason}'):
+    with pytest.raises(RecordingError, match=rf'bag\.mcap: {rec.ACCEL}: .*{reason}'):
         read(path)
 
 
@@ -70,26 +57,24 @@ def test_ros_1_messages_in_an_mcap_file_are_read(tmp_path):
     path = tmp_path / 'bag.mcap'
     numbers = struct.pack('<3d', 1.5, -2.5, 3.5)
     data = struct.pack('<IIII', 9, 12, 34, 4) + b'link' + numbers
-    path.write_bytes(
-        whole_file(declared('ros1', 'geometry_msgs/Vector3Stamped'), short_message(data))
-    )
+    kind = declared('ros1', 'geometry_msgs/Vector3Stamped')
+    path.write_bytes(whole_file(kind, short_message(data)))
     with open_recording(path, require=('accel',)) as reader:
         (block,) = reader.blocks(raw=True)
     assert block.accel.tolist() == [[1.5, -2.5, 3.5]]
     assert block.accel_stamp_ns.tolist() == [12 * 10**9 + 34]
     assert block.frame_id == 'link'
-    message = Message(ACCEL, 1, 12 * 10**9 + 34, 'link', (1.5, -2.5, 3.5))
-    assert block.raw['accel'].data.tobytes() == serialize(message)
+    message = rec.Message(rec.ACCEL, 1, 12 * 10**9 + 34, 'link', (1.5, -2.5, 3.5))
+    assert block.raw['accel'].data.tobytes() == rec.serialize(message)
 
 
 def test_messages_in_a_wrong_encoding_are_refused(tmp_path):
     path = tmp_path / 'bag.mcap'
-    both = declared() + declared('ros1').replace(
-        struct.pack('<HH', 1, 1), struct.pack('<HH', 2, 1)
-    )
-    message = Message(ACCEL, 1, 1, '', (1.0, 2.0, 3.0))
-    path.write_bytes(whole_file(both, short_message(serialize(message))))
-    with pytest.raises(RecordingError, match=f'{ACCEL}: its messages have several encodings'):
+    first, second = struct.pack('<HH', 1, 1), struct.pack('<HH', 2, 1)
+    both = declared() + declared('ros1').replace(first, second)
+    message = rec.Message(rec.ACCEL, 1, 1, '', (1.0, 2.0, 3.0))
+    path.write_bytes(whole_file(both, short_message(rec.serialize(message))))
+    with pytest.raises(RecordingError, match=f'{rec.ACCEL}: its messages have several encodings'):
         read(path)
     path.write_bytes(whole_file(declared('json'), short_message(b'{}')))
     with pytest.raises(RecordingError, match="encoded as 'json', expected cdr"):
@@ -109,8 +94,8 @@ def test_paths_that_are_not_a_bag_are_refused(tmp_path):
     for name, content, reason in (
         (
             'notes.txt',
-            b'hello',
-            r'not a bag: expected a directory, \.mcap, \.db3 or \.bag; `thermo_comp convert`',
+            b'',
+            r'not a bag: expected a directory, \.mcap, \.db3 or \.bag; `thermo_comp ',
         ),
         ('text.mcap', b'hello, this is no bag at all', 'not an MCAP file'),
         ('empty.mcap', b'', 'the file is empty'),
@@ -128,32 +113,30 @@ def test_paths_that_are_not_a_bag_are_refused(tmp_path):
         ('a: 1', 'not the metadata of a rosbag2 bag'),
         ('- 1', 'not the metadata of a rosbag2 bag'),
         ('rosbag2_bagfile_information: {relative_file_paths: []}', 'not the metadata'),
-        (
-            'rosbag2_bagfile_information: {relative_file_paths: [a.mcap], storage_identifier: m}',
-            r'the file a\.mcap of the bag is missing',
-        ),
+        ('rosbag2_bagfile_information: {relative_file_paths: [a.mcap], storage_identifier: m}',
+         r'the file a\.mcap of the bag is missing'),
         ('[' * 5000, 'not valid YAML'),
-    ):
+    ):  # fmt: skip
         (tmp_path / 'folder' / 'metadata.yaml').write_text(content)
         refused(tmp_path / 'folder', reason)
 
 
 def test_absent_topics_and_topics_of_a_wrong_type_are_refused(tmp_path):
     path = tmp_path / 'bag.mcap'
-    messages = regular_messages(8)
-    write_mcap(path, messages)
+    messages = rec.regular_messages(8)
+    rec.write_mcap(path, messages)
     asked = Topics(counts='my/counts', input='counts')
     refused(path, r'counts: no such topic; the bag has /accel/counts ', asked)
     reason = r'or x/imu: no such topic.*--topic counts=TOPIC or --topic imu='
     refused(path, reason, Topics(counts='x/counts', imu='x/imu'))
     refused(path, 'name another with --topic case=', Topics(case='other/case'))
-    refused(path, 'has type sensor_msgs/msg/Temperature, expected geo', Topics(counts=BOARD))
-    write_mcap(path, [m for m in messages if m.topic != CASE])
+    refused(path, 'has type sensor_msgs/msg/Temperature, expected geo', Topics(counts=rec.BOARD))
+    rec.write_mcap(path, [m for m in messages if m.topic != rec.CASE])
     refused(path, 'temperature/case: no such topic')
     with open_recording(path, require=('accel', 'board')) as reader:
         (block,) = reader.blocks()
         assert [len(times) for times in block.log_ns.values()] == [8, 1, 0]
-    write_mcap(path, [])
+    rec.write_mcap(path, [])
     refused(path, 'the bag holds no messages')
     assert inspect_recording(path).input is None
     assert len(read(path).columns) == 0
@@ -183,7 +166,7 @@ def test_topic_names_with_control_characters_are_escaped_in_messages(tmp_path):
     path = tmp_path / 'bag.mcap'
     with BagWriter(path) as bag:
         for row in range(30):
-            bag.write_raw(f'a\nb\x1b[31m{row:02}' + 'x' * 1000, BOOL, [1], [b''])
+            bag.write_raw(f'a\nb\x1b[31m{row:02}' + 'x' * 1000, rec.BOOL, [1], [b''])
     with pytest.raises(RecordingError, match=r'/a\\nb\\x1b\[31m00x.* and 10 more; name') as caught:
         open_recording(path)
     assert str(caught.value).isprintable()
@@ -191,9 +174,9 @@ def test_topic_names_with_control_characters_are_escaped_in_messages(tmp_path):
 
 
 def test_cut_db3_and_bag_files_give_a_message_of_one_line(tmp_path):
-    messages = [*regular_messages(400), Message(OTHER, 0)]
-    write_rosbag2(tmp_path / 'bag', messages, storage='sqlite3')
-    write_rosbag1(tmp_path / 'bag.bag', messages)
+    messages = [*rec.regular_messages(400), rec.Message(rec.OTHER, 0)]
+    rec.write_rosbag2(tmp_path / 'bag', messages, storage='sqlite3')
+    rec.write_rosbag1(tmp_path / 'bag.bag', messages)
     for path in (tmp_path / 'bag' / 'bag.db3', tmp_path / 'bag.bag'):
         content = path.read_bytes()
         path.write_bytes(content[: len(content) * 2 // 3])
@@ -204,7 +187,7 @@ def test_cut_db3_and_bag_files_give_a_message_of_one_line(tmp_path):
 
 def driver_bag(path, *topics, metadata=None):
     """Write five messages per topic, of type Imu, Temperature, Bool or Vector3Stamped."""
-    stamp_ns = START_NS + np.arange(5) * 10**7
+    stamp_ns = rec.START_NS + np.arange(5) * 10**7
     with BagWriter(path, metadata=metadata or {}) as bag:
         for topic, kind in topics:
             if kind == 'imu':
@@ -212,7 +195,7 @@ def driver_bag(path, *topics, metadata=None):
             elif kind == 'celsius':
                 bag.write_temperature(topic, stamp_ns, np.full(5, 20.0))
             elif kind == 'flag':
-                bag.write_raw(topic, BOOL, stamp_ns, [b''] * 5)
+                bag.write_raw(topic, rec.BOOL, stamp_ns, [b''] * 5)
             else:
                 bag.write_counts(topic, stamp_ns, np.ones((5, 3)))
     return path
@@ -256,9 +239,8 @@ def test_the_input_that_the_user_names_is_compensated(tmp_path):
 
 
 def test_a_topic_that_thermo_comp_wrote_is_refused_as_input(tmp_path):
-    path = driver_bag(
-        tmp_path / 'bag', ('imu/data_raw', 'imu'), metadata={'corrected_by': 'thermo_comp 0.1'}
-    )
+    facts = {'corrected_by': 'thermo_comp 0.1'}
+    path = driver_bag(tmp_path / 'bag', ('imu/data_raw', 'imu'), metadata=facts)
     told = '/imu/data_raw is no input: thermo_comp wrote it'
     with pytest.raises(RecordingError, match=told):
         open_recording(path, require=('accel',))

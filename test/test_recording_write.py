@@ -7,26 +7,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import recording_helpers as rec
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
-from recording_helpers import ACCEL, BOARD, IMU_IN, START_NS, Message, serialize, typestore
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader as Reader2
 
 from thermo_comp.errors import OutputError, RecordingError
-from thermo_comp.recording.blocks import ImuColumns
 from thermo_comp.recording.reader import open_recording, read_recording
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.topics import BOOL, FLAGS, STAMPED
 
 STEP_NS = 2_500_000
-
-
-def imu_columns(rng, n):
-    return ImuColumns(*(rng.normal(size=(n, width)) for width in (4, 9, 3, 9, 9)))
 
 
 @settings(max_examples=25, deadline=None)
@@ -47,25 +42,29 @@ def test_rosbags_and_mcap_read_the_written_messages(
         path = Path(folder, 'bag.mcap' if is_file else 'bag')
         with BagWriter(path, compression=compression, chunk_bytes=chunk_bytes) as bag:
             for n in counts:
-                log_ns = START_NS + rng.integers(0, 50, n) * STEP_NS
+                log_ns = rec.START_NS + rng.integers(0, 50, n) * STEP_NS
                 stamp_ns = rng.integers(0, 2**31 * 10**9, n)
-                imu, linear = imu_columns(rng, n), rng.normal(size=(n, 3))
+                imu, linear = rec.imu_columns(rng, n), rng.normal(size=(n, 3))
                 raw = [rng.bytes(int(size)) for size in rng.integers(1, 40, n)]
                 covariance = imu.linear_acceleration_covariance
-                bag.write_counts(ACCEL, stamp_ns, linear, frame_id, log_ns)
-                bag.write_temperature(BOARD, stamp_ns, linear[:, 0], log_ns)
-                bag.write_imu(IMU_IN, stamp_ns, linear, covariance, frame_id, imu, log_ns)
+                bag.write_counts(rec.ACCEL, stamp_ns, linear, frame_id, log_ns)
+                bag.write_temperature(rec.BOARD, stamp_ns, linear[:, 0], log_ns)
+                bag.write_imu(rec.IMU_IN, stamp_ns, linear, covariance, frame_id, imu, log_ns)
                 flags = [b'\0\1\0\0' + bytes([x > 0]) for x in linear[:, 0].tolist()]
                 bag.write_raw('regime/dynamic', BOOL, log_ns, flags)
                 bag.write_raw('diagnostics', 'std_msgs/msg/String', log_ns, raw)
                 bag.flush()
                 numbers = {
-                    ACCEL: linear, BOARD: np.column_stack((linear[:, 0], np.zeros(n))),
-                    IMU_IN: np.hstack((*imu[:4], linear, covariance)),
+                    rec.ACCEL: linear, rec.BOARD: np.column_stack((linear[:, 0], np.zeros(n))),
+                    rec.IMU_IN: np.hstack((*imu[:4], linear, covariance)),
                 }  # fmt: skip
                 group = [
-                    (log, topic, serialize(Message(topic, log, stamp, frame, tuple(row))))
-                    for topic, frame in ((ACCEL, frame_id), (BOARD, ''), (IMU_IN, frame_id))
+                    (log, topic, rec.serialize(rec.Message(topic, log, stamp, frame, tuple(row))))
+                    for topic, frame in (
+                        (rec.ACCEL, frame_id),
+                        (rec.BOARD, ''),
+                        (rec.IMU_IN, frame_id),
+                    )
                     for log, stamp, row in zip(
                         log_ns.tolist(), stamp_ns.tolist(), numbers[topic].tolist(), strict=True
                     )
@@ -90,7 +89,7 @@ def test_rosbags_and_mcap_read_the_written_messages(
         with Reader2(path) as rosbag:
             assert rosbag.message_count == len(wanted)
             topics = {connection.topic for connection in rosbag.connections}
-            assert topics == {ACCEL, BOARD, IMU_IN, '/regime/dynamic', '/diagnostics'}
+            assert topics == {rec.ACCEL, rec.BOARD, rec.IMU_IN, '/regime/dynamic', '/diagnostics'}
             listed = [(log, link.topic, bytes(data)) for link, log, data in rosbag.messages()]
         # The order of messages with equal log times in two chunks depends on rosbags' version.
         assert [log for log, *_ in listed] == times
@@ -99,7 +98,7 @@ def test_rosbags_and_mcap_read_the_written_messages(
 
 def small(path, value=1.0, **options):
     with BagWriter(path, **options) as bag:
-        stamps = START_NS + STEP_NS * np.arange(5)
+        stamps = rec.START_NS + STEP_NS * np.arange(5)
         bag.write_counts('accel/counts', stamps, np.full((5, 3), value))
 
 
@@ -123,13 +122,13 @@ def test_a_written_directory_equals_that_of_rosbag2(tmp_path):
     assert content['storage_identifier'] == 'mcap'
     assert content['relative_file_paths'] == ['bag_0.mcap']
     assert content['message_count'] == 5
-    assert content['starting_time'] == {'nanoseconds_since_epoch': START_NS}
+    assert content['starting_time'] == {'nanoseconds_since_epoch': rec.START_NS}
     assert content['duration'] == {'nanoseconds': 4 * STEP_NS}
     assert content['custom_data'] == {'serial': '7'}
     (topic,) = content['topics_with_message_count']
     kind = 'geometry_msgs/msg/Vector3Stamped'
     assert topic['topic_metadata']['type'] == kind
-    assert topic['topic_metadata']['type_description_hash'] == typestore().hash_rihs01(kind)
+    assert topic['topic_metadata']['type_description_hash'] == rec.typestore().hash_rihs01(kind)
     with (tmp_path / 'bag' / 'bag_0.mcap').open('rb') as stream:
         reader = make_reader(stream)
         assert reader.get_header().profile == 'ros2'
@@ -138,7 +137,7 @@ def test_a_written_directory_equals_that_of_rosbag2(tmp_path):
         (schema,) = summary.schemas.values()
         metadata = {record.name: record.metadata for record in reader.iter_metadata()}
     assert (schema.name, schema.encoding) == (kind, 'ros2msg')
-    assert schema.data.decode() == typestore().generate_msgdef(kind, ros_version=2)[0]
+    assert schema.data.decode() == rec.typestore().generate_msgdef(kind, ros_version=2)[0]
     qos = yaml.safe_load(channel.metadata['offered_qos_profiles'])
     assert qos == topic['topic_metadata']['offered_qos_profiles']
     assert qos[0]['reliability'] == 'reliable'
@@ -249,12 +248,9 @@ def test_regime_topics_of_a_bag_have_the_qos_of_the_node(tmp_path, name):
     path = tmp_path / name / 'bag_0.mcap' if name == 'bag' else tmp_path / name
     with path.open('rb') as file:
         channels = make_reader(file).get_summary().channels.values()
-        offered = {
-            channel.topic: yaml.safe_load(channel.metadata['offered_qos_profiles'])[0]
-            for channel in channels
-        }
-    assert {topic: profile['durability'] for topic, profile in offered.items()} == {
-        '/imu0/regime/dynamic': 'transient_local',
-        '/imu0/regime/stamped': 'transient_local',
-        '/diagnostics': 'volatile',
-    }
+    regimes = {'/imu0/regime/dynamic', '/imu0/regime/stamped'}
+    assert {channel.topic for channel in channels} == {*regimes, '/diagnostics'}
+    for channel in channels:
+        (profile,) = yaml.safe_load(channel.metadata['offered_qos_profiles'])
+        is_latched = channel.topic in regimes
+        assert profile['durability'] == ('transient_local' if is_latched else 'volatile')

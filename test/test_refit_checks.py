@@ -31,10 +31,8 @@ def test_the_pieces_of_a_rest_contain_every_window_of_the_rest(n_minutes, window
     bag = reduce_source(rest.source(), window_s=window_s, full_scale=None)
     pieces = in_pieces(bag)
     for name in ('time', 'count', 'mean'):
-        whole, parts = (
-            [getattr(interval, name) for interval in some.intervals] for some in (bag, pieces)
-        )
-        np.testing.assert_array_equal(np.concatenate(parts), np.concatenate(whole))
+        both = ([getattr(each, name) for each in some.intervals] for some in (bag, pieces))
+        np.testing.assert_array_equal(*map(np.concatenate, both))
     assert sum(p.n_whole for p in pieces.intervals) == sum(r.n_whole for r in bag.intervals)
     hours = [len(piece.time) * bag.window_s / 3600.0 for piece in pieces.intervals]
     # If a rest is divided, its pieces are as close to an hour as possible: 40 to 90 min.

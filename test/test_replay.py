@@ -9,12 +9,11 @@ import tracemalloc
 import numpy as np
 import pytest
 from builders import calibration, equal_axes, rich_calibration
-from recording_helpers import BOOL, OTHER, Message, regular_messages, write_rosbag1
+from recording_helpers import BOOL, OTHER, Message, imu_columns, regular_messages, write_rosbag1
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from thermo_comp.errors import CalibrationError, OutputError, RecordingError
-from thermo_comp.recording.blocks import ImuColumns
 from thermo_comp.recording.reader import open_recording, read_recording
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter
@@ -27,7 +26,7 @@ START_NS = 1_767_225_600_000_000_000
 SECOND_NS = 1_000_000_000
 
 
-def thermal_test(path, minutes=30.0, rate_hz=5.0, serial='', imu=False):
+def thermal_test(path, minutes=30.0, rate_hz=5.0, serial='', is_imu=False):
     """Write a bag, in seven parts, of a ramp between two soaks with a board that lags."""
     rng = np.random.default_rng(7)
     n = round(minutes * 60.0 * rate_hz)
@@ -37,36 +36,21 @@ def thermal_test(path, minutes=30.0, rate_hz=5.0, serial='', imu=False):
     board = np.interp(seconds - 200.0, [0.0, 600.0, 1500.0], [14.0, 14.0, 28.0])
     reading_ns = START_NS + (seconds * 1e9).astype(np.int64)
     accel = np.array([1800.0, -300.0, 2300.0]) + rng.integers(-3, 4, (n, 3))
-    if imu:
-        accel = accel / 300.0
     metadata = {'serial': serial} if serial else {}
+    parts = (np.array_split(np.arange(size), 7) for size in (n, len(seconds)))
     with BagWriter(path, metadata=metadata) as writer:
-        for rows, readings in zip(
-            np.array_split(np.arange(n), 7),
-            np.array_split(np.arange(len(seconds)), 7),
-            strict=True,
-        ):
+        for rows, readings in zip(*parts, strict=True):
             for topic, values in ((TOPICS.board, board), (TOPICS.case, case)):
                 noisy = values[readings] + 0.004 * rng.standard_normal(len(readings))
                 writer.write_temperature(topic, reading_ns[readings], noisy)
-            if imu:
-                columns = imu_columns(rng, len(rows))
-                covariance = columns.linear_acceleration_covariance
-                writer.write_imu(
-                    TOPICS.imu, stamps[rows], accel[rows], covariance, 'imu_link', imu=columns
-                )
+            if is_imu:
+                imu = imu_columns(rng, len(rows))
+                given = accel[rows] / 300.0, imu.linear_acceleration_covariance, 'imu_link'
+                writer.write_imu(TOPICS.imu, stamps[rows], *given, imu=imu)
             else:
                 writer.write_counts(TOPICS.counts, stamps[rows], accel[rows], 'imu_link')
             writer.flush()
     return path
-
-
-def imu_columns(rng, n):
-    return ImuColumns(*(rng.standard_normal((n, k)) for k in (4, 9, 3, 9, 9)))
-
-
-def calibrated(**changes):
-    return dataclasses.replace(rich_calibration(), **changes)
 
 
 def output_of(path):
@@ -140,9 +124,7 @@ def test_a_calibration_of_another_unit_is_refused_unless_serial_names_it_or_is_e
     bag = thermal_test(tmp_path / 'bag', minutes=1.0, serial='T-2')
     calibration = rich_calibration()
     for serial in (None, 'T-2'):
-        with pytest.raises(
-            CalibrationError, match=r'calibration is of unit T-1.* is (of unit )?T-2 '
-        ):
+        with pytest.raises(CalibrationError, match=r'is of unit T-1.* is (of unit )?T-2 '):
             replay(bag, calibration, tmp_path / 'out', serial=serial)
     assert not (tmp_path / 'out').exists()
     assert isinstance(replay(bag, calibration, tmp_path / 'a', serial=''), ReplayResult)
@@ -150,7 +132,7 @@ def test_a_calibration_of_another_unit_is_refused_unless_serial_names_it_or_is_e
 
 
 def test_an_imu_is_refused_by_a_calibration_of_counts(tmp_path):
-    bag = thermal_test(tmp_path / 'bag', minutes=1.0, imu=True)
+    bag = thermal_test(tmp_path / 'bag', minutes=1.0, is_imu=True)
     with pytest.raises(CalibrationError, match=r'takes samples in counts.*are sensor_msgs/Imu'):
         replay(bag, rich_calibration(), tmp_path / 'out', topics=Topics(input='imu'))
     with pytest.raises(RecordingError, match='accel/counts'):
@@ -187,11 +169,9 @@ def test_memory_does_not_grow_with_the_bag(tmp_path, monkeypatch):
 @pytest.mark.parametrize('imu', [False, True])
 def test_an_output_table_has_the_values_of_the_output_bag(tmp_path, imu):
     pq = pytest.importorskip('pyarrow.parquet', reason='no pyarrow: install the extra `parquet`')
-    bag = thermal_test(tmp_path / 'bag', imu=imu)
-    calibration = rich_calibration()
-    if imu:
-        unit = Unit('T-1', 'm/s^2', 100.0, 0.1)
-        calibration = calibrated(unit=unit)
+    bag = thermal_test(tmp_path / 'bag', rate_hz=2.0, is_imu=imu)
+    unit = {'unit': Unit('T-1', 'm/s^2', 100.0, 0.1)} if imu else {}
+    calibration = dataclasses.replace(rich_calibration(), **unit)
     for name in ('out', 'out.csv', 'out.parquet'):
         replay(bag, calibration, tmp_path / name)
     block, flags = output_of(tmp_path / 'out')
@@ -251,9 +231,8 @@ def test_the_option_all_topics_copies_every_topic(tmp_path, storage):
                 writer.write_raw(name, reader.info.topics[name][0], raw.log_ns, raw)
         definition = ('ros2msg', 'string data')
         writer.write_raw('odd', 'odd_msgs/msg/Odd', stamps, messages, definition)
-        writer.write_raw(
-            'gps/ok', BOOL, stamps, [bytes((0, 1, 0, 0, k % 2)) for k in range(len(stamps))]
-        )
+        flags = [bytes((0, 1, 0, 0, k % 2)) for k in range(len(stamps))]
+        writer.write_raw('gps/ok', BOOL, stamps, flags)
         writer.write_raw(IMU_OUT.name, BOOL, stamps, [bytes((0, 1, 0, 0, 0))] * len(stamps))
     bag = mcap
     if storage == 'sqlite3':

@@ -33,10 +33,7 @@ class Page(HTMLParser):
 
     def __init__(self, text):
         super().__init__()
-        self.source = text
-        self.tags = []
-        self.text = ''
-        self.open = []
+        self.source, self.text, self.tags, self.open = text, '', [], []
         self.feed(text)
 
     def handle_starttag(self, tag, attrs):
@@ -87,17 +84,10 @@ def page():
 def test_the_certificate_of_a_fit_has_the_expected_statements(page):
     assert not page.open  # every tag is closed
     for fact in (
-        'Unit thermostatted-0001',
-        evidence().calibration.provenance.created,
-        f'thermo_comp {__version__}',
-        '9.80665 m/s²',
-        f'{1:064x}',
-        f'{9:064x}',
-        'Residual after each step of the model',
-        'Contribution of each part of the model',
-        'parts that lag the board',
-        'after 600 s, m',
-        '12.7 m per µg',
+        *('Unit thermostatted-0001', evidence().calibration.provenance.created),
+        *(f'thermo_comp {__version__}', '9.80665 m/s²', f'{1:064x}', f'{9:064x}'),
+        *('Residual after each step of the model', 'Contribution of each part of the model'),
+        *('parts that lag the board', 'after 600 s, m', '12.7 m per µg'),
     ):
         assert fact in page.text
     for figure in figures_of(evidence()):
@@ -169,17 +159,15 @@ def test_a_page_without_calibration_shows_temperatures_derivatives_and_regime(op
 
 def test_texts_of_a_bag_or_a_calibration_are_escaped_in_the_page(tmp_path, monkeypatch):
     evil = '<script>alert("x")</script>'
-    bag = write_bag(
-        tmp_path / "a'b<img src=x onerror=alert(1)>$\\frac{.mcap", frame_id=evil, serial=evil
-    )
+    path = tmp_path / "a'b<img src=x onerror=alert(1)>$\\frac{.mcap"
+    bag = write_bag(path, frame_id=evil, serial=evil)
     calibration = fitted().calibration
     provenance = replace(
         calibration.provenance, created=evil, tool_version=evil, model=evil, notes=(evil,),
         sources=(replace(calibration.provenance.sources[0], name=evil, sha256=evil),),
     )  # fmt: skip
-    calibration = replace(
-        calibration, unit=replace(calibration.unit, serial=evil), provenance=provenance
-    )
+    unit = replace(calibration.unit, serial=evil)
+    calibration = replace(calibration, unit=unit, provenance=provenance)
     judged = evidence_of_bags(open_bags([bag]), calibration)
     undrawn = 'thermo_comp.report.page.drawn_figures'
     monkeypatch.setattr(undrawn, lambda figures: [(figure, '') for figure in figures])
@@ -236,9 +224,8 @@ def test_a_calibration_without_bags_gives_a_page_and_figures_as_png(tmp_path):
     names = [figure.name for figure in figures_of(evidence())]
     without_bags = [name for name in names if name in ('functions', 'step', 'hysteresis')]
     files = sorted(folder.iterdir())
-    assert [path.name for path in files] == [
-        f'{i}_{name}.png' for i, name in enumerate(without_bags, 1)
-    ]
+    expected = [f'{i}_{name}.png' for i, name in enumerate(without_bags, 1)]
+    assert [path.name for path in files] == expected
     assert all(path.read_bytes().startswith(b'\x89PNG') for path in files)
 
 
@@ -258,11 +245,9 @@ def test_the_page_is_written_atomically(tmp_path):
 def test_each_verdict_has_a_colour_in_the_page(opened):
     assert evidence().level in ('good', 'reserved')
     calibration = fitted().calibration
-    narrow = {
-        name: replace(getattr(calibration, name), temperature_range_c=(19.0, 22.0))
-        for name in ('static', 'dynamic')
-    }
-    judged = evidence_of_bags(opened, replace(calibration, **narrow))
+    sets = (replace(each, temperature_range_c=(19.0, 22.0)) for each in calibration.regime_sets())
+    narrow = replace(calibration, **dict(zip(('static', 'dynamic'), sets, strict=True)))
+    judged = evidence_of_bags(opened, narrow)
     assert judged.judgement.sections['outside'].n > 0
     assert 'outside the calibrated ranges not judged' in judged.headline
     strict = evidence_of_bags(opened, calibration, tolerance=1e-9)

@@ -75,10 +75,18 @@ def logged(folder):
 
 
 def finder():
-    state = (20.0,) * 7
-    return RestFinder(
-        np.full(3, 300.0), np.full(3, NOISE**2), 32767.0, lambda: (state, ()), 1.0 / RATE_HZ
-    )
+    given = np.full(3, 300.0), np.full(3, NOISE**2), 32767.0
+    return RestFinder(*given, lambda: ((20.0,) * 7, ()), 1.0 / RATE_HZ)
+
+
+def check_blocks(stamps, samples, cuts, whole):
+    """Check that samples in blocks give the rests `whole` that all samples at once give."""
+    pieces, found = finder(), []
+    for cut in np.split(np.arange(len(samples)), cuts):
+        if len(cut):
+            found += pieces.add(stamps[cut], samples[cut])
+    assert [row.stamp_ns for row in found] == [row.stamp_ns for row in whole]
+    assert np.allclose([row.mean for row in found], [row.mean for row in whole], atol=1e-9)
 
 
 def test_logged_windows_are_means_over_10_s_at_rest():
@@ -94,11 +102,7 @@ def test_logged_windows_are_means_over_10_s_at_rest():
         assert np.allclose(row.mean, part.mean(axis=0), atol=1e-9)
         assert np.allclose(row.sd, part.std(axis=0), rtol=0.05)
     # Samples in blocks of any size give equal windows.
-    pieces, rests = finder(), []
-    for cut in np.split(np.arange(len(samples)), [7, 333, 334, 1201]):
-        rests += pieces.add(stamps[cut], samples[cut])
-    assert [row.stamp_ns for row in rests] == [row.stamp_ns for row in whole]
-    assert np.allclose([row.mean for row in rests], [row.mean for row in whole], atol=1e-9)
+    check_blocks(stamps, samples, [7, 333, 334, 1201], whole)
 
 
 @pytest.mark.parametrize('rate', [1.0, 2.0, 3.3, 5.0, 50.0, 2000.0])
@@ -119,12 +123,7 @@ def test_rests_are_found_at_any_rate_of_samples(rate, rng):
         is_first = row.stamp_ns < START_NS + 60 * SECOND_NS
         expected = (30.0, -20.0, 2941.0) if is_first else (2941.0, -20.0, 30.0)
         assert np.abs(np.array(row.mean) - expected).max() < 5.0 * 3.0 * excess / np.sqrt(row.n)
-    pieces, found = finder(), []
-    for cut in np.split(np.arange(n), np.sort(rng.choice(n, 20, replace=False))):
-        if len(cut):
-            found += pieces.add(stamps[cut], samples[cut])
-    assert [row.stamp_ns for row in found] == [row.stamp_ns for row in whole]
-    assert np.allclose([row.mean for row in found], [row.mean for row in whole], atol=1e-9)
+    check_blocks(stamps, samples, np.sort(rng.choice(n, 20, replace=False)), whole)
 
 
 @pytest.mark.parametrize('fault', ['moves', 'shakes', 'stuck', 'tilts', 'saturated', 'gap'])
@@ -290,13 +289,8 @@ def test_the_diagnostics_warn_of_a_full_disk(small_disk, unit, peer):
         driver = drive(peer, node)
         send(driver, standing(12 * RATE_HZ))
 
-        def warned():
-            return any(
-                'not kept in the rest log: No space left on device' in message.status[0].message
-                for message in heard
-            )
-
-        peer.wait_for(warned, 'the warning')
+        text = 'not kept in the rest log: No space left on device'
+        peer.wait_for(lambda: any(text in each.status[0].message for each in heard), text)
 
 
 def test_a_folder_that_cannot_be_made_is_refused(unit):

@@ -33,11 +33,8 @@ def at_rest(rng, bias=0.0):
 
 
 def readings(second):
-    flicker = 0.004 * (-1) ** second
-    return [
-        ('board', second * SECOND_NS, 20.0 + flicker),
-        ('case', second * SECOND_NS, 20.0 - flicker),
-    ]
+    at, flicker = second * SECOND_NS, 0.004 * (-1) ** second
+    return [('board', at, 20.0 + flicker), ('case', at, 20.0 - flicker)]
 
 
 def recording(n, rate_hz, sample, start_ns=0):
@@ -60,13 +57,12 @@ def test_few_equal_samples_are_accepted_at_any_sample_rate(rng):
     assert compensator.counters.n_stuck == 0
 
 
+#: Numbers of equal samples, also near the limit of a stuck axis.
+LENGTHS = [1, 1, 1, 2, 3, 24, 48, 49, 50, 51, 52, 120]
+
+
 @given(
-    st.lists(
-        st.tuples(
-            st.sampled_from([1, 1, 1, 2, 3, 24, 48, 49, 50, 51, 52, 120]), st.integers(0, 7)
-        ),
-        max_size=40,
-    ),
+    st.lists(st.tuples(st.sampled_from(LENGTHS), st.integers(0, 7)), max_size=40),
     st.lists(st.integers(1, 300), min_size=1, max_size=10),
     st.sampled_from([0, 1, 49, 60]),
 )
@@ -119,18 +115,9 @@ def test_a_constant_axis_is_stuck_if_the_other_axes_change(axis, value):
 def test_a_constant_axis_at_rest_is_not_stuck(rng):
     compensator = Compensator(calibration())
     # Noise is below a rounding step: x repeats one value, y and z alternate between two.
-    stream(
-        compensator,
-        recording(
-            5000,
-            100.0,
-            lambda _: (
-                float(round(K * GRAVITY * UP[0])),
-                round(-1411.5 + rng.normal(0.0, 0.1)),
-                round(2353.5 + rng.normal(0.0, 0.1)),
-            ),
-        ),
-    )
+    level = np.array([round(K * GRAVITY * UP[0]), -1411.5, 2353.5])
+    samples = np.round(level + [0.0, 0.1, 0.1] * rng.standard_normal((5000, 3))).tolist()
+    stream(compensator, recording(5000, 100.0, lambda k: samples[k]))
     assert compensator.counters.n_out == 5000
 
 
@@ -164,12 +151,8 @@ def test_a_constant_axis_at_rest_is_stuck_if_its_noise_would_show(dead, rng):
 def test_no_sample_of_a_working_sensor_is_stuck_whatever_its_bandwidth(correlation, rng):
     compensator = Compensator(noisy_unit(3.0))
     n = 30_000
-    noise = lfilter(
-        [3.0 * math.sqrt(1.0 - correlation**2)],
-        [1.0, -correlation],
-        rng.normal(size=(n, 3)),
-        axis=0,
-    )
+    white = 3.0 * math.sqrt(1.0 - correlation**2) * rng.normal(size=(n, 3))
+    noise = lfilter([1.0], [1.0, -correlation], white, axis=0)
     table = np.round(K * GRAVITY * np.array(UP) + noise)
     stream(compensator, recording(n, 100.0, lambda k: tuple(table[k].tolist())))
     assert compensator.counters.n_stuck == 0
@@ -206,13 +189,10 @@ def test_samples_in_bursts_are_not_taken_for_too_fast(rng):
 def test_the_variance_of_samples_in_m_s2_is_proportional_to_their_rate(rng):
     unit = calibration(unit=Unit('T-1', 'm/s^2', 100.0, 0.01), axes=equal_axes(1.0))
     compensator = Compensator(unit)
-    rows, _ = stream(
-        compensator,
-        recording(8000, 400.0, lambda _: tuple(GRAVITY * u + rng.normal(0.0, 1e-3) for u in UP)),
-    )
+    samples = GRAVITY * np.array(UP) + 1e-3 * rng.standard_normal((8000, 3))
+    rows, _ = stream(compensator, recording(8000, 400.0, lambda k: tuple(samples[k])))
     assert len(rows) == 8000
-    # At four times the calibrated rate a sample averages 1/4 of the time and has 4 times the
-    # variance.
+    # At four times the calibrated rate a sample has 1/4 of the time, and 4 times the variance.
     assert rows[-1][3] / rows[0][3] == pytest.approx(4.0, rel=1e-6)
 
 

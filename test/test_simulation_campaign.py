@@ -33,13 +33,10 @@ def test_a_record_of_arrays_equals_a_run_of_simulate(kind):
     unit = triad(kind, 1)
     _, record = arrays(unit, [STATION, STATION], 3)
     run = simulate(unit, PROGRAM, STATION.up, rate_hz=4.0, seed=3001, start_ns=0)
-    np.testing.assert_array_equal(record.counts, run.counts)
-    np.testing.assert_array_equal(record.board, run.board)
-    np.testing.assert_array_equal(record.case, run.case)
-    np.testing.assert_array_equal(record.accel_stamp_ns, run.accel_stamp_ns)
-    np.testing.assert_array_equal(record.case_stamp_ns, run.case_stamp_ns)
-    np.testing.assert_array_equal(record.truth.specific_force, run.truth.specific_force)
-    np.testing.assert_array_equal(record.truth.scale_grid, run.truth.scale_grid)
+    for name in ('counts', 'board', 'case', 'accel_stamp_ns', 'case_stamp_ns'):
+        np.testing.assert_array_equal(getattr(record, name), getattr(run, name))
+    for name in ('specific_force', 'scale_grid'):
+        np.testing.assert_array_equal(getattr(record.truth, name), getattr(run.truth, name))
 
 
 @pytest.mark.parametrize('kind', TRIAD_NAMES)
@@ -63,23 +60,20 @@ def test_the_true_thermal_model_leaves_only_noise(kind):
 
 
 def test_plans_have_the_stated_durations_and_attitudes():
-    hours = {
-        name: sum(p.program.duration_s for p in plan(name, 1)) / 3600.0 for name in PLAN_NAMES
-    }
+    plans = {name: plan(name, 1) for name in PLAN_NAMES}
+    hours = {name: sum(p.program.duration_s for p in plans[name]) / 3600.0 for name in plans}
     expected = {
         'chamber-18': 171.0, 'chamber-9': 27.0, 'tumble': 6.0, 'tumble-3': 15.0, 'tumble-1': 9.0,
         'held-out': 3 * 26220 / 3600, 'centrifuge': 45.0, 'rate-table': 45.0,
     }  # fmt: skip
     assert hours == pytest.approx(expected, rel=1e-2)
-    for name in PLAN_NAMES:
-        ups = np.array([p.up for p in plan(name, 1)])
-        np.testing.assert_allclose(np.linalg.norm(ups, axis=1), 1.0)
-        assert np.any(ups != np.array([p.up for p in plan(name, 2)]))
+    ups = {name: np.array([p.up for p in stations]) for name, stations in plans.items()}
+    for name, up in ups.items():
+        np.testing.assert_allclose(np.linalg.norm(up, axis=1), 1.0)
+        assert np.any(up != np.array([p.up for p in plan(name, 2)]))
     # Between the chamber positions of plan tumble-3 the force on each axis varies by over 0.5 g.
-    assert np.ptp(np.array([p.up for p in plan('tumble-3', 1)][18:]), axis=0).min() > 0.5
-    fitted = np.array([p.up for p in plan('chamber-18', 1)])
-    held_out = np.array([p.up for p in plan('held-out', 1)])
-    assert (held_out @ fitted.T).max() < 0.999
+    assert np.ptp(ups['tumble-3'][18:], axis=0).min() > 0.5
+    assert (ups['held-out'] @ ups['chamber-18'].T).max() < 0.999
 
 
 def test_a_slipping_joint_has_a_closed_hysteresis_loop():
@@ -118,14 +112,10 @@ def test_a_saturated_effect_of_heat_flow_has_two_values():
 def test_a_switched_load_warms_its_part_by_the_steady_heat_balance():
     """A load that is off warms nothing; a load that stays on warms as in the heat balance."""
     unit = triad('own-lags', 1)
-    spell = 30_000.0
-    load = SwitchedLoad('board', 0.5, (spell, 1.0001 * spell))
-    loaded = replace(unit, load=load)
-    program = parse_cyclogram('20 16h')
-    on, off = (
-        simulate(model, program, STATION.up, rate_hz=0.1, temperature_rate_hz=0.01).truth
-        for model in (loaded, unit)
-    )
+    spell, rates = 30_000.0, {'rate_hz': 0.1, 'temperature_rate_hz': 0.01}
+    loaded = replace(unit, load=SwitchedLoad('board', 0.5, (spell, 1.0001 * spell)))
+    given = parse_cyclogram('20 16h'), STATION.up
+    on, off = (simulate(model, *given, **rates).truth for model in (loaded, unit))
     warmer = of_part(on, 'board') - of_part(off, 'board')
     np.testing.assert_allclose(warmer[: int(spell)], 0.0, atol=1e-9)
     # The load of 0.5 W flows through 0.4 W/K to the case, and from there to the air.
@@ -136,26 +126,21 @@ def test_a_switched_load_warms_its_part_by_the_steady_heat_balance():
 def test_a_chamber_program_is_read_from_text():
     program = parse_cyclogram('20 30min, 35@0.5 1h; -5.5@1.5\n-5.5 90s, 20')
     np.testing.assert_allclose(program.temperature_c, [20, 20, 35, 35, -5.5, -5.5, 20])
-    np.testing.assert_allclose(
-        np.diff(program.time_s), [1800, 30 * 60, 3600, 40.5 / 1.5 * 60, 90, 25.5 / 1.5 * 60]
-    )
+    steps_s = [1800, 30 * 60, 3600, 40.5 / 1.5 * 60, 90, 25.5 / 1.5 * 60]
+    np.testing.assert_allclose(np.diff(program.time_s), steps_s)
 
 
 @pytest.mark.parametrize(
     ('text', 'message'),
     [
         ('20, 35@', "step 2 '35@' must read TARGET"),
-        ('20@1, 30', "step 1 '20@1' must read"),
-        ('20, 30@0 5min', "step 2 '30@0 5min' must read"),
-        ('20, 30@0.00 5min', r"step 2 '30@0\.00 5min' must read"),
-        ('20, 30 5', "step 2 '30 5' must read"),
-        ('nan', "step 1 'nan' must read"),
-        ('oven', "step 1 'oven' must read"),
-        (' ,\n', 'cyclogram is empty'),
-        ('20', 'a ramp or a soak'),
+        *((f'20, {step}', f"step 2 '{step}' must read")
+          for step in ('30@0 5min', '30@0.00 5min', '30 5')),
+        *((step, f"step 1 '{step}' must read") for step in ('20@1', 'nan', 'oven')),
+        *((' ,\n', 'cyclogram is empty'), ('20', 'a ramp or a soak')),
         (f'20, {"9" * 400}', 'finite numbers'),
     ],
-)
+)  # fmt: skip
 def test_a_wrong_chamber_program_is_refused_with_the_step(text, message):
     with pytest.raises(ValueError, match=message):
         parse_cyclogram(text)
@@ -165,14 +150,12 @@ NAMES = (*UNIT_NAMES, *TRIAD_NAMES)
 
 
 def _static(unit, board):
-    still = []
+    network, still = unit.network, []
     for temperature in board:
-        parts = unit.network.equilibrium(unit.network.air_for('board', float(temperature)))
-        deviation = (parts - unit.origin)[None]
-        history = PartHistory(unit.network.nodes, deviation, unit.origin, 1.0)
+        parts = network.equilibrium(network.air_for('board', float(temperature)))
+        history = PartHistory(network.nodes, (parts - unit.origin)[None], unit.origin, 1.0)
         still.append(drift_of(unit.drift, history))
-    bias, scale = zip(*still, strict=True)
-    return np.concatenate(bias), np.concatenate(scale)
+    return map(np.concatenate, zip(*still, strict=True))
 
 
 @pytest.mark.parametrize('name', NAMES)

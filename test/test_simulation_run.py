@@ -31,10 +31,6 @@ def unit():
     return unit_preset('thermostatted', 4)
 
 
-def _joined(blocks, name, *, is_truth=False):
-    return np.concatenate([getattr(b.truth if is_truth else b, name) for b in blocks])
-
-
 @pytest.mark.parametrize('block_size', [1777, 6000, 10**6])
 @pytest.mark.parametrize('name', ['thermostatted', 'mems'])
 def test_a_run_in_blocks_equals_the_whole_run_bit_for_bit(name, block_size):
@@ -43,12 +39,11 @@ def test_a_run_in_blocks_equals_the_whole_run_bit_for_bit(name, block_size):
     whole = simulate(*arguments, **options)
     blocks = list(simulate_blocks(*arguments, block_size=block_size, **options))
     assert len(blocks) == -(-len(whole.counts) // block_size)
-    for column in COLUMNS:
-        np.testing.assert_array_equal(_joined(blocks, column), getattr(whole, column))
-    for column in CYCLES:
-        np.testing.assert_array_equal(
-            _joined(blocks, column, is_truth=True), getattr(whole.truth, column)
-        )
+    truths = [block.truth for block in blocks]
+    for parts, run, names in ((blocks, whole, COLUMNS), (truths, whole.truth, CYCLES)):
+        for column in names:
+            joined = np.concatenate([getattr(part, column) for part in parts])
+            np.testing.assert_array_equal(joined, getattr(run, column))
     # A block has the temperature readings up to the end of its last cycle.
     for block in blocks[:-1]:
         assert block.board_stamp_ns[-1] <= block.accel_stamp_ns[-1]
@@ -68,9 +63,8 @@ def test_stamps_are_the_ends_of_the_cycles(unit):
     assert len(run.counts) == SHORT.duration_s * 300
     assert run.accel_stamp_ns[0] == START_NS + 3_333_333
     assert run.accel_stamp_ns[-1] == START_NS + round(SHORT.duration_s * 1e9)
-    np.testing.assert_allclose(
-        (run.accel_stamp_ns - START_NS) * 1e-9 - run.truth.cycle_s, 0.5 / 300.0, atol=1e-9
-    )
+    since_s = (run.accel_stamp_ns - START_NS) * 1e-9
+    np.testing.assert_allclose(since_s - run.truth.cycle_s, 0.5 / 300.0, atol=1e-9)
 
 
 def test_a_further_error_source_does_not_change_the_random_numbers_of_other_sources(unit):
@@ -81,9 +75,9 @@ def test_a_further_error_source_does_not_change_the_random_numbers_of_other_sour
     np.testing.assert_array_equal(noisy.case, plain.case)
     np.testing.assert_array_equal(noisy.counts, plain.counts)
     still = simulate(replace(unit, drift=()), SHORT, UP)
-    moved = (plain.truth.bias - still.truth.bias) + (
-        plain.truth.scale - 1.0
-    ) * unit.scale_factor * (plain.truth.specific_force @ np.linalg.inv(unit.M).T)
+    force = plain.truth.specific_force @ np.linalg.inv(unit.M).T
+    moved = plain.truth.bias - still.truth.bias
+    moved = moved + (plain.truth.scale - 1.0) * unit.scale_factor * force
     difference = np.cumsum(plain.counts - still.counts, axis=0) - np.cumsum(moved, axis=0)
     # Both runs begin with the same rounding remainder, so sums of counts agree within one count.
     assert np.abs(difference).max() < 1.0 + 1e-6
@@ -109,14 +103,11 @@ def test_simulated_white_noise_has_the_stated_density(unit):
     # With a carried remainder, rounding noise rises with f^2, to 1 (ug)^2/Hz at f = 0.4 Hz.
     band = (frequency > 0.01) & (frequency < 0.4)
     # The mean of 128 spectral lines, each from 86 half-overlapping segments, is uncertain by 1 %.
-    np.testing.assert_allclose(
-        power[band].mean(axis=0), 2.0 * np.array(unit.noise_density) ** 2, rtol=0.05
-    )
+    density = np.array(unit.noise_density)
+    np.testing.assert_allclose(power[band].mean(axis=0), 2.0 * density**2, rtol=0.05)
     means = accel.reshape(-1, 3000, 3).mean(axis=1)
     # The sd of 240 means is uncertain by 4.6 %; the limit is three times 4.6 %.
-    np.testing.assert_allclose(
-        means.std(axis=0), np.array(unit.noise_density) / np.sqrt(60.0), rtol=0.15
-    )
+    np.testing.assert_allclose(means.std(axis=0), density / np.sqrt(60.0), rtol=0.15)
 
 
 @pytest.mark.parametrize('quantum', [0.0625, 1.0])
@@ -134,10 +125,8 @@ def test_simulated_thermometers_have_the_stated_rate_and_noise(unit, rate_hz):
     np.testing.assert_allclose(np.diff(run.case_stamp_ns) * 1e-9, 1.0 / rate_hz, atol=2e-9)
     assert run.case_stamp_ns[0] == START_NS
     assert run.board_stamp_ns[0] == START_NS + round(0.5e9 / rate_hz)
-    true = np.interp(
-        (run.case_stamp_ns - START_NS) * 1e-9, run.truth.grid_s, of_part(run.truth, 'case')
-    )
-    error = run.case - true
+    since_s = (run.case_stamp_ns - START_NS) * 1e-9
+    error = run.case - np.interp(since_s, run.truth.grid_s, of_part(run.truth, 'case'))
     # 540 readings (noise 5 mK) determine the mean to 0.2 mK, the sd to 3 %; limits: 5 sd.
     assert error.mean() == pytest.approx(0.0, abs=1.1e-3)
     assert error.std() == pytest.approx(0.005, rel=0.16)
@@ -159,14 +148,11 @@ def test_nine_or_more_positions_determine_nine_terms_of_a_quadric(n, least):
 
 
 def test_wrong_arguments_of_simulate_are_refused(unit):
-    with pytest.raises(ValueError, match='`rate_hz` must be positive, got 0'):
-        simulate(unit, SHORT, UP, rate_hz=0.0)
-    with pytest.raises(ValueError, match='`temperature_rate_hz` must be positive, got 0'):
-        simulate(unit, SHORT, UP, temperature_rate_hz=0.0)
+    for name, value in (('rate_hz', 0.0), ('temperature_rate_hz', 0.0), ('gravity', float('nan'))):
+        with pytest.raises(ValueError, match=f'`{name}` must be positive, got {value:g}'):
+            simulate(unit, SHORT, UP, **{name: value})
     with pytest.raises(ValueError, match='shorter than one conversion cycle of 1 s'):
         simulate(unit, Cyclogram((0.0, 0.5), (20.0, 20.0)), UP, rate_hz=1.0)
-    with pytest.raises(ValueError, match='`gravity` must be positive, got nan'):
-        simulate(unit, SHORT, UP, gravity=float('nan'))
 
 
 # Rounding error of closed solutions of a thermal network, at some 10 degC [K].
@@ -180,9 +166,8 @@ def response_of(network, time, air):
 def test_two_parts_follow_a_ramp_like_the_closed_solution():
     """The chain air - case - board, in which heat also flows from board to case."""
     c0, c1, g0, g1, rate = 700.0, 300.0, 3.0, 0.4, 1.0 / 60.0
-    network = ThermalNetwork(
-        {'case': c0, 'board': c1}, (Link(AIR, 'case', g0), Link('case', 'board', g1))
-    )
+    links = Link(AIR, 'case', g0), Link('case', 'board', g1)
+    network = ThermalNetwork({'case': c0, 'board': c1}, links)
     trace, determinant = -(g0 + g1) / c0 - g1 / c1, g0 * g1 / (c0 * c1)
     root = math.sqrt(trace * trace - 4.0 * determinant)
     modes = np.array([(trace + root) / 2.0, (trace - root) / 2.0])
@@ -233,18 +218,15 @@ def test_creep_decays_with_its_time_constant():
 
 def test_the_steady_state_obeys_the_heat_balance():
     """In the steady state the heat flow to the air is the power of all parts."""
-    unit = unit_preset('bare-quartz', 5)
-    warm = unit.network.equilibrium(12.0)
-    to_air = next(link for link in unit.network.links if AIR in (link.a, link.b))
-    case = warm[unit.network.nodes.index('case')]
-    assert to_air.conductance * (case - 12.0) == pytest.approx(sum(unit.network.power.values()))
-    response = response_of(unit.network, [0.0, 3600.0], [12.0, 12.0])
+    network = unit_preset('bare-quartz', 5).network
+    warm = network.equilibrium(12.0)
+    to_air = next(link for link in network.links if AIR in (link.a, link.b))
+    case, board = map(network.nodes.index, ('case', 'board'))
+    assert to_air.conductance * (warm[case] - 12.0) == pytest.approx(sum(network.power.values()))
+    response = response_of(network, [0.0, 3600.0], [12.0, 12.0])
     temperatures = response.temperatures(np.array([0.0, 1800.0, 3600.0]))
     np.testing.assert_allclose(temperatures, np.tile(warm, (3, 1)), atol=ROUNDING)
-    board = unit.network.nodes.index('board')
-    assert unit.network.equilibrium(unit.network.air_for('board', 20.0))[board] == pytest.approx(
-        20.0
-    )
+    assert network.equilibrium(network.air_for('board', 20.0))[board] == pytest.approx(20.0)
 
 
 def test_a_thermostat_keeps_its_part_within_0_2_k_by_the_power_that_leaks():

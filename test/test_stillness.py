@@ -50,9 +50,7 @@ def hover(rng, seconds, vibration):
 @pytest.mark.parametrize('with_gyro', [True, False])
 def test_no_rest_is_found_in_a_flight(rng, with_gyro):
     accel, gyro = hover(rng, 120.0, vibration=1.0)
-    with pytest.raises(
-        FitError, match=r'log: no still interval: the samples scatter by at least 9\d mg'
-    ):
+    with pytest.raises(FitError, match=r'log: no still interval: .* scatter by at least 9\d mg'):
         reduce_bag(source(accel, gyro if with_gyro else None), OPTIONS)
 
 
@@ -158,10 +156,6 @@ def look(rest, **keys):
     return find_jumps(bag)
 
 
-def test_no_jump_is_found_in_an_undisturbed_rest(rng):
-    assert look(Rest(rng)) == ()
-
-
 @pytest.mark.filterwarnings('error')
 @pytest.mark.parametrize('sd', [0.05, 0.1, 0.2, 0.5])
 def test_steps_of_a_coarse_converter_are_not_taken_for_jumps(rng, sd):
@@ -217,26 +211,32 @@ def test_a_turn_is_recognised_by_the_gyroscope(rng, seen):
     assert [round(event.time) for event in events] == ([] if seen else [250])
 
 
-def test_without_a_gyroscope_a_turn_is_not_taken_for_a_jump(rng):
-    rest = Rest(rng)
-    turned(rest, 250.0, 0.02, with_rate=False)
-    assert look(rest) == ()
+def changed_in_motion(rest, end, sd, step):
+    rows = (rest.time > 300.0) & (rest.time < end)
+    rest.accel[rows] += sd * rest.rng.standard_normal((rows.sum(), 3))
+    rest.add(np.array(step) * MG, from_s=0.5 * (300.0 + end))
+
+
+def drifting(rest):
+    # The bias changes by 2 mg/K, at up to 6 K/min.
+    rest.accel[:, 2] += 2.0 * MG * (rest.temperature(rest.time) - 20.0)
 
 
 @pytest.mark.parametrize(
-    ('end', 'sd', 'step'), [(312.0, 200.0 * MG, (50.0, 0, 0)), (360.0, GRAVITY, (0, 0, 20.0))]
+    'change',
+    [
+        lambda _: None,
+        lambda rest: rest.add((0.0, 0.0, 40.0 * MG), from_s=300.0, to_s=302.0),
+        lambda rest: changed_in_motion(rest, 312.0, 200.0 * MG, (50.0, 0, 0)),
+        lambda rest: changed_in_motion(rest, 360.0, GRAVITY, (0, 0, 20.0)),
+        lambda rest: turned(rest, 250.0, 0.02, with_rate=False),
+        drifting,
+    ],
+    ids=['none', 'for two seconds', 'in a motion', 'in a large motion', 'a turn', 'temperature'],
 )
-def test_a_change_during_a_motion_is_not_taken_for_a_jump(rng, end, sd, step):
+def test_no_change_but_a_lasting_one_at_rest_is_taken_for_a_jump(rng, change):
     rest = Rest(rng)
-    rows = (rest.time > 300.0) & (rest.time < end)
-    rest.accel[rows] += sd * rng.standard_normal((rows.sum(), 3))
-    rest.add(np.array(step) * MG, from_s=0.5 * (300.0 + end))
-    assert look(rest) == ()
-
-
-def test_a_disturbance_of_two_seconds_is_not_taken_for_a_jump(rng):
-    rest = Rest(rng)
-    rest.add((0.0, 0.0, 40.0 * MG), from_s=300.0, to_s=302.0)
+    change(rest)
     assert look(rest) == ()
 
 
@@ -246,13 +246,6 @@ def test_jumps_do_not_depend_on_the_lengths_of_blocks(rng):
     whole = look(rest)
     assert whole == look(rest, n_blocks=37)
     assert len(whole) == 1
-
-
-def test_drift_with_temperature_is_not_taken_for_a_jump(rng):
-    # The bias changes by 2 mg/K, at up to 6 K/min.
-    rest = Rest(rng)
-    rest.accel[:, 2] += 2.0 * MG * (rest.temperature(rest.time) - 20.0)
-    assert look(rest) == ()
 
 
 def behind_a_low_pass(rng, rest, tau_s, sd):

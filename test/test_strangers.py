@@ -215,14 +215,10 @@ def curved_unit():
 
 def test_the_scipy_cubic_fits_a_cubic_bias_and_constants_do_not():
     given = curved_unit()
-    fit, held = (
-        of_attitudes(given, np.linspace(5, 35, 7)),
-        of_attitudes(given, np.array([8.0, 29])),
-    )
-    cubic, constants = (
-        strangers.error_of([by_norm([fit], order=order)(held)], [held], is_drift=False)
-        for order in (3, 0)
-    )
+    fit = of_attitudes(given, np.linspace(5, 35, 7))
+    held = of_attitudes(given, np.array([8.0, 29]))
+    forces = (by_norm([fit], order=order)(held) for order in (3, 0))
+    cubic, constants = (strangers.error_of([force], [held], is_drift=False) for force in forces)
     # The scipy cubic neglects products of small terms, e.g. misalignment times bias, below 5 ug.
     assert cubic.vector < 5.0
     assert constants.vector > 50.0
@@ -259,14 +255,13 @@ def test_the_bias_score_is_error_over_bound_and_error_over_claimed_sd():
 
 def test_the_scipy_cubic_fits_the_drift_in_a_single_pose():
     given = replace(curved_unit(), scale_curve=ZEROS)
-    minutes_ = [
-        of_attitudes(given, board) for board in (np.linspace(5, 35, 31), np.array([9.0, 22]))
-    ]
-    fit, held = (
-        Minutes(bag.samples[: len(bag.board) // 18], bag.board[: len(bag.board) // 18],
-                bag.force[: len(bag.board) // 18])
-        for bag in minutes_
-    )  # fmt: skip
+
+    def one_pose(board):
+        bag = of_attitudes(given, board)
+        rows = slice(len(board))
+        return Minutes(bag.samples[rows], bag.board[rows], bag.force[rows])
+
+    fit, held = one_pose(np.linspace(5, 35, 31)), one_pose(np.array([9.0, 22]))
     error = strangers.error_of([by_drift([fit], 1.0, order=3)(held)], [held], is_drift=True)
     assert error.vector < 1e-6
 

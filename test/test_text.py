@@ -16,14 +16,8 @@ from builders import rich_calibration
 from hypothesis import given
 from hypothesis import strategies as st
 
+from thermo_comp import errors
 from thermo_comp.cli.app import run
-from thermo_comp.errors import (
-    CalibrationError,
-    FitError,
-    OutputError,
-    RecordingError,
-    ThermoCompError,
-)
 from thermo_comp.fitting import FitOptions, FitSource
 from thermo_comp.fitting.fit import check_serial
 from thermo_comp.recording.writer import BagWriter
@@ -49,10 +43,10 @@ def test_text_from_outside_is_printed_as_one_line_without_escape_sequences(text)
 def test_an_error_is_printed_as_one_line_without_escape_sequences():
     # WHY: paths, keys and topics in messages come from outside, and may contain escape sequences.
     for error in (
-        ThermoCompError(FORGED),
-        CalibrationError('cannot be read', FORGED, FORGED),
-        RecordingError('no such', Path('bag'), FORGED),
-        OutputError(FORGED, FORGED),
+        errors.ThermoCompError(FORGED),
+        errors.CalibrationError('cannot be read', FORGED, FORGED),
+        errors.RecordingError('no such', Path('bag'), FORGED),
+        errors.OutputError(FORGED, FORGED),
     ):
         assert str(error) == one_line(str(error))
         assert one_line(FORGED) in str(error)
@@ -65,7 +59,7 @@ def test_impossible_serials_are_refused(serial):
             take(serial)
     if serial:
         source = FitSource('bag', list, serial=serial)
-        with pytest.raises(FitError, match='must be one printable line'):
+        with pytest.raises(errors.FitError, match='must be one printable line'):
             check_serial([source], FitOptions(gravity=9.8))
 
 
@@ -77,10 +71,8 @@ def test_permitted_serials_are_accepted(serial):
 @pytest.mark.parametrize(
     'command',
     [
-        ('fit', 'x', '-o', 'y', '--gravity', '9.8'),
-        ('report', '-c', 'x', '-o', 'y'),
-        ('replay', 'x', '-c', 'y', '-o', 'z'),
-        ('import', 'x', '-o', 'y'),
+        *(('fit', 'x', '-o', 'y', '--gravity', '9.8'), ('report', '-c', 'x', '-o', 'y')),
+        *(('replay', 'x', '-c', 'y', '-o', 'z'), ('import', 'x', '-o', 'y')),
     ],
     ids=lambda command: command[0],
 )
@@ -106,22 +98,18 @@ def test_a_recording_forges_no_line(forged, tmp_path, capfd):
     save_calibration(rich_calibration(), tmp_path / 'unit.yaml')
     unit = ('-c', str(tmp_path / 'unit.yaml'))
     out = ('-o', str(tmp_path / 'out.yaml'))
-    for command in (
-        ('info', str(forged)),
-        ('info', str(forged), '--json'),
-        ('evaluate', str(forged), *unit),
-        ('replay', str(forged), *unit, *out),
-        ('fit', str(forged), *out, '--gravity', '9.8'),
+    for command, *words in (
+        *(('info',), ('info', '--json'), ('evaluate', *unit), ('replay', *unit, *out)),
+        ('fit', *out, '--gravity', '9.8'),
     ):
-        run([*command])
-        printed, errors = capfd.readouterr()
-        for line in (printed + errors).splitlines():
+        run([command, str(forged), *words])
+        printed, said = capfd.readouterr()
+        for line in (printed + said).splitlines():
             assert line.isprintable()
             assert not line.startswith('thermo_comp: error: forged')
-        if command[0] == 'info':
-            assert r'\x1b' in printed or r'\u001b' in printed
-            if '--json' in command:
-                assert json.loads(printed)['metadata']['serial'] == FORGED
+        assert command != 'info' or r'\x1b' in printed or r'\u001b' in printed
+        if '--json' in words:
+            assert json.loads(printed)['metadata']['serial'] == FORGED
 
 
 @pytest.mark.parametrize('encoding', ['latin-1', 'ascii', 'utf-8'])

@@ -38,10 +38,8 @@ def test_the_lag_is_unknown_at_the_start_and_known_after_some_time():
 
 
 def test_the_thermal_state_does_not_depend_on_earlier_queries():
-    tracker = ThermalTracker(DetectorSettings(), LAG)
-    other = ThermalTracker(DetectorSettings(), LAG)
-    t = np.arange(0, 3000)
-    board = 20.0 + 0.005 * t
+    tracker, other = (ThermalTracker(DetectorSettings(), LAG) for _ in range(2))
+    board = 20.0 + 0.005 * np.arange(3000)
     feed(tracker, board, board + 1.0)
     for k, celsius in enumerate(board.tolist()):
         other.read('board', k * SECOND_NS, celsius)
@@ -54,8 +52,7 @@ def test_the_thermal_state_does_not_depend_on_earlier_queries():
 
 def test_the_thermal_state_does_not_depend_on_the_origin_of_time():
     epoch_ns = 1_790_000_000 * SECOND_NS
-    tracker = ThermalTracker(DetectorSettings(), LAG)
-    other = ThermalTracker(DetectorSettings(), LAG)
+    tracker, other = (ThermalTracker(DetectorSettings(), LAG) for _ in range(2))
     board = 20.0 + 0.01 * np.arange(500)
     feed(tracker, board, board + 2.0)
     feed(other, board, board + 2.0, start_s=1_790_000_000)
@@ -77,19 +74,14 @@ def ramp(tracker):
     return np.array(weights)
 
 
-def test_the_dynamic_weight_is_linear_over_the_transition_time():
-    tracker = ThermalTracker(DetectorSettings(), None, ThermalConfig(transition_time_s=20.0))
-    weights = ramp(tracker)
+@pytest.mark.parametrize(('transition_s', 'n_steps'), [(20.0, 20), (0.0, 1)])
+def test_the_dynamic_weight_is_linear_over_the_transition_time(transition_s, n_steps):
+    config = ThermalConfig(transition_time_s=transition_s)
+    weights = ramp(ThermalTracker(DetectorSettings(), None, config))
     steps = np.diff(weights)
-    moving = steps[steps > 0.0]
-    assert len(moving) == 20
-    np.testing.assert_allclose(moving, 1.0 / 20.0, atol=1e-9)
-    assert weights[-1] == 1.0
-
-
-def test_a_transition_time_of_zero_switches_the_sets_at_once():
-    tracker = ThermalTracker(DetectorSettings(), None, ThermalConfig(transition_time_s=0.0))
-    assert set(ramp(tracker).tolist()) == {0.0, 1.0}
+    moving = steps[steps != 0.0]
+    np.testing.assert_allclose(moving, [1.0 / n_steps] * n_steps, atol=1e-9)
+    assert (weights[0], weights[-1]) == (0.0, 1.0)
 
 
 def test_the_gradient_follows_from_the_board_rate_if_the_case_sensor_is_lost():

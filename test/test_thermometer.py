@@ -63,9 +63,8 @@ def errors():
             rate = np.gradient(truth, t)
             thermometer = Thermometer(ThermometerSettings(noise, quantum, lag_s=LAG_S))
             out = run(thermometer, t, read(truth, noise, quantum, rng))
-            runs.append(
-                np.column_stack([t, (out[:, 0] - truth) ** 2, (out[:, 1] - rate) ** 2, out[:, 2:]])
-            )
+            squares = (out[:, 0] - truth) ** 2, (out[:, 1] - rate) ** 2
+            runs.append(np.column_stack([t, *squares, out[:, 2:]]))
         collected[name] = np.concatenate(runs)
     return collected
 
@@ -136,16 +135,13 @@ def test_equal_readings_each_minute_keep_the_error_below_1_5_quanta(quantum, lag
     assert np.abs(out[rows, 1] - 1.0 / 60.0).max(initial=0.0) < max(quantum, 0.3) / 60.0
 
 
-def test_the_estimate_of_a_constant_temperature_without_noise_is_exact():
+def test_the_estimate_of_a_constant_temperature_or_a_ramp_without_noise_is_exact():
     thermometer = Thermometer(ThermometerSettings())
     for k in range(100):
         assert thermometer.update(k * SECOND_NS, 20.25)
         assert (thermometer.temperature, thermometer.rate) == (20.25, 0.0)
         assert thermometer.acceleration[0] == 0.0
     assert type(thermometer.temperature) is float
-
-
-def test_the_estimate_of_a_ramp_without_noise_is_exact():
     # After minutes of readings the prior of the rate (sd 3 K/min) has no effect.
     thermometer = Thermometer(ThermometerSettings())
     for k in range(600):
@@ -155,36 +151,34 @@ def test_the_estimate_of_a_ramp_without_noise_is_exact():
     assert abs(thermometer.acceleration[0]) < 1e-7
 
 
-def test_the_prediction_step_equals_matrix_algebra():
-    rng = np.random.default_rng(0)
+UPPER = np.triu_indices(3)
+
+
+def drawn(rng):
+    """Draw the mean and the covariance of a state of three numbers."""
     root = rng.normal(size=(3, 3))
-    covariance = root @ root.T
-    mean = rng.normal(size=3)
+    return rng.normal(size=3), root @ root.T
+
+
+def test_the_prediction_step_equals_matrix_algebra():
+    mean, covariance = drawn(np.random.default_rng(0))
     dt, lag, power = 1.7, 50.0, 0.3
-    forward = np.array(
-        [[1.0, dt, dt**2 / 2.0], [0.0, 1.0, dt], [0.0, 0.0, 1.0 / (1.0 + dt / lag)]]
-    )
+    forward = np.array([[1.0, dt, dt**2 / 2.0], [0.0, 1.0, dt], [0.0, 0.0, 1 / (1.0 + dt / lag)]])
     wander = power * np.array([[dt**5 / 20.0, dt**4 / 8.0, dt**3 / 6.0],
                                [dt**4 / 8.0, dt**3 / 3.0, dt**2 / 2.0],
                                [dt**3 / 6.0, dt**2 / 2.0, dt]])  # fmt: skip
-    upper = np.triu_indices(3)
-    out = predict((*mean, *covariance[upper]), dt, lag, power)
+    out = predict((*mean, *covariance[UPPER]), dt, lag, power)
     np.testing.assert_allclose(out[:3], forward @ mean, rtol=1e-13)
-    np.testing.assert_allclose(
-        out[3:], (forward @ covariance @ forward.T + wander)[upper], rtol=1e-12
-    )
+    expected = forward @ covariance @ forward.T + wander
+    np.testing.assert_allclose(out[3:], expected[UPPER], rtol=1e-12)
 
 
 def test_the_correction_step_equals_matrix_algebra():
-    rng = np.random.default_rng(1)
-    root = rng.normal(size=(3, 3))
-    covariance = root @ root.T
-    mean = rng.normal(size=3)
-    upper = np.triu_indices(3)
-    out, innovation, spread = correct((*mean, *covariance[upper]), 5.0, 0.2)
+    mean, covariance = drawn(np.random.default_rng(1))
+    out, innovation, spread = correct((*mean, *covariance[UPPER]), 5.0, 0.2)
     gain = covariance[:, 0] / (covariance[0, 0] + 0.2)
     np.testing.assert_allclose(out[:3], mean + gain * (5.0 - mean[0]), rtol=1e-13)
-    np.testing.assert_allclose(out[3:], (covariance - np.outer(gain, covariance[0]))[upper])
+    np.testing.assert_allclose(out[3:], (covariance - np.outer(gain, covariance[0]))[UPPER])
     assert innovation == 5.0 - mean[0]
     assert spread == pytest.approx(covariance[0, 0] + 0.2)
 
@@ -192,18 +186,16 @@ def test_the_correction_step_equals_matrix_algebra():
 def test_a_blend_has_mean_and_covariance_of_the_mixture():
     rng = np.random.default_rng(2)
     states, samples = [], []
-    upper = np.triu_indices(3)
     for n in (300_000, 100_000):
-        root = rng.normal(size=(3, 3))
-        mean = rng.normal(size=3)
-        states.append((*mean, *(root @ root.T)[upper]))
-        samples.append(rng.multivariate_normal(mean, root @ root.T, n))
+        mean, covariance = drawn(rng)
+        states.append((*mean, *covariance[UPPER]))
+        samples.append(rng.multivariate_normal(mean, covariance, n))
     out, back = mix(*states, 0.25), mix(*states[::-1], 0.75)
     np.testing.assert_allclose(back, out, rtol=1e-12)
     mixed = np.concatenate(samples)
     # 400 000 samples determine the covariances to 1 %.
     np.testing.assert_allclose(out[:3], mixed.mean(axis=0), atol=0.02)
-    np.testing.assert_allclose(out[3:], np.cov(mixed.T)[upper], atol=0.1)
+    np.testing.assert_allclose(out[3:], np.cov(mixed.T)[UPPER], atol=0.1)
 
 
 @pytest.mark.parametrize(
@@ -310,14 +302,13 @@ def test_reset_removes_the_effect_of_all_readings():
     assert thermometer.temperature == 30.0
 
 
+STEPS = st.integers(1, 400 * SECOND_NS)
+
+
 @settings(max_examples=60, deadline=None)
 @given(
     quantum=st.sampled_from([0.0, 0.0625, 1.0]),
-    rows=st.lists(
-        st.tuples(st.integers(1, 400 * SECOND_NS), st.floats(-80.0, 150.0)),
-        min_size=1,
-        max_size=60,
-    ),
+    rows=st.lists(st.tuples(STEPS, st.floats(-80.0, 150.0)), min_size=1, max_size=60),
 )
 def test_estimates_after_any_readings_are_finite_with_a_valid_covariance(quantum, rows):
     thermometer = Thermometer(ThermometerSettings(0.01, quantum))
@@ -326,9 +317,7 @@ def test_estimates_after_any_readings_are_finite_with_a_valid_covariance(quantum
         stamp_ns += step_ns
         value = round(reading / quantum) * quantum if quantum else reading
         thermometer.update(stamp_ns, value)
-        assert math.isfinite(thermometer.temperature)
-        assert math.isfinite(thermometer.rate)
-        assert 0.0 < thermometer.var_temperature < math.inf
-        assert 0.0 < thermometer.var_rate < math.inf
-        assert 0.0 < thermometer.acceleration[1] < math.inf
+        assert np.isfinite([thermometer.temperature, thermometer.rate]).all()
+        variances = thermometer.var_temperature, thermometer.var_rate, thermometer.acceleration[1]
+        assert all(0.0 < variance < math.inf for variance in variances)
         assert thermometer.at(stamp_ns + 10**8)[2] > 0.0

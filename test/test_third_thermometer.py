@@ -38,10 +38,8 @@ LOAD_K = 5.0
 
 
 def unit_with_a_lid():
-    network = ThermalNetwork(
-        {'case': 800.0, 'board': 120.0, 'lid': 60.0},
-        (Link(AIR, 'case', 4.0), Link('case', 'board', 0.4), Link('case', 'lid', 0.1)),
-    )
+    links = Link(AIR, 'case', 4.0), Link('case', 'board', 0.4), Link('case', 'lid', 0.1)
+    network = ThermalNetwork({'case': 800.0, 'board': 120.0, 'lid': 60.0}, links)
     drift = (PartEffect('board', bias=(6.0, 4.0, -8.0)), PartEffect('lid', bias=LID_UG_K))
     load = SwitchedLoad('lid', 0.1 * LOAD_K)
     return replace(unit_preset('bare-quartz', 1), network=network, drift=drift, load=load)
@@ -69,11 +67,8 @@ def fitted(bags):
 
 @pytest.fixture(scope='module')
 def runs():
-    unit = unit_with_a_lid()
-    return [
-        simulate(unit, PROGRAM, up, rate_hz=2.0, temperature_rate_hz=0.25, seed=number)
-        for number, up in enumerate(positions(4, 1))
-    ]
+    unit, rates = unit_with_a_lid(), {'rate_hz': 2.0, 'temperature_rate_hz': 0.25}
+    return [simulate(unit, PROGRAM, up, seed=k, **rates) for k, up in enumerate(positions(4, 1))]
 
 
 @pytest.mark.slow
@@ -92,9 +87,8 @@ def test_a_third_thermometer_reduces_the_error_to_the_noise(runs, tmp_path):
     for sees_lid, tried in ((False, replace(calibration, response=blind)), (True, calibration)):
         output = tmp_path / f'{sees_lid}.mcap'
         replay(held_out, tried, output)
-        corrected = read_recording(
-            output, Topics(imu='imu/data_raw', input='imu'), require=('accel',)
-        ).columns
+        topics = Topics(imu='imu/data_raw', input='imu')
+        corrected = read_recording(output, topics, require=('accel',)).columns
         truth = runs[-1].truth
         index = np.searchsorted(runs[-1].accel_stamp_ns, corrected.accel_stamp_ns)
         error = corrected.accel - truth.specific_force

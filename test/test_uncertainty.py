@@ -124,9 +124,8 @@ def test_the_claimed_sd_covers_thermometer_errors_for_parts_that_lag_the_board(f
     per_kelvin, axis = 30.0, axis_set((0.0, 30.0))
     part = term('board', (-per_kelvin, 0.0, 0.0), tau_s=600.0)
     parts = regime_set(x=axis, rate_range_k_min=(-5.0, 5.0))
-    compensator = Compensator(
-        calibration(static=parts, dynamic=parts, response=(part,), board_lag_s=60.0), UNCHECKED
-    )
+    unit = calibration(static=parts, dynamic=parts, response=(part,), board_lag_s=60.0)
+    compensator = Compensator(unit, UNCHECKED)
     of_part, errors, sds = 20.0, [], []
     for second in range(3600):
         stamp = 10**12 + second * SECOND_NS
@@ -196,11 +195,9 @@ def sd_at(unit, board, behind=0.0, force=0.0):
 def test_beyond_the_range_curve_and_lag_do_not_cancel_in_the_claimed_sd():
     # Inside the range the slopes of curve and lag over board temperature cancel. Outside of the
     # range the sum of both slopes is unknown, so the claimed sd is that of the curve alone.
-    bias = axis_set((0.0, 0.5), residual_sd_m_s2=1e-6)
-    unit = calibration(
-        static=regime_set(bias), dynamic=regime_set(bias),
-        response=(term('board', (-0.5, 0.0, 0.0), tau_s=600.0),),
-    )  # fmt: skip
+    parts = regime_set(axis_set((0.0, 0.5), residual_sd_m_s2=1e-6))
+    lag = term('board', (-0.5, 0.0, 0.0), tau_s=600.0)
+    unit = calibration(static=parts, dynamic=parts, response=(lag,))
     assert sd_at(unit, 35.0) == pytest.approx(1e-6, rel=1e-6)
     # The board is at 41 degC, 6 K above the range of 20 +- 15 degC.
     far = math.sqrt(1.0 + (6.0 / 15.0) ** 2)
@@ -231,9 +228,8 @@ def test_beyond_the_range_curves_follow_their_tangent_for_a_quarter_of_the_range
     static, dynamic = axis_set(BENT, (1.0, 1e-4, 2e-6)), axis_set(WAVY, (1.0, 5e-5), delta=2.0)
     unit = calibration(static=regime_set(static), dynamic=regime_set(dynamic))
     for edge, sign in ((35.0, 1.0), (5.0, -1.0)):
-        at_edge, *outside = np.moveaxis(
-            curves_at(unit, edge + sign * np.array([0.0, 1e-9, 3.0, 7.5, 7.5 + 1e-9, 300.0])), 2, 0
-        )
+        celsius = edge + sign * np.array([0.0, 1e-9, 3.0, 7.5, 7.5 + 1e-9, 300.0])
+        at_edge, *outside = np.moveaxis(curves_at(unit, celsius), 2, 0)
         t = edge - 20.0
         slopes = [
             [np.polynomial.Polynomial(c).deriv()(t) for c in rows]
@@ -278,11 +274,9 @@ def test_the_sd_beyond_the_range_includes_every_parameter_of_the_tangents(rng):
     states = np.zeros((StateLayout(Correction(unit).memory).width, 9))
     states[BOARD] = -40.0, -5.0, 3.0, 20.0, 33.0, 36.0, 42.0, 43.0, 90.0
     states[WEIGHT] = 0.0, 1.0, 0.3, 0.5, 1.0, 0.3, 0.0, 0.7, 1.0
-    moved, nominal = (
-        Correction(each).bias_scale(states) for each in (drawn(unit, layout, change), unit)
-    )
     regressors = Correction(unit).curves.regressors(states, np.zeros((0, 9)))
-    moved_by = moved - nominal
+    moved_by = Correction(drawn(unit, layout, change)).bias_scale(states)
+    moved_by -= Correction(unit).bias_scale(states)
     moved_by[1] /= 300.0
     for axis in range(3):
         for block, of, row in (
@@ -340,11 +334,9 @@ def test_the_distance_of_a_squared_column_from_its_range_is_that_of_its_quantity
 
 
 def test_a_lagged_temperature_outside_the_range_increases_the_claimed_sd():
-    bent = axis_set((0.0, 0.5, 0.01), residual_sd_m_s2=1e-6)
-    unit = calibration(
-        static=regime_set(bent), dynamic=regime_set(bent),
-        response=(term('board', (-0.5, 0.0, 0.0), tau_s=600.0),),
-    )  # fmt: skip
+    bent = regime_set(axis_set((0.0, 0.5, 0.01), residual_sd_m_s2=1e-6))
+    lag = term('board', (-0.5, 0.0, 0.0), tau_s=600.0)
+    unit = calibration(static=bent, dynamic=bent, response=(lag,))
     # The board is at 33 degC, inside the range of 5 to 35 degC. A part at 34 degC adds no
     # variance; a part at 41 degC does.
     assert sd_at(unit, 33.0, behind=-1.0) == pytest.approx(1e-6, rel=1e-6)

@@ -59,18 +59,14 @@ class Running:
 
 
 def test_rclpy_has_the_undocumented_attributes_in_use():
-    methods = {
-        'WaitSet': (
-            *('clear_entities', 'add_subscription', 'add_guard_condition', 'add_service'),
-            *('wait', 'is_ready'),
-        ),
-        'Subscription': ('take_message', 'pointer', 'get_publisher_count'),
-        'Service': ('service_take_request',),
-        'Publisher': ('publish_raw',),
-    }
-    for kind, names in methods.items():
-        missing = [n for n in names if not hasattr(getattr(rclpy_implementation, kind), n)]
-        assert not missing, f'rclpy._rclpy.{kind} has lost {missing}'
+    for path in (
+        *(f'WaitSet.{name}' for name in ('clear_entities', 'add_subscription', 'add_service')),
+        *('WaitSet.add_guard_condition', 'WaitSet.wait', 'WaitSet.is_ready'),
+        *('Subscription.take_message', 'Subscription.pointer', 'Subscription.get_publisher_count'),
+        *('Service.service_take_request', 'Publisher.publish_raw'),
+    ):
+        kind, name = path.split('.')
+        assert hasattr(getattr(rclpy_implementation, kind), name), f'rclpy._rclpy lost {path}'
     assert issubclass(rclpy_implementation.RCLError, RuntimeError)
     assert issubclass(RCLError, Exception)
 
@@ -170,8 +166,7 @@ def test_qos_of_a_subscription_can_be_overridden(node):
     loop.subscribe(Vector3Stamped, 'others', qos)
     # rclpy writes overrides into the given QoS profile, so each subscription needs a copy.
     assert qos.depth == 7
-    depth = node.get_parameter('qos_overrides./samples.subscription.depth')
-    assert depth.value == 7
+    assert node.get_parameter('qos_overrides./samples.subscription.depth').value == 7
     reliability = node.get_parameter('qos_overrides./samples.subscription.reliability')
     assert ReliabilityPolicy[reliability.value.upper()] is ReliabilityPolicy.RELIABLE
 
