@@ -152,6 +152,11 @@ invalid `calibration_file` is refused in the response, with the reason, and the 
 coefficients of a calibration are not parameters: parameters arrive one at a time, and a polynomial that mixes old and new
 coefficients gives a wrong correction.
 
+If lags, play operators and `detector` of the new calibration equal those of the running calibration, as after `update`, the
+estimates of temperatures and regime go on. With a calibration of a new fit these estimates restart from the last
+temperatures: after a reload in a ramp the output may step, with a larger covariance until `memory settled` in `/diagnostics`
+is True. Load a calibration of a new fit when the temperature has been constant for an hour.
+
 ```console
 $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 ```
@@ -175,7 +180,7 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | case readings that repeat those of the board (one topic for both), ten changed readings in a row | the readings are used; the gradient expected of the case adds to the covariance, WARN |
 | a sample whose stamp goes back by a second or more, after the force at rest has refuted the calibration | nothing is published until the force at rest agrees with gravity in two windows, ERROR |
 | a board temperature that leads the case temperature in ramps (swapped topics) | the covariance is increased, ERROR |
-| counts constant for `stuck_timeout`, on all axes or on one axis while the others change or show their noise; samples of three zeros | dropped, counted, ERROR |
+| counts constant for `stuck_timeout` and more than 50 samples, on all axes or on one axis while the others change or show their noise; samples of three zeros | dropped, counted, ERROR |
 | counts that come faster than their conversion cycle | dropped, counted, ERROR |
 | a magnitude of the specific force at rest that differs from gravity by more than `gravity_tolerance`, also a smooth acceleration that turns the force by over 3 degrees or follows a rest after over 60 s of motion | nothing is published, ERROR |
 | a constant force along the force at the last rest but larger or smaller, after motion, as in a coordinated turn | published: the platform accelerates |
@@ -185,7 +190,7 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | a temperature stamped more than 5 s after the next reading of the same thermometer | the reading is not used |
 | a sample whose stamp repeats, or goes back by less than a second | dropped, counted |
 | a sample stamped more than 15 s (or ten cycles, if longer) after the last sample, until a reading or a second sample confirms the time | dropped, counted |
-| a sample whose stamp goes back by a second or more | all estimators restart, which is reported once |
+| a sample whose stamp goes back by a second or more | dropped, counted, until a second sample confirms the time; then all estimators restart, which is reported once |
 
 [Faults](faults.md) lists every fault with its test.
 """

@@ -262,7 +262,8 @@ def test_a_jump_back_in_time_does_not_restore_a_refuted_calibration(rng, is_mend
         assert compensator.counters.n_out - n_out == pytest.approx(4500, abs=200)
     else:
         assert compensator.counters.n_out == n_out
-        assert compensator.counters.n_refuted == n_refuted + 6000
+        # The first sample that jumps back is dropped as out of order.
+        assert compensator.counters.n_refuted == n_refuted + 5999
 
 
 NOISE_SD = 2e-3

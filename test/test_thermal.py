@@ -97,6 +97,17 @@ def test_the_gradient_follows_from_the_board_rate_if_the_case_sensor_is_lost():
     assert math.sqrt(state[VAR_GRADIENT]) >= LOST_GRADIENT_RELATIVE_SD * 5.9
 
 
+def test_the_lagged_gradient_of_a_sensor_without_readings_follows_the_board():
+    # WHY: without any reading of the case the lag of the gradient was the gradient itself, an
+    # error of 3 claimed sds. Behind a lag of 500 s a ramp of 1 K/min has a gradient of 8.3 K.
+    spec = MemorySpec(lags=(('case', 600.0),))
+    tracker = ThermalTracker(DetectorSettings(), spec, board_lag_s=500.0)
+    feed(tracker, 20.0 + np.maximum(np.arange(1301) - 1000.0, 0.0) / 60.0)
+    state = tracker.sample(1300 * SECOND_NS)
+    expected = 500.0 / 60.0 * (1.0 - math.exp(-0.5))
+    assert state[StateLayout(spec).places[spec.lags[0]]] == pytest.approx(expected, rel=0.1)
+
+
 def test_the_rate_of_a_lost_sensor_is_that_of_the_board():
     spec = MemorySpec(rates=('case',))
     tracker = ThermalTracker(DetectorSettings(), spec, ThermalConfig(case_timeout_s=10.0))

@@ -266,7 +266,10 @@ def play(
     context: typer.Context,
     bag: Path = _BAG,
     rate: float = option(
-        'Speed relative to real time; 0: as fast as the subscribers read.', 1.0, min=0.0
+        'Speed relative to real time; 0: as fast as reliable subscribers receive. A subscriber '
+        'that processes fewer messages per second then loses messages.',
+        1.0,
+        min=0.0,
     ),
     wait: float = option('Longest wait until every topic has a subscriber, in s.', 10.0, min=0.0),
     topics: Any = options.reading,
@@ -286,7 +289,7 @@ def play(
       thermo_comp play chamber.mcap --ros-args -r __ns:=/imu0
     """
     if not rate < float('inf'):
-        raise options.usage('--rate must be finite; 0 plays as fast as the subscribers read')
+        raise options.usage('--rate must be finite; 0 plays as fast as the subscribers receive')
     options.require_ros()
     from ..ros.player import play as run
 

@@ -43,7 +43,7 @@ UNMEASURED_SD_K: Final = 10.0
 class SlowState(NamedTuple):
     """
     Arguments of the variance due to parameters and initial lag states: thermal state, remaining
-    shares of the unknown initial lag states, largest rate of the board since the start [K/s].
+    shares of the unknown initial lag states, board rate of a ramp at the start [K/s].
     """
 
     state: tuple[float, ...]
@@ -169,9 +169,11 @@ class ThermalSide:
         self._forget_samples()
 
     def push(self, name: str, stamp_ns: int, celsius: float) -> None:
-        """Queue a reading, if the calibration has a thermometer of this name."""
-        if name in self.inputs:
-            self._count_rejected(name, self.queue.push(name, stamp_ns, celsius))
+        """Queue a reading; ValueError if the calibration has no thermometer of this name."""
+        if name not in self.inputs:
+            text = f'{name!r} is not a thermometer of the calibration, which has '
+            raise ValueError(text + ', '.join(self.inputs))
+        self._count_rejected(name, self.queue.push(name, stamp_ns, celsius))
 
     def _apply(self, name: str, stamp_ns: int, celsius: float) -> None:
         self._n_applied += 1

@@ -108,8 +108,8 @@ class NodeConfig:
     stuck_timeout: float = _parameter(
         _DEFAULTS.stuck_timeout_s,
         'Longest repetition of equal readings that is published [s], on all axes, or on one axis '
-        'while the others change or show noise. Samples of three zeros are dropped at once. 0: '
-        'repetitions and zeros are published.',
+        'while the others change or show noise; at least 50 repetitions are published. Samples of '
+        'three zeros are dropped at once. 0: repetitions and zeros are published.',
         (0.0, 3600.0),
     )
     local_gravity: float = _parameter(

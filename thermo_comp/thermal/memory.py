@@ -137,15 +137,16 @@ class ThermalMemory:
         self._needs_sensors = any(play.inputs != (BOARD_INPUT,) for play in spec.plays)
         self._widths = [play.width_k for play in spec.plays]
         self._held: list[float] = []
-        #: Largest rate of the board temperature since the start, less two sd [K/s].
-        self.start_rate = 0.0
+        #: Largest rate of the board temperature within its lag after the start [K/s]; largest
+        #: rate less two sd, which `start_rate` is at least.
+        self.start_rate = self.sure_rate = 0.0
 
     def forget(self) -> None:
         """Forget all inputs; the next board temperature sets each play equal to its input."""
         for bank in self.banks.values():
             bank.forget()
         self._held = []
-        self.start_rate = 0.0
+        self.start_rate = self.sure_rate = 0.0
 
     def forget_input(self, name: str) -> None:
         """Forget the gradient of a sensor or, for the board, all inputs."""

@@ -134,13 +134,20 @@ class ThermalTracker:
             leading, _ = self._gradient(name, stamp_ns, board.temperature, board.rate)
             error = sqrt(self._board_error(leading))
             memory.board_step(stamp_ns, board.temperature, error)
-            rate = abs(board.rate) - 2.0 * sqrt(board.var_rate)
-            memory.start_rate = max(memory.start_rate, rate)
+            age_s = (stamp_ns - (memory.board.start_ns or 0)) * 1e-9
+            if age_s <= self._board_lag_s:
+                # Within `_board_lag_s` the board's rate shows a ramp that began before the start.
+                rate = abs(board.rate)
+                memory.sure_rate = max(memory.sure_rate, rate - 2.0 * sqrt(board.var_rate))
+                memory.start_rate = max(memory.sure_rate, rate)
+            # A sensor without any reading counts as lost once the time-out has passed.
+            is_young = age_s <= self.config.case_timeout_s
             for name, bank in memory.banks.items():
                 sensor = self.thermometers[name]
-                if sensor is board or not bank.taus or bank.stamp_ns is None:
+                if sensor is board or not bank.taus:
                     continue
-                if not self.is_live(stamp_ns, sensor):
+                is_first = bank.stamp_ns is None and is_young
+                if not (is_first or self.is_live(stamp_ns, sensor)):
                     # The sensor is lost: update the lags of its gradient with an estimate.
                     gradient, variance = self._lost_gradient(name, stamp_ns, board.rate)
                     bank.step(stamp_ns, gradient, sqrt(variance))

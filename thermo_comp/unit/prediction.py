@@ -39,10 +39,18 @@ class SlowUncertainty:
         self._root = start_root(lags)
         edges = [edge for part in calibration.regime_sets() for edge in part.temperature_range_c]
         self._span = max(edges) - min(edges)
-        #: For each lag: lag [K] / rate of the board temperature [K/s] in a long ramp.
+        #: Lag [K] / rate of the board temperature [K/s], (2, n_lags): lags of the board in a long
+        #: ramp; lags of gradients after the gradients' change at the onset of a ramp.
         self._behind_s = np.array([
-            sum(w * tau for (of, tau), w in lag.first_order_weights.items() if of == BOARD_INPUT)
-            for lag in lags
+            [
+                sum(
+                    w * (tau if is_of_board else calibration.board_lag_s)
+                    for (of, tau), w in lag.first_order_weights.items()
+                    if (of == BOARD_INPUT) is is_of_board
+                )
+                for lag in lags
+            ]
+            for is_of_board in (True, False)
         ])  # fmt: skip
         layout, posterior = parameter_layout(calibration), calibration.posterior
         matrix, diagonal = np.zeros((layout.n_parameters, 0)), np.zeros(layout.n_parameters)
@@ -63,15 +71,13 @@ class SlowUncertainty:
         """
         Evaluate the rows of the error covariance (see `unit.covariance`) at thermal states, shape
         (width, n). `start_shares`, (n_lags, n): share of each lag's initial state that remains;
-        `start_rates`, (n,): largest board rate since the start, if above the present rate [K/s].
+        `start_rates`, (n,): board rate of a ramp at the start [K/s]; None: the present rate.
         Returns `Correction.n_slow` rows: a, b, c of each axis' error variance ``v(x) = a + b x + c
         x^2`` [m^2/s^4], then the covariances of the pairs of errors in `BETWEEN`, then the
         contributions of a nonlinearity to the coefficients of x^2 to x^6 of v(x).
         """
         cuts = range(_CHUNK, states.shape[1], _CHUNK)
-        rates = np.abs(states[RATE])
-        if start_rates is not None:
-            rates = np.maximum(rates, start_rates)
+        rates = np.abs(states[RATE]) if start_rates is None else start_rates
         arrays = states, start_shares, rates
         parts = zip(*(np.split(array, cuts, -1) for array in arrays), strict=True)
         return np.hstack([self._at(*part) for part in parts])
@@ -79,19 +85,19 @@ class SlowUncertainty:
     def of_start(self, states: Floats, start_shares: Floats, rates: Floats) -> Floats:
         """
         Differentiate bias [input units] and scale [relative] w.r.t. the unknown initial lag
-        states, as variables of unit variance, shape (n_unknown, 6, n). `rates`: largest known
-        rate of the board temperature since the start, (n,) [K/s].
+        states, as variables of unit variance, shape (n_unknown, 6, n). `rates`: board
+        rate of a ramp at the start, (n,) [K/s].
         """
         table = self._correction.table
         factors, _ = table.factors(states[BOARD], states[WEIGHT])
         by_pair = self._correction.by_pairs(table.slopes(states)[0] * factors)
         moved = by_pair[self._correction.layout.lag_pairs] * start_shares[:, np.newaxis]
-        # The unit may have been started in a ramp: the sd of each lag at the start is its value in
-        # a long ramp at the largest rate since the start, limited to the calibrated span.
-        behind = hold(self._behind_s[:, np.newaxis] * rates, -self._span, self._span)
-        in_ramp = in_order(moved * behind[:, np.newaxis], 0)
+        # The unit may have been started in a ramp, long or new: the sd of each lag at the start is
+        # its value in a ramp of this rate, within the calibrated span.
+        behind = hold(self._behind_s[:, :, np.newaxis] * rates, -self._span, self._span)
+        in_ramp = in_order(moved * behind[:, :, np.newaxis], 1)
         by_root = in_order(self._root[:, :, np.newaxis, np.newaxis] * moved[:, np.newaxis], 0)
-        return np.concatenate((by_root, in_ramp[np.newaxis]))
+        return np.concatenate((by_root, in_ramp))
 
     def _at(self, states: Floats, start_shares: Floats, rates: Floats) -> Floats:
         of_start = self.of_start(states, start_shares, rates)
