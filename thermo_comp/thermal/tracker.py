@@ -135,8 +135,8 @@ class ThermalTracker:
             error = sqrt(self._board_error(leading))
             memory.board_step(stamp_ns, board.temperature, error)
             age_s = (stamp_ns - (memory.board.start_ns or 0)) * 1e-9
-            if age_s <= self._board_lag_s:
-                # Within `_board_lag_s` the board's rate shows a ramp that began before the start.
+            if age_s <= max(self._board_lag_s, board.settings.lag_s):
+                # Within a lag the rate of the board shows a ramp that began before the start.
                 rate = abs(board.rate)
                 memory.sure_rate = max(memory.sure_rate, rate - 2.0 * sqrt(board.var_rate))
                 memory.start_rate = max(memory.sure_rate, rate)
