@@ -248,6 +248,17 @@ def test_jumps_do_not_depend_on_the_lengths_of_blocks(rng):
     assert len(whole) == 1
 
 
+def test_a_steep_curve_over_temperature_is_not_taken_for_a_jump(rng):
+    # WHY: a fit refused bags in which the reading changed by 15 mg over 0.2 K, within 4 s.
+    for _ in range(4):
+        rest = Rest(rng)
+        curve = np.tanh((rest.temperature(rest.time) - 25.0) / 0.1)
+        rest.accel[:, 2] += 7.5 * MG * curve
+        assert look(rest) == ()
+    rest.add((0.0, 0.0, 15.0 * MG), from_s=301.0)
+    assert [round(event.time) for event in look(rest)] == [301]
+
+
 def behind_a_low_pass(rng, rest, tau_s, sd):
     """Replace the noise by first-order noise with time constant `tau_s` and sd `sd`."""
     r = np.exp(-1.0 / (rest.rate_hz * tau_s))

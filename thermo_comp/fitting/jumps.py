@@ -7,7 +7,8 @@ The reading of a sensor can step within one sample, if a die relaxes or a piece 
 temperature does not step, so no function of temperature describes a jump, and a fit to data across
 a jump gives a wrong curve. A jump differs from a rotation of the unit in two ways: the samples
 before and after a jump scatter no more than at rest; and either the norm of the reading, which is
-almost constant in a rotation, changes, or a gyroscope measures no rotation during the jump.
+almost constant in a rotation, changes, or a gyroscope measures no rotation during the jump. A
+steep curve over temperature changes the reading more slowly than a jump.
 
 If a sensor has a low-pass filter, neighbouring samples have a correlation r, and the slow noise of
 the samples hides a step. The noise of the differences ``a_i - r a_(i-1)`` is white (generalised
@@ -140,7 +141,7 @@ def _examine(
         is_step &= np.abs(lasting) > 4.0 * lasting_sd
     else:
         is_step = np.abs(lasting) > _STEP_SDS * lasting_sd
-    if not is_step.any():
+    if not is_step.any() or _is_gradual(time, accel, (at, r), sd, bag):
         return None
     sides = accel[:at], accel[at:]
     # Differences of neighbouring samples give the noise without the drift.
@@ -163,6 +164,29 @@ def _examine(
     return Jump(float(time[at]), float(time[at] - time[at - 1]), (x, y, z), along, *warmed)
 
 
+def _is_gradual(
+    time: Floats, accel: Floats, place_and_colour: tuple[int, float], sd: Floats, bag: ReducedBag
+) -> bool:
+    """
+    Whether a change over 0.1 K or more of the board temperature explains the samples better than a
+    step: by a factor of e^2 in likelihood. A steep curve over temperature changes so in a ramp.
+    """
+    (at, r), sd = place_and_colour, np.maximum(sd, 1e-9)
+    board_s, board = _readings(bag, time[0], time[-1])
+    if len(board) < _FEWEST_SAMPLES:
+        return False
+    rate = abs(float(np.polyfit(board_s - time[at], board, 1)[0]))
+    chi2 = []
+    duration_s = 0.1 / max(rate, 1e-9)
+    while 2.0 * duration_s < time[-1] - time[0]:
+        for middle in time[at] + duration_s * np.array([-0.25, 0.0, 0.25]):
+            residual = _step(time, accel, float(middle), r, duration_s)[2]
+            chi2.append(np.sum((residual / sd) ** 2))
+        duration_s *= 2.0
+    of_step = np.sum((_step(time, accel, time[at], r)[2] / sd) ** 2)
+    return bool(min(chi2, default=np.inf) < of_step - 4.0)
+
+
 def _correlation(residual: Floats, sd: Floats) -> Floats:
     """Return the sd of a mean residual over its sd for white noise `sd`, at least 1, (3,)."""
     # A lag-1 correlation r of the means of 40 pieces multiplies the variance of the mean of all
@@ -179,13 +203,18 @@ def _correlation(residual: Floats, sd: Floats) -> Floats:
 
 def _temperature_step(bag: ReducedBag, begin: float, at: float, end: float) -> tuple[float, float]:
     """Estimate the step of the board temperature at the time `at`, and the sd of the step [K]."""
-    time = np.asarray(bag.board.stamp_ns - bag.start_ns, dtype=np.float64) * 1e-9
-    use = (time >= begin) & (time <= end)
-    time, value = time[use], bag.board.value[use]
+    time, value = _readings(bag, begin, end)
     if min(np.sum(time < at), np.sum(time >= at)) < _FEWEST_SAMPLES:
         return np.nan, np.nan
     (step,), relative_sd, residual = _step(time, value[:, None], at)
     return float(step), relative_sd * float(np.sqrt(np.sum(residual**2) / (len(value) - 3)))
+
+
+def _readings(bag: ReducedBag, begin: float, end: float) -> tuple[Floats, Floats]:
+    """Return times since the bag's start [s] and board readings [degC] from `begin` to `end`."""
+    time = np.asarray(bag.board.stamp_ns - bag.start_ns, dtype=np.float64) * 1e-9
+    use = (time >= begin) & (time <= end)
+    return time[use], np.asarray(bag.board.value[use], dtype=np.float64)
 
 
 def _place_and_colour(time: Floats, accel: Floats, quiet_sd: Floats) -> tuple[int, float]:
@@ -236,10 +265,16 @@ def whitened(values: Floats, r: float) -> Floats:
     return np.concatenate((first, values[1:] - r * values[:-1]))
 
 
-def _step(time: Floats, values: Floats, at: float, r: float = 0.0) -> tuple[Floats, float, Floats]:
-    """Fit a step and a linear drift; return step, its sd in noise sds, residuals (n, k)."""
+def _step(
+    time: Floats, values: Floats, at: float, r: float = 0.0, duration_s: float = 0.0
+) -> tuple[Floats, float, Floats]:
+    """
+    Fit a step, or a change over `duration_s` about `at`, and a linear drift; return the step, its
+    sd in noise sds, residuals (n, k).
+    """
     trend = _trend(time, r)
-    jump = whitened((time >= at).astype(np.float64)[:, None], r)[:, 0]
+    part = np.clip((time - at) / duration_s + 0.5, 0.0, 1.0) if duration_s else time >= at
+    jump = whitened(np.asarray(part, dtype=np.float64)[:, None], r)[:, 0]
     jump -= trend @ (trend.T @ jump)
     values = whitened(values, r)
     square = float(jump @ jump)
