@@ -9,7 +9,7 @@ wire. A converter counts charge per cycle, so the scale factor changes with the 
 an aged calibration, or that of another unit, |f| at rest may differ from gravity by more than the
 stated uncertainty. |f| is averaged over windows of a second or longer. A window is still if its
 scatter is within the sensor's noise and its mean agrees with the mean of the previous window. A
-step of |f| from a rest to another rest is judged within a second.
+step of |f| from a rest to another rest is judged within 3 s.
 """
 
 import math
