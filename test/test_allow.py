@@ -56,7 +56,7 @@ def swapped(source):
         ('units', as_it_is, COUNTS, 1),
         ('jump', jumped, FORCE, 1),
         ('jump', jumped, FORCE, 7),
-        # The case 'swapped' replaces the readings by the function `swapped`.
+        # For the refusal 'swapped' the function `swapped` replaces the readings.
         ('swapped', as_it_is, FORCE, 7),
         ('compensated', compensated, FORCE, 12),
     ],

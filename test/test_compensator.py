@@ -177,7 +177,7 @@ def test_a_sample_with_a_stamp_20_s_ahead_is_dropped_unless_the_next_stamp_agree
         (np.insert(usual, 2, usual[2] + leap), [0, 1, 3, 4, 5]),
         # After a gap of 20 s the first sample is dropped, and the samples after it are used.
         (np.where(np.arange(5) < 2, usual, usual + leap), [0, 1, 3, 4]),
-        # Two stamps 20 s too late are dropped if not adjacent, or if the second is the lower one.
+        # Two stamps 20 s ahead are dropped if not adjacent, or if the second is before the first.
         (np.insert(usual, [1, 3], usual[[1, 3]] + leap), [0, 2, 3, 5, 6]),
         (np.array([1, 2 + leap, 1 + leap, 3, 4]), [0, 3, 4]),
     ):
@@ -369,7 +369,7 @@ def test_a_swap_of_calibrations_takes_effect_between_two_samples_and_loses_no_sa
     compensator.swap(calibration(axes=equal_axes(150.0)))
     after = compensator.process(5 * SECOND_NS + 1, 300.0, 0.0, 1.0)
     assert (before[0], after[0]) == (1.0, 2.0)
-    # The detector of this calibration is another one, whose state is not settled.
+    # This calibration has other detector settings, so a new detector begins, not yet settled.
     compensator.swap(rich_calibration())
     assert compensator.process(5 * SECOND_NS + 2, 300.0, 0.0, 1.0) is not None
     assert not compensator.status().is_settled

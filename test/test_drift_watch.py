@@ -91,7 +91,7 @@ def test_the_verdict_follows_the_true_error_on_each_day(attitudes):
         back = [str(np.datetime64(first + day, 'D')) for day in (34, 35)]
         assert (result.inside_since in back) == (n_days > 34)
         assert ('again within its claim since' in str(result)) == (result.inside_since is not None)
-        # A unit within its claim must be forecast to leave it after the last day of the log.
+        # If a unit is within its claim, the forecast day must be after the last day of the log.
         assert since is not None or f'about {result.last}' not in str(result)
 
 

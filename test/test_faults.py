@@ -34,7 +34,7 @@ OVER_DDS = (
     *('board late by 5 s', 'counts out of order'),
     *('time jumps back', 'temperatures of another clock'),
 )
-#: Slow tests: faults of the case that are read like those of the board, and second time jumps.
+#: Slow tests: faults of the case thermometer like those of the board's; further jumps of time.
 SLOW = {
     *('case twice', 'case in whole degrees', 'case is NaN', 'case is infinite'),
     *('case jumps by 40 K and stays', 'case out of order', 'case late by 5 s'),

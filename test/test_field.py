@@ -39,8 +39,8 @@ def test_derivatives_of_a_rest_by_all_parameters_agree_with_finite_differences()
     layout = parameter_layout(unit)
     levels = {level for block in layout.scale for level in (block.static, block.dynamic)}
     levels |= {block.static for block in layout.bias}
-    # Test the derivatives by every other parameter. The block of parameters of a bias or scale has
-    # an odd length, so each kind of parameter is tested either in the bias or in the scale.
+    # Test the derivatives by every other parameter. A bias or a scale has an odd number of
+    # parameters, so each kind of parameter is tested either in the bias or in the scale.
     for k in range(0, layout.n_parameters, 2):
         step = 1e-7
         moved = values.copy()
@@ -90,7 +90,7 @@ def test_an_update_with_the_true_variances_equals_a_kalman_filter():
         bias, scale = layout.bias[axis].static, layout.scale[axis].static
         sd = np.sqrt(solved.posterior[bias, bias]) / field_units.K
         expected = best.state[axis] + best.state[15 + axis]
-        # The update averages rests of a turn-on to a few rows: an error of less than 0.2 sd.
+        # The update averages the rests of a turn-on to a few rows, which costs less than 0.2 sd.
         assert abs(solved.shift[bias] / field_units.K - expected) < 0.2 * sd
         P = best.P[np.ix_([axis, 15 + axis], [axis, 15 + axis])].sum()
         assert sd == pytest.approx(np.sqrt(P), rel=0.1)

@@ -40,7 +40,7 @@ def weight(record, end_condition):
         for stamp, value in zip(stamps.tolist(), values.tolist(), strict=True)
     )
     at, result = 0, []
-    # The dynamic set's weight changes over 300 s, so every fourth sample (2 Hz) suffices.
+    # The dynamic set's weight changes over 300 s, so every fourth of the samples at 2 Hz suffices.
     for stamp in record.accel_stamp_ns[::4].tolist():
         while at < len(readings) and readings[at][0] <= stamp:
             tracker.read(readings[at][1], readings[at][0], readings[at][2])
@@ -176,11 +176,11 @@ def test_a_larger_model_must_not_explain_the_errors_of_a_coarse_thermometer():
     curve, parts, bends = (score(drift, (), by_thermometer) for drift in (120.0, 46.0, 20.0))
     assert is_better(curve, parts)
     assert not is_better(parts, bends)
-    # A curve is chosen if |f| errors without it far exceed those by the thermometer, 49 ug.
+    # A curve that reduces errors of |f| from 3000 to 60 ug is chosen, one from 60 to 30 ug is not.
     flat, curved = (score(46.0, size * np.ones(9), by_thermometer) for size in (3000.0, 60.0))
     assert is_better(flat, curved)
     assert not is_better(curved, score(20.0, 30.0 * np.ones(9), by_thermometer))
-    # If errors by the thermometer are 5 ug, a left-out drift of 20 ug is better than one of 46 ug.
+    # With thermometer errors of only 5 ug, a left-out drift of 20 ug is better than one of 46 ug.
     assert is_better(score(46.0, (), 5.0), score(20.0, (), 5.0))
 
 

@@ -175,8 +175,8 @@ def test_rounding_removes_no_correlation_time_from_the_search():
 
 
 def test_the_estimated_prior_sd_of_a_column_is_the_rms_of_its_true_weights(calm):
-    # Prior variance of a column: sum of its squared weights / 3 effective parameters. A hyperprior
-    # of variance (ln 10)^2 = 5.3 moves ln sd 1 / (2 x 3 x 5.3) of the way to its centre.
+    # Prior variance of a column: sum of its squared weights / 3 effective parameters. A
+    # hyperprior of variance (ln 10)^2 = 5.3 moves ln sd by 3 % of the distance to its centre.
     regression, chosen, truth = calm
     true = np.sqrt(np.mean((truth.on_bias * regression.rms) ** 2, axis=0))
     np.testing.assert_allclose(chosen.posterior.prior.column_sd[0, :4], true[:4], rtol=0.25)

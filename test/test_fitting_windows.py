@@ -57,9 +57,9 @@ def windows_of(bags):
 
 
 def test_a_rest_partly_in_the_range_of_the_model_is_used_there_only(bags):
-    # WHY: an update by three positions that reached 3 K beyond the range of the prior, in a unit
-    # whose bias and scale had changed by 100 ug and 100 ppm, increased its error from 270 to
-    # 600 ug; without the windows beyond the range the update leaves 162 ug.
+    # WHY: bias and scale of a unit had changed by 100 ug and 100 ppm. An update by positions that
+    # reached 3 K beyond the range of the prior increased the error from 270 to 600 ug; without the
+    # windows beyond the range the update leaves 162 ug.
     everything = windows_of(bags)
     lower, upper = np.quantile(everything.temperature, (0.3, 0.7))
     for range_c, is_used in (((lower, upper), True), ((90.0, 95.0), False)):
@@ -179,8 +179,8 @@ def test_windows_with_a_silent_or_stuck_thermometer_are_left_out(bags, name, is_
         readings = Readings(readings.stamp_ns[~lost], readings.value[~lost])
     message = replace(bag, temperatures={**bag.temperatures, name: readings})
     windows = windows_of([message])
-    # A silent thermometer counts as missing after 120 s (60 s time-out, 5 intervals, a window), a
-    # stuck one after 600 s.
+    # A thermometer counts as missing within 120 s if silent (time-out of 60 s, 5 intervals between
+    # readings, and a window), within 600 s if stuck.
     seen_s = 600.0 if is_stuck else 120.0
     assert not ((windows.data.time > start + seen_s) & (windows.data.time < stop)).any()
     whole = windows_of([bag])

@@ -210,7 +210,7 @@ def test_ramp_states_equal_those_of_the_memory_of_the_fit(rate):
             # In `memory_on_grid` the gradient rises within 1 s, in `ramp_states` it rises at once.
             assert state[place] == pytest.approx(lived[place - first], rel=2e-3), quantity
         elif isinstance(quantity, Play) and not quantity.tau_s:
-            # Plays of lags are not tested: a lag takes half an hour to change by a half-width.
+            # Plays of lags are not tested: a lag needs half an hour to change by `width_k`.
             assert state[place] == pytest.approx(-quantity.width_k * np.sign(rate))
             assert state[place] == pytest.approx(lived[place - first])
 

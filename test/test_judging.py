@@ -401,7 +401,7 @@ def test_an_axis_that_repeats_one_value_in_a_rest_is_named(tmp_path):
 
 
 def test_a_bag_with_temperatures_in_kelvins_is_refused(tmp_path):
-    # WHY: the verdict on such a bag was only that its temperatures are outside the calibration's.
+    # WHY: the verdict on a bag in kelvins was only that it is outside the calibrated temperatures.
     bag = resting(tmp_path / 'hot.mcap', 293.15)
     with pytest.raises(
         RecordingError, match=r'hot\.mcap: temperature/board reads 293\S* degC .* kelv'

@@ -34,7 +34,7 @@ SOAKS = tuple(program(celsius, 25.0) for celsius in (8.0, 19.0, 34.0))
 
 
 def study_of(*name, up=9, corners=cases.HALF, held=HELD, grade=cases.navigation, **given):
-    """Return a unit and its bags: for a fit, in directions `up` (or their number); held-out."""
+    """Return a unit and a study: fit bags in directions `up` (or their number), held-out bags."""
     rng = rng_of(*name)
     unit = grade(rng, **given)
     is_mems = grade is not cases.navigation
@@ -216,7 +216,7 @@ def test_a_bump_of_the_bias_over_temperature_is_fitted_by_knees():
     # The three stated groups of columns make the fit three times as fast as a choice of groups.
     calibration = strangers.fitted(study, groups=('curve', 'part', 'bend'))
     judgement = judged(calibration, study)
-    # The bump is a bell curve (sd 0.85 K) of the bias, fitted by straight lines of 0.5 K each.
+    # The bump of the bias, a bell curve (sd 0.85 K), is fitted by straight lines of 0.5 K each.
     assert judgement.norm < 60.0
     assert judgement.norm_ratio < 1.5
 
@@ -289,7 +289,7 @@ def test_the_claimed_sd_between_two_soaks_includes_the_undetermined_curve():
 
 @pytest.mark.slow
 def test_the_claimed_sd_includes_a_curve_that_soaks_do_not_determine():
-    # WHY: each axis is vertical at one temperature only; errors were 15 times the claimed sd.
+    # WHY: with each axis vertical at one temperature only, force errors were 15 claimed sd.
     _, study = study_of('confounded soaks', up=np.vstack((FACES, np.eye(3))), corners=SOAKS)
     assert judged(strangers.fitted(study), study).ratio < 1.5
 
@@ -322,7 +322,7 @@ def test_a_bias_decay_after_power_on_is_not_fitted_by_a_lag():
         for way, n in ((cases.WARM, 12), (cases.WARM_HELD, 4))
     )
     study = cases.Study('', fit, cases.one_test(held), {'full_scale': 32767.0})
-    # The bias decay has an RMS of 0.32 mg over a bag, and a smaller mean, which constants absorb.
+    # The decay of the bias has an RMS of 0.32 mg; its mean, below 0.32 mg, is in the constants.
     assert judged(strangers.fitted(study), study).vector < np.sqrt(2.0) * 320.0
 
 
