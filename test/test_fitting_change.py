@@ -26,7 +26,7 @@ def lagged(values, tau):
 
 
 def recorded(rng, up, name, targets):
-    """Simulate a bias that is an even function of T_case - T_board minus its value in a soak."""
+    """Simulate a bias that is even in (T_case - T_board) - (this difference in a soak)."""
     corners = [(0.0, targets[0]), (900.0, targets[0])]
     for before, after in pairwise(targets):
         corners += [(corners[-1][0] + 60.0 * abs(after - before), after)]

@@ -68,7 +68,7 @@ def test_the_reduction_does_not_depend_on_how_samples_are_divided_into_blocks(rn
 
 @pytest.mark.parametrize('rest_s', [30, 45])
 def test_short_rests_of_slow_samples_are_found(rng, rest_s):
-    # WHY: at 1 Hz samples were averaged over 30 s, over several attitudes, to |f| = 0.07 m/s^2.
+    # WHY: at 1 Hz means were over 30 s and several attitudes, so |f| of a mean was 0.07 m/s^2.
     ups = np.repeat(positions(18, 1), rest_s, axis=0)
     samples = 9.8 * (ups + 5e-6 * rng.standard_normal(ups.shape))
     tumble = ArrayBlock(stamps(len(samples), 1.0), samples)
@@ -76,7 +76,7 @@ def test_short_rests_of_slow_samples_are_found(rng, rest_s):
     assert len(bag.intervals) >= 18
     for interval in bag.intervals:
         size = np.linalg.norm(interval.mean, axis=1)
-        # A sample has a noise of 5 ug; a window has ten samples, the last window of a rest fewer.
+        # A sample has a noise of 5 ug; a window has ten samples, or fewer at the end of a rest.
         np.testing.assert_allclose(size, 9.8, rtol=2e-5)
     # Samples at 1 Hz in random attitudes, without a rest, keep windows of 30 s.
     alone = replace(tumble, accel=samples[rng.integers(rest_s, size=len(samples))])

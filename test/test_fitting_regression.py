@@ -182,7 +182,7 @@ def test_covariance_and_evidence_agree_with_dense_linear_algebra(solved):
         at, jacobian = dense.residual(np.zeros(dense.n)), dense.jacobian(np.zeros(dense.n))
         hessian, sd, n = jacobian.T @ jacobian, np.sqrt(mode.variance), mode.layout.n_unit
         covariance = np.linalg.inv(hessian * np.outer(sd, sd))[:n, :n]
-        # Of the derivatives' eight digits, correlations of 0.999 in the Hessian lose three.
+        # Correlations of 0.999 in the Hessian lose three of the eight digits of the derivatives.
         correlation = mode.covariance / np.outer(sd[:n], sd[:n])
         np.testing.assert_allclose(correlation, covariance, atol=1e-4)
         assert np.diag(covariance) == pytest.approx(1.0, rel=1e-4)
@@ -316,8 +316,8 @@ def test_a_position_that_alone_determines_a_parameter_has_no_left_out_norm(rng):
     score = score_of(regression, mode)
     assert np.isnan(score.force).all()
     assert np.isnan(score.norms.square).all()
-    # The drift of |f| in a left-out position is predicted without bias and scale: it has a score.
-    # M keeps its prior mean and sd.
+    # The drift of |f| in a left-out position does not depend on bias and scale, so it is
+    # predicted. M keeps its prior mean and sd.
     assert np.isfinite(score.positions.square).all()
     np.testing.assert_allclose(mode.state.misalignment, 0.0, atol=1e-6)
     places = mode.layout.misalignment

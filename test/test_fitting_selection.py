@@ -203,7 +203,7 @@ def test_errors_of_fitted_parameters_in_claimed_sd_have_an_rms_near_1(noisy):
     errors = truth.errors(regression, chosen.posterior)
     # Weights that the fit pruned have no sd and are not in `errors`.
     every = np.concatenate([*errors.values()])
-    # The RMS of 30 values of error / sd is uncertain by 13 %; estimated prior sd lower the RMS.
+    # The RMS of 30 values of error / sd is uncertain by 13 %; estimates of prior sd lower the RMS.
     assert len(every) > 20
     assert 0.5 < np.sqrt(np.mean(every**2)) < 1.5
     assert np.abs(every).max() < 4.0

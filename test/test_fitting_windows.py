@@ -70,8 +70,8 @@ def test_a_rest_partly_in_the_range_of_the_model_is_used_there_only(bags):
 
 
 def test_the_sets_differ_only_with_soaks_at_several_temperatures(bags):
-    # WHY: in bags with 4 static windows of 1035 the static set was chosen freely: after a soak of
-    # 50 min the error of z was 341 ug, and is 21 ug without a difference of the sets.
+    # WHY: bags with 4 static windows of 1035 hardly determine the static curves: after a soak of
+    # 50 min the error of z was 341 ug, and is 21 ug with equal curves in both regimes.
     ramps = windows_of(bags)
     soaks = replace(ramps, weight=1.0 * (np.abs(ramps.rate) > 1e-3))
     of_sets = np.array(ramps.data.groups) == 'set'
@@ -326,7 +326,7 @@ def test_sections_and_kelvins_of_columns_agree_with_formulas(bags):
         assert (np.diff(section) >= 0).all()
         assert np.ptp(np.bincount(section, minlength=N_SECTIONS)) <= 2
     rms = np.sqrt(np.mean(data.columns**2, axis=0))
-    # `kelvins`: RMS of a column divided by its largest slope over t: 1 for t, 2 max |t| for t^2.
+    # `kelvins`: RMS of a column / its largest slope over t (1 for t, 2 max |t| for t^2).
     lines = [0, *(k for k, column in enumerate(bank(), start=6) if column.group == 'board')]
     np.testing.assert_allclose(data.kelvins[lines], rms[lines], rtol=1e-6)
     assert data.kelvins[1] == pytest.approx(rms[1] / (2.0 * np.abs(t).max()), rel=0.02)

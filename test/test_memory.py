@@ -117,7 +117,7 @@ def test_the_lag_of_a_part_coupled_to_board_and_case_agrees_with_a_solver(rng):
     # The lag of a part contains the lagged gradient with a minus sign: their covariance is < 0.
     P = start_covariance(spec.lags)
     assert P[0, 1] < 0.0 < P[0, 0] + 2.0 * P[0, 1] + P[1, 1]
-    # The age of a lag with two inputs counts from the first value of the later input.
+    # The age of a lag with two inputs counts from the first value of the input that begins later.
     late = ThermalMemory(spec)
     late.board_step(0, 20.0)
     late.banks['case'].step(600 * SECOND_NS, 1.0)
@@ -218,7 +218,7 @@ def test_the_prior_covariance_of_initial_lag_states_agrees_with_the_formula():
 
 
 def test_the_prior_of_initial_lag_states_is_their_covariance_after_a_random_walk(rng):
-    # `start_covariance` equals that of lags after a long random walk of T_board.
+    # `start_covariance` equals the covariance of lags after a long random walk of T_board.
     D = 0.005
     tau = np.array([60.0, 240.0, 960.0])
     n, step = 4000, 6.0

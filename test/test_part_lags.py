@@ -98,7 +98,7 @@ def test_lags_of_parts_coupled_to_board_and_case_are_fitted():
     parts = {term.part for term in calibration.response if term.kind == 'board'}
     assert {part.second_tau_s for part in parts} == {0.0}
     taus, _, shares, leads = np.array(sorted(parts)).T
-    # Ramps determine time constants to 1 %, and the case's share in a part's input to 0.01.
+    # Ramps determine time constants to 1 %, and the share of T_case in a part's input to 0.01.
     assert taus == pytest.approx(unit.part_s, rel=0.02)
     assert shares == pytest.approx(case_share, abs=0.02)
     assert not leads.any()
@@ -108,8 +108,8 @@ def test_lags_of_parts_coupled_to_board_and_case_are_fitted():
 @pytest.mark.slow
 @pytest.mark.parametrize('sensors', [('board',), ('board', 'case')])
 def test_lags_of_the_thermometers_themselves_are_fitted(sensors):
-    # WHY: without the thermometer lag in the model the fit chose a bank of time constants instead
-    # of one per part; in a held-out program the error of |f| was 57 ug, the claimed sd 2 ug.
+    # WHY: without the thermometer lag in the model the fit chose several fixed time constants, not
+    # one per part; in a held-out program the error of |f| was 57 ug, the claimed sd 2 ug.
     given = {'part_s': PARTS_S, 'thermometer_s': 60.0, 'sensors': sensors}
     unit, study = study_of('slow thermometer', **given)
     calibration = strangers.fitted(study)
@@ -134,7 +134,7 @@ def test_with_a_coarse_or_noisy_thermometer_the_fit_is_as_good_as_a_cubic_by_sci
     bags = [minutes(bag) for bag in study.tests['']]
     correct = strangers.scipy_baselines(study)['cubic']
     by_cubic = strangers.error_of([correct(bag) for bag in bags], bags, is_drift=False)
-    # The ratio (error of the fit) / (error of the cubic) of a unit scatters by some 20 %.
+    # Between units the ratio (error of the fit) / (error of the cubic) scatters by some 20 %.
     assert ours.vector < 1.2 * by_cubic.vector
     assert ours.ratio < 1.5
 

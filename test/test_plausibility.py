@@ -125,7 +125,7 @@ def test_a_frozen_sensor_is_detected_by_changes_of_the_second_sensor(sensor, fro
 
 @pytest.mark.parametrize('sensor', ['board', 'case'])
 def test_a_jump_that_stays_is_claimed_until_the_readings_jump_back(sensor):
-    # WHY: three lags after a jump by 5 K the claimed sd of the temperature had forgotten the jump.
+    # WHY: three lags after a jump by 5 K the claimed sd of the temperature no longer covered it.
     tracker = tracker_of(memory=LAG)
     place = VAR_BOARD if sensor == 'board' else VAR_GRADIENT
     for second in range(12_000):

@@ -184,8 +184,8 @@ def test_time_and_size_of_a_jump_along_gravity_are_found(rng, with_gyro):
 
 @pytest.mark.parametrize('rate_hz', [0.5, 2.0, 5.0])
 def test_a_jump_is_found_at_low_sample_rates(rng, rate_hz):
-    # WHY: at 2 Hz the gap of 120 samples between the rests before and after a jump was 60 s, above
-    # the limit of 30 s, so the jump was not found.
+    # WHY: at 2 Hz the gap of 120 samples between the rests before and after a jump lasted 60 s
+    # (limit: 30 s), so the jump was not found.
     rest = Rest(rng, duration_s=8000.0 / rate_hz, rate_hz=rate_hz, pace_s=4000.0)
     rest.add((0.0, 0.0, 20.0 * MG), from_s=4000.0 / rate_hz)
     source = rest.source()
@@ -263,7 +263,7 @@ def test_low_pass_filtered_noise_gives_one_rest_without_a_jump(rng, tau_s):
     bag = reduce_source(rest.source(), full_scale=None)
     assert len(bag.intervals) == 1
     assert find_jumps(bag) == ()
-    # At most 2 % of the cells, those at the ends of the rest, may count as motion.
+    # At most 2 % of the means, those at the ends of the rest, may count as motion.
     assert bag.n_still_cells > 0.98 * bag.n_cells
 
 

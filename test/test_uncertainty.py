@@ -226,7 +226,7 @@ def test_outside_its_range_a_set_follows_the_curve_of_the_other_set():
     )
     celsius = [-20.0, -7.5, -3.0, 0.0, 5.0, 30.0, 35.0, 38.0, 42.5, 60.0]
     static, dynamic = curves_at(unit, celsius)[:, 0]
-    # Outside the common range, 5 to 30 degC, both curves differ by as much as at its nearer end.
+    # Outside 5 to 30 degC, the common range, the sets differ as at the nearer end of this range.
     np.testing.assert_allclose((dynamic - static)[:5], dynamic[4] - static[4], rtol=1e-12)
     np.testing.assert_allclose((dynamic - static)[5:], dynamic[5] - static[5], rtol=1e-12)
     wavy, bent = np.polynomial.Polynomial(WAVY), np.polynomial.Polynomial(BENT)
