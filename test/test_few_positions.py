@@ -174,8 +174,8 @@ def test_rests_at_three_temperatures_give_the_bias_slope_despite_a_warm_up_of_th
     # the sensor in a rest is uncertain by 0.1 K.
     np.testing.assert_allclose(slopes, 0.1 * MG * SLOPE, atol=0.002 * MG)
     assert 'misfit' not in findings_of(result)
-    # Soaks do not determine the weights of lags, which can be as large as the bias slope: their
-    # claimed sd is between half of the bias slope and the bias slope.
+    # Soaks do not determine the weights of lags, which can be as large as the bias slope: the
+    # claimed sd of these weights is 0.5 to 1 times the bias slope.
     variance, layout = np.diag(calibration.posterior.covariance()), parameter_layout(calibration)
     of_lags = [variance[block.response : block.end].sum() for block in layout.bias]
     assert 0.5 < np.sqrt(np.mean(of_lags) / np.mean(slopes**2)) < 1.0

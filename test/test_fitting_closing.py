@@ -131,7 +131,7 @@ def test_variance_ratio_and_correlation_time_are_estimated(rng, noise):
 
 
 def test_white_noise_is_not_taken_for_gauss_markov_noise(rng):
-    # In 1 % of all series of white noise the fit finds Gauss-Markov noise, but not in these ten.
+    # In 1 % of all series of white noise a fit finds Gauss-Markov noise, but not in the ten drawn.
     for _ in range(10):
         whitener, weight, series = drawn(rng, 5, 100, Noise())
         assert whitener.estimate(series, weight) == Noise()

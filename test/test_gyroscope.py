@@ -137,7 +137,7 @@ def test_a_gyroscope_does_not_change_the_accelerometer_s_fit(unit):
     (messages,) = (finding.message for finding in result.findings if finding.name == 'rate')
     assert messages == 'first: not every sample has an angular rate, so no gyroscope was fitted'
     assert 'rate' not in {finding.name for finding in (*with_rate.findings, *without.findings)}
-    # If the stated |f| of rests differs, the file says, too, why it has no gyroscope.
+    # If the stated |f| differs between rests, the file says, too, why it has no gyroscope.
     known = KnownForce('stated', (Section(0.0, math.inf, 1.002 * STANDARD_GRAVITY, 0.0),))
     result = fit([replace(plain[0], force=known), plain[1]], options)
     notes = result.calibration.provenance.notes

@@ -39,7 +39,7 @@ def test_a_value_with_the_last_stamp_replaces_the_last_value():
 def test_the_variance_of_a_lag_after_a_gap_agrees_with_the_formula():
     bank = LagBank((100.0, 1000.0))
     bank.step(0, 0.0)
-    # A gap of 50 s adds variance to a lag if it exceeds tau / 10: for tau = 100 s, not for 1000 s.
+    # A gap above tau / 10 adds variance to a lag: 50 s do so for tau = 100 s, not for 1000 s.
     bank.step(50 * SECOND_NS, 2.0)
     lost = 2.0 * (1.0 - math.exp(-0.5))
     assert bank.extra == pytest.approx([lost**2, 0.0])
