@@ -246,7 +246,7 @@ def _cpu_time(pid: int) -> float:
 
 
 def _machine_time() -> tuple[int, int]:
-    """Return the sum over all cores of the time taken by the host, and of all time [ticks]."""
+    """Return ticks stolen by the host and all ticks since boot, each summed over the cores."""
     file = Path('/proc/stat')
     if not file.is_file():
         return 0, 0

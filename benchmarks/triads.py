@@ -81,8 +81,8 @@ def _only(axis: int, value: float) -> Triple:
 def triad(kind: str, seed: int = 0) -> UnitModel:
     """
     Return a triad whose sensor heads lag the board's temperature. Bias and scale are constant in
-    the kind 'plain'. In other kinds they depend on the temperatures of the sensor heads (kind
-    'paper': of the board) and, in the kinds of `_EXTRA`, on further effects.
+    the kind 'plain'. Except in 'plain', bias and scale depend on the heads' temperatures (kind
+    'paper': the board's) and, in the kinds of `_EXTRA`, on further effects.
     """
     draw = Specimen(kind, seed, FIRST_KIND + TRIAD_NAMES.index(kind))
     heads = ['head-x', 'head-y', 'head-z'] if kind in _OWN_HEADS else ['head']

@@ -67,7 +67,7 @@ def term(kind, bias=(0.0, 0.0, 0.0), scale=(0.0, 0.0, 0.0), **keys):
 
 
 def rich_calibration():
-    """Make a calibration with a posterior and every kind of term, on all axes, in both regimes."""
+    """Make a calibration with a posterior and all kinds of terms, on all axes, in both regimes."""
 
     def axis_of(sign, dynamic):
         size = 2 if dynamic else 1

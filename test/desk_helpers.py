@@ -78,7 +78,7 @@ class Desk:
             to = ('--to', _EXPORTS[name])
             self._cli('export', self._make('unit42.yaml'), *to, '-o', path, '-q')
         elif name in ('chamber.mcap', 'unit42_p01'):
-            # Some examples play the bag in real time, so it is short.
+            # Some examples play the bag in real time, so the bag is short.
             self._cli('simulate', '--profile', '20 1s', '-o', path, '-q')
         elif name == 'freezer.mcap':
             program = ('--unit', 'mems', '--profile', '20 2min, 0@2 5min', '--rate-hz', '20')

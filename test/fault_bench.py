@@ -4,8 +4,8 @@
 Owns the fault bench: it sends messages over DDS to a node process and collects the node's output.
 
 Messages are sent without pauses in lots of up to 400. After each lot the bench waits until the
-node's diagnostics have counted every sample. By these waits no message is lost between bench and
-node, at least one report contains each fault, and the result does not depend on the machine.
+node's diagnostics have counted every sample. Because of the waits no message is lost between bench
+and node, at least one report contains each fault, and the result does not depend on the machine.
 """
 
 import struct

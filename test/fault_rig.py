@@ -42,7 +42,7 @@ BIAS_SLOPE, BIAS_CURVE = 300.0, 4.0  # counts/K, counts/K^2: 100 ug/K, 1.4 ug/K^
 SCALE_SLOPE = 7e-5
 BY_GRADIENT, BY_MEMORY = 150.0, 60.0  # counts/K
 
-#: Residual sd of the static set [m/s^2], which covers the error until a ramp is detected.
+#: Residual sd of the static curves [m/s^2], which covers the error until a ramp is detected.
 STATIC_RESIDUAL = 1.5e-4
 DYNAMIC_RESIDUAL = 3e-5
 

@@ -56,7 +56,7 @@ def swapped(source):
         ('units', as_it_is, COUNTS, 1),
         ('jump', jumped, FORCE, 1),
         ('jump', jumped, FORCE, 7),
-        # The case 'swapped' replaces the readings by the function `swapped`.
+        # For the refusal 'swapped' the function `swapped` replaces the readings.
         ('swapped', as_it_is, FORCE, 7),
         ('compensated', compensated, FORCE, 12),
     ],
@@ -198,8 +198,8 @@ def test_an_axis_that_is_constant_in_one_position_is_named(rng):
 
 @pytest.mark.parametrize(('n', 'n_prior', 'step'), [(8, 6, 1e-2), (2, 1, 1e-4)])
 def test_samples_with_steps_above_their_noise_are_fitted_or_refused(rng, n, n_prior, step):
-    # WHY: for constant samples of an axis the fit assumed a noise of 1e-8 m/s^2, and a fit with a
-    # prior ended with a LinAlgError.
+    # WHY: for an axis with constant samples the fit assumed a noise of 1e-8 m/s^2, and a fit with
+    # a prior ended with a LinAlgError.
     rests = rests_of(rng, n, sd=1e-5)
     for rest in rests:
         drift = 1e-2 * np.outer((rest.temperature(rest.time) - 25.0) / 20.0, (1.0, -0.5, 0.3))

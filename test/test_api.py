@@ -120,7 +120,7 @@ def test_unusable_samples_give_rows_of_nan(arrays):
     late = thermal_calibration().correct(arrays['time_s'], counts, board=arrays['board'])
     assert np.flatnonzero(np.isnan(late.specific_force[:, 0])).tolist() == [7, 9]
     assert (late.counters.n_not_finite, late.counters.n_saturated) == (1, 1)
-    # Without a case thermometer the dynamic regime never begins earlier than with one.
+    # Without a case thermometer the dynamic regime begins no earlier than with one.
     assert late.dynamic.any()
     assert np.argmax(late.dynamic) >= np.argmax(out.dynamic)
 

@@ -164,7 +164,7 @@ class TestEvaluations:
             writer.write_counts(TOPICS.counts, stamps, level)
         finished = cli('evaluate', path, '-c', tmp_path / 'wrong.yaml', code=1)
         assert 'no better than raw: 48 mg RMS of |f| - g, ' in finished.stdout
-        # In the second calibration, which is right, levels of +10 mg cancel biases of -10 mg.
+        # The second calibration is right: its levels of +10 mg cancel its biases of -10 mg.
         right = axis_set(delta=30.0)
         sets = regime_set(right, right, right)
         axes = equal_axes(300.0, -30.0)

@@ -106,7 +106,7 @@ def test_the_value_of_each_kind_of_column_agrees_with_hand_numbers():
     ]
     spec = memory_of(columns, ('case', 'tip'))
     layout = StateLayout(spec)
-    # Board, its variance, rate, weight, unknown regime; 2 gradients and 2 lags, variances; play.
+    # Board, its variance, rate, weight, is regime unknown; (gradient or lag, variance) x 4; play.
     state = [23.0, 0.0, 0.01, 0.25, 0.0, 1.2, 0.0, -0.7, 0.0, 0.5, 0.0, -0.3, 0.0, 0.1]
     state = np.array([state]).T
     assert layout.width == len(state)
@@ -116,7 +116,7 @@ def test_the_value_of_each_kind_of_column_agrees_with_hand_numbers():
         0.25, 0.49 * 3.0, 0.7, 0.5 * 3.0, 1.0, 0.5, 0.0,
     ]  # fmt: skip
     assert values == pytest.approx(expected)
-    # In products t is limited to calibrated temperatures; the column `board` has no factor t.
+    # Columns with a factor t limit it to calibrated temperatures; the column `board` has no t.
     at_edge = ColumnTable(columns, spec, 20.0, (-10.0, 22.0)).values(state)[:, 0]
     assert at_edge[4] == pytest.approx(-0.6)
     assert at_edge[2] == 0.5

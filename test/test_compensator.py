@@ -48,7 +48,7 @@ def test_the_offset_is_half_the_sum_of_signed_counts():
 
 
 def test_a_corrected_sample_agrees_with_the_formula_of_the_static_set():
-    # Expected: the formula of the static set at t = 10 K, for a gradient and a rate of 0.
+    # Expected: the formula with the static curves at t = 10 K, for a gradient and a rate of 0.
     axis = axis_set((0.0, 0.5, 0.01), (1.0, 1e-4), delta=2.0)
     unit = calibration(
         axes=equal_axes(300.0, 7.0),
@@ -177,7 +177,7 @@ def test_a_sample_with_a_stamp_20_s_ahead_is_dropped_unless_the_next_stamp_agree
         (np.insert(usual, 2, usual[2] + leap), [0, 1, 3, 4, 5]),
         # After a gap of 20 s the first sample is dropped, and the samples after it are used.
         (np.where(np.arange(5) < 2, usual, usual + leap), [0, 1, 3, 4]),
-        # Two stamps 20 s too late are dropped if not adjacent, or if the second is the lower one.
+        # Two stamps 20 s ahead are dropped if not adjacent, or if the second is before the first.
         (np.insert(usual, [1, 3], usual[[1, 3]] + leap), [0, 2, 3, 5, 6]),
         (np.array([1, 2 + leap, 1 + leap, 3, 4]), [0, 3, 4]),
     ):
@@ -260,7 +260,7 @@ def test_flush_updates_the_regime_without_samples():
 
 
 def test_another_transition_time_during_a_transition_causes_no_step_of_the_output():
-    # The static and the dynamic set differ by 0.025 counts (8.5 ug) at any temperature.
+    # The curves of both regimes differ by 0.025 counts (8.5 ug) at any temperature.
     unit = calibration(dynamic=regime_set(axis_set(delta=0.025)))
     config = replace(UNCHECKED, transition_time_s=100.0)
     compensator = Compensator(unit, config)
@@ -371,7 +371,7 @@ def test_a_switch_of_sets_causes_no_step():
 
 @pytest.mark.parametrize(
     ('delta', 'given_s', 'expected_s'),
-    # At 1 ug/s a change by the difference of the sets, 0.3 counts = 102 ug, takes 102 s.
+    # At 1 ug/s a change by the difference of the regimes, 0.3 counts = 102 ug, takes 102 s.
     [(0.01, 30.0, 30.0), (0.3, 30.0, 1e-3 / 9.80665e-6), (0.3, 5.0, 50.0), (0.3, 0.0, 0.0)],
 )
 def test_a_transition_time_above_0_limits_the_change_to_1_ug_per_s(delta, given_s, expected_s):
@@ -387,7 +387,7 @@ def test_a_swap_of_calibrations_takes_effect_between_two_samples_and_loses_no_sa
     compensator.swap(calibration(axes=equal_axes(150.0)))
     after = compensator.process(5 * SECOND_NS + 1, 300.0, 0.0, 1.0)
     assert (before[0], after[0]) == (1.0, 2.0)
-    # The detector of this calibration is another one, whose state is not settled.
+    # This calibration has other detector settings, so a new detector begins, not yet settled.
     compensator.swap(rich_calibration())
     assert compensator.process(5 * SECOND_NS + 2, 300.0, 0.0, 1.0) is not None
     assert not compensator.status().is_settled

@@ -60,8 +60,8 @@ def test_forecasts_agree_with_the_simulated_future_of_units():
     # The printed interval must contain 80 % of the simulated days on which a unit leaves the
     # tolerance; the mean of 24 such shares has an error of 6 %.
     assert np.mean(shares) == pytest.approx(0.8, abs=0.12)
-    # A unit's median time until it leaves the tolerance is uncertain by a factor of 1.5, the mean
-    # of eight such times by 1.3.
+    # The median time of a unit until it leaves the tolerance is uncertain by a factor of 1.5, the
+    # mean of eight such times by a factor of 1.3.
     assert 1.0 / 1.6 < np.exp(np.mean(np.log(ratios))) < 1.6
     assert 0.45 < min(ratios) < max(ratios) < 2.2
 
@@ -91,7 +91,7 @@ def test_the_verdict_follows_the_true_error_on_each_day(attitudes):
         back = [str(np.datetime64(first + day, 'D')) for day in (34, 35)]
         assert (result.inside_since in back) == (n_days > 34)
         assert ('again within its claim since' in str(result)) == (result.inside_since is not None)
-        # A unit within its claim must be forecast to leave it after the last day of the log.
+        # If a unit is within its claim, the forecast day must be after the last day of the log.
         assert since is not None or f'about {result.last}' not in str(result)
 
 

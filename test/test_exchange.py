@@ -187,8 +187,8 @@ def test_an_export_for_a_stated_attitude_contains_the_scale_drift(cubic):
 
 
 def test_an_export_to_px4_contains_the_offset_in_m_s2(cubic):
-    # WHY: PX4 subtracts the offset from readings that it takes as m/s^2. At rest a scale error of
-    # 0.5 % is an error of 5 mg, which the offset for a stated attitude must contain.
+    # WHY: PX4 subtracts the offset from readings that it takes as m/s^2. The offset for a
+    # stated attitude must contain the effect of a scale error of 0.5 %, up to 5 mg at rest.
     axes = Axes(*(AxisReference(0.995, bias) for bias in (0.1, -0.2, 0.3)))
     calibration = replace(cubic, axes=axes)
     plain = export_calibration(calibration, 'px4')

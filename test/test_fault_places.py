@@ -53,7 +53,7 @@ def settling_s():
 
 
 def ended_s(row):
-    """Return the time [s] from which a row's messages equal those of the bag without the fault."""
+    """Return the time [s] from which a row's messages equal the messages without the fault."""
     at, _ = row.shift
     if math.isfinite(at):
         return at

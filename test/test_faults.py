@@ -29,12 +29,12 @@ from thermo_comp.unit.calibration_file import save_calibration
 SIGMAS = 5.0
 #: After recovery the output differs from the undisturbed output by at most 1 ug [m/s^2].
 RECOVERED = 9.80665e-6
-#: Rows that are also tested over DDS, because they depend on the order of arrival of messages.
+#: Rows of the fault table that are also tested over DDS: they depend on the order of messages.
 OVER_DDS = (
     *('board late by 5 s', 'counts out of order'),
     *('time jumps back', 'temperatures of another clock'),
 )
-#: Slow tests: faults of the case that are read like those of the board, and second time jumps.
+#: Slow tests: faults of the case thermometer like those of the board's; further jumps of time.
 SLOW = {
     *('case twice', 'case in whole degrees', 'case is NaN', 'case is infinite'),
     *('case jumps by 40 K and stays', 'case out of order', 'case late by 5 s'),
@@ -77,7 +77,7 @@ class Direct:
 
 @cache
 def undisturbed():
-    """Return the undisturbed bag's message groups, each with the `Direct` in its state before."""
+    """Return the groups of messages of the undisturbed bag, each with the `Direct` before it."""
     run, result = Direct(), []
     for lot in (*lots(bag()), []):
         result.append((lot, deepcopy(run)))

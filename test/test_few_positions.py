@@ -39,7 +39,7 @@ def left_by(pair, **options):
     time_s = held_out.time_s[: 8 * n].reshape(n, 8).mean(axis=1)
     counts = held_out.counts[: 8 * n].reshape(n, 8, 3).mean(axis=1)
     corrected = calibration.correct(time_s, counts, **held_out.temperatures)
-    # A fit to two positions leaves bias, K and M uncertain: an axis' sd in a third exceeds 1 mg.
+    # A fit to two positions leaves bias, K and M uncertain: in a third one an axis' sd is > 1 mg.
     sd = np.sqrt(np.nanmedian(np.einsum('nii->ni', corrected.covariance), axis=0))
     assert (sd > 1000.0 * MICRO_G).any()
     return np.asarray(minutes(corrected.specific_force).std(axis=0))
@@ -47,9 +47,9 @@ def left_by(pair, **options):
 
 @pytest.mark.slow
 def test_two_positions_determine_the_thermal_response():
-    # Noise of 9 ug/sqrt(Hz) is 1.2 ug in means over 60 s; 128 means determine the sd to 6 %, and
-    # superfluous columns may increase the sd by 10 %. Over all 36 pairs of the nine sample bags
-    # the sd of 60 s means in a third position has a median of 1.3 ug.
+    # Noise of 9 ug/sqrt(Hz) is 1.2 ug in means over 60 s; 128 means determine this sd to 6 %, and
+    # superfluous columns of a fit may increase it by 10 %. Over all 36 pairs of the nine sample
+    # bags the sd of 60 s means in a third position has a median of 1.3 ug.
     assert left_by((1, 2)) == pytest.approx([1.2] * 3, rel=0.3)
 
 
@@ -144,8 +144,8 @@ def test_one_position_leaves_the_scale_at_its_prior(one_position):
 
 
 def test_after_soaks_in_one_position_the_drift_error_is_within_three_claimed_sd(rng):
-    # WHY: |f| in one attitude does not separate bias and scale. The fit attributed the drift to
-    # the scale; the bias drift was wrong on two axes, with a claimed sd of 0.
+    # WHY: |f| in one attitude does not separate bias and scale. The fit attributed the drift of
+    # |f| to the scale, and stated a wrong bias slope of two axes with an sd of 0.
     slope = 0.1 * SLOPE
     bags = []
     for celsius in (5.0, 20.0, 35.0):
@@ -158,8 +158,8 @@ def test_after_soaks_in_one_position_the_drift_error_is_within_three_claimed_sd(
 
 @pytest.mark.slow
 def test_rests_at_three_temperatures_give_the_bias_slope_despite_a_warm_up_of_the_board(rng):
-    # WHY: the sensor does not follow the warm-up of the board. The fit found a bias slope of 0,
-    # and attributed differences of |f| between rests to mounting offsets.
+    # WHY: while the board warmed up, the bias did not change. The fit found a bias slope of 0, and
+    # attributed differences of |f| between rests to mounting offsets.
     bags = []
     for celsius in (5.0, 20.0, 35.0):
         for up in positions(8, 3):
@@ -174,8 +174,8 @@ def test_rests_at_three_temperatures_give_the_bias_slope_despite_a_warm_up_of_th
     # the sensor in a rest is uncertain by 0.1 K.
     np.testing.assert_allclose(slopes, 0.1 * MG * SLOPE, atol=0.002 * MG)
     assert 'misfit' not in findings_of(result)
-    # Soaks do not determine the weights of lags, which can be as large as the bias slope: their
-    # claimed sd is between half of the bias slope and the bias slope.
+    # Soaks do not determine the weights of lags, which can be as large as the bias slope: the
+    # claimed sd of these weights is 0.5 to 1 times the bias slope.
     variance, layout = np.diag(calibration.posterior.covariance()), parameter_layout(calibration)
     of_lags = [variance[block.response : block.end].sum() for block in layout.bias]
     assert 0.5 < np.sqrt(np.mean(of_lags) / np.mean(slopes**2)) < 1.0
@@ -236,7 +236,7 @@ def test_positions_without_a_thermometer_give_constants_and_wide_temperature_slo
     out = calibration.correct([1.0], [[0.1, -0.2, GRAVITY + 0.3]])
     np.testing.assert_allclose(out.specific_force, [[0.0, 0.0, GRAVITY]], atol=0.02)
     left = np.array([0.05, 0.05, np.hypot(0.05, 2e-3 * GRAVITY)])
-    # `left` [m/s^2]: temperature sd, 10 K, times sd of the slopes; sample noise: 0.02 m/s^2.
+    # `left` [m/s^2]: effect of the unknown temperature: its sd, 10 K, times sd of the slopes.
     sd = np.sqrt(np.diagonal(out.covariance[0]))
     np.testing.assert_allclose(sd, np.hypot(left, 0.02), rtol=0.05)
 
@@ -267,7 +267,7 @@ def test_the_bias_sd_of_one_recording_contains_the_sd_of_a_turn_on(rng):
     # WHY: the claimed bias sd was 1/6 of the bias error, as if each position had its own turn-on.
     offsets = 5e-3 * rng.standard_normal((8, 3))
     ups = positions(12, 3)
-    # `least`: prior sd of turn-ons for samples with a noise of 0.02 m/s^2, or stated sd [m/s^2].
+    # `least` [m/s^2]: turn-on sd, by the prior for a sample noise of 0.02 m/s^2, or as stated.
     stated = fit([turned(rng, ups)], replace(OPTIONS, mounting_sd=5e-3))
     for result, least in ((tumbled(12), 1e-3), (stated, 5e-3)):
         calibration = result.calibration
@@ -297,8 +297,8 @@ def test_the_claimed_variance_of_a_curve_contains_that_of_turn_ons_at_each_tempe
     for bag in (bags[0], bags[2]):
         out = unit.correct(bag.time_s, bag.counts, board=bag.temperatures['board'])
         # If turn-ons have a variance of V, a line fitted to three equidistant temperatures has a
-        # variance of 5/6 V at its ends, a parabola V; the next turn-on adds V. With nine mountings
-        # of variance V the errors of bias and of scale add V/3 each.
+        # variance of 5/6 V at its ends, a parabola V; the next turn-on adds V. Nine mountings of
+        # variance V add V/3 by the error of the bias, and V/3 by the error of the scale.
         variance = np.diagonal(out.covariance[-dwell:].mean(axis=0)) - 1e-3**2
         assert ((1.0 + 5.0 / 6.0) * turn_on**2 < variance).all()
         assert (variance < (1.0 + 1.0 + 2.0 / 3.0) * turn_on**2).all()
@@ -325,7 +325,7 @@ def test_two_bags_without_a_pause_between_them_count_as_one_turn_on(rng):
         ]
         return [source_of(*part, name=name) for part, name in zip(arrays, 'ab', strict=True)]
 
-    # The second bag begins in the fifth position; bags that are not joined have a mounting more.
+    # The second bag begins in the fifth position, which is two mountings if bags are not joined.
     source = turned(rng, positions(9, 3))
     whole = tumbled(9)
     parts, others = (fit(cut(source, 9400, pause_s), OPTIONS) for pause_s in (0.0, 60.0))

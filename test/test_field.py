@@ -39,8 +39,8 @@ def test_derivatives_of_a_rest_by_all_parameters_agree_with_finite_differences()
     layout = parameter_layout(unit)
     levels = {level for block in layout.scale for level in (block.static, block.dynamic)}
     levels |= {block.static for block in layout.bias}
-    # Test the derivatives by every other parameter. The block of parameters of a bias or scale has
-    # an odd length, so each kind of parameter is tested either in the bias or in the scale.
+    # Test the derivatives by every other parameter. A bias or a scale has an odd number of
+    # parameters, so each kind of parameter is tested either in the bias or in the scale.
     for k in range(0, layout.n_parameters, 2):
         step = 1e-7
         moved = values.copy()
@@ -90,7 +90,7 @@ def test_an_update_with_the_true_variances_equals_a_kalman_filter():
         bias, scale = layout.bias[axis].static, layout.scale[axis].static
         sd = np.sqrt(solved.posterior[bias, bias]) / field_units.K
         expected = best.state[axis] + best.state[15 + axis]
-        # The update averages rests of a turn-on to a few rows: an error of less than 0.2 sd.
+        # The update averages the rests of a turn-on to a few rows, which costs less than 0.2 sd.
         assert abs(solved.shift[bias] / field_units.K - expected) < 0.2 * sd
         P = best.P[np.ix_([axis, 15 + axis], [axis, 15 + axis])].sum()
         assert sd == pytest.approx(np.sqrt(P), rel=0.1)
@@ -177,7 +177,7 @@ def test_the_sd_of_an_old_calibration_aged_to_the_last_rest_includes_the_random_
     # half and all of the variance of the random walk to the biases of x and y.
     for axis in (x, y):
         assert 0.5 < axis.present_sd / (329.0 * MICRO_G) < 1.5
-    # The z bias' sd at the last rest must equal its simulated walk within 40 ug, two turn-on sd.
+    # At the last rest the sd of the z bias must equal its walk within 40 ug (two turn-on sd).
     assert z.present_sd == pytest.approx(abs(walk[-1, 2]), abs=40.0 * MICRO_G)
 
 
@@ -263,7 +263,7 @@ def test_a_changed_curve_is_detected_and_corrected():
 
 
 def test_the_sd_of_a_bias_slope_that_no_rest_observes_grows_by_1_ug_per_k_and_root_year():
-    # Upright rests do not observe the x axis: its bias slope's sd grows by 1 ug/K per root year.
+    # Upright rests do not observe x: the sd of its bias slope grows by 1 ug/K per root year.
     unit = known_with_curves()
     series = series_of(rests(unit, upright, no_error), unit)
     result, n = update(series, unit), len(series) // 10
@@ -344,7 +344,7 @@ def test_the_command_update_writes_a_better_calibration(tmp_path, unit_file, cli
     # The date in the new calibration file is that of its last rest, not that of the command.
     assert written.provenance.date == '2030-01-20T23:12:40Z'
     assert 'from 0 bags and 1 rest log, ' in cli('info', new).stdout
-    # The old calibration is judged on the log, because no rest of the log was used to make it.
+    # The old calibration is judged on the log, as it was made without the rests of the log.
     assert parsed(cli('evaluate', log, '-c', unit_file, '--json', code=1).stdout)['left']
     history = cli('report', '-c', unit_file, '-c', new, '-o', tmp_path / 'page.html', '--json')
     assert [change['constant'] for change in parsed(history.stdout)['history']][2] == 'bias z'

@@ -156,7 +156,7 @@ def test_the_error_of_the_compensator_is_that_stated_by_the_fit(response):
     assert rms < 2.0 * response.residuals[-1].left_out.rms
     density = np.array(response.calibration.noise_density_m_s2_sqrt_hz)
     variance = after.covariance[: n * per_window, [0, 4, 8]].reshape(n, per_window, 3).mean(axis=1)
-    # A mean over 60 s reduces white noise and rounding; errors of the model stay as they are.
+    # A mean over 60 s reduces white noise and rounding; it does not reduce errors of the model.
     variance += density**2 / 60.0 - np.array(compensator.thermal.correction.noise)
     error = (force - record.truth.specific_force) / np.sqrt(variance)
     assert 0.5 < np.sqrt(np.mean(error**2)) < 1.6
@@ -187,7 +187,7 @@ def test_six_faces_leave_misalignment_at_its_prior():
 
 def test_the_claimed_sd_of_nine_positions_includes_turn_on_offsets(rng):
     # WHY: nine constants fit nine |f| exactly, whatever the offsets, and the claimed sd of the
-    # constants was 3 to 5 times too small.
+    # constants was too small by a factor of 3 to 5.
     turn_ons = PLAIN.scale_factor * rng.normal(0.0, 50e-6 * STANDARD_GRAVITY, (9, 3))
     records = records_of(PLAIN, positions(9, 1), 1)
     pairs = zip(records, turn_ons, strict=True)

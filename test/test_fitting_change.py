@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Effects even in T_case - T_board are symmetric about its value in a soak (self-heating)."""
+"""Fits of effects that are even in T_case - T_board about 0 or about the value in a soak."""
 
 from itertools import pairwise
 
@@ -26,7 +26,7 @@ def lagged(values, tau):
 
 
 def recorded(rng, up, name, targets):
-    """Simulate a bias that is an even function of T_case - T_board minus its value in a soak."""
+    """Simulate a bias that is even in (T_case - T_board) - (this difference in a soak)."""
     corners = [(0.0, targets[0]), (900.0, targets[0])]
     for before, after in pairwise(targets):
         corners += [(corners[-1][0] + 60.0 * abs(after - before), after)]
@@ -65,7 +65,7 @@ def test_effects_even_about_the_rest_gradient_are_found(rng):
     kept = {column.group for column in about_rest.calibration.response}
     assert 'gradient_even_about_rest' in kept
     assert 'gradient_even' not in kept
-    # Functions even about T_case - T_board = 0 describe only part of an effect even about -0.6 K.
+    # The effect is even about T_case - T_board = -0.6 K; functions even about 0 K fit only part.
     floor = NOISE / np.sqrt(30.0)
     assert about_rest.residuals[-1].fitted.rms < 1.1 * floor
     assert about_0.residuals[-1].fitted.rms > 1.5 * floor

@@ -24,12 +24,12 @@ from thermo_comp.unit.gravity import MICRO_G, STANDARD_GRAVITY
 
 #: Temperatures of a bag: soaks long enough for the board to settle.
 PROGRAM = parse_cyclogram('20 40min, 45@1.5 120min')
-#: Bias of the dynamic set less that of the static set [m/s^2]; the noise of a window is 2 ug.
+#: Bias in the dynamic regime less bias in the static regime [m/s^2]; noise of a window: 2 ug.
 STEP = np.array([120.0, -80.0, 60.0]) * MICRO_G
 
 
 def weight(record, end_condition):
-    """Return the weight of the dynamic set at each sample, with the true detector settings."""
+    """Return each sample's weight of the dynamic curves, with the true detector settings."""
     tracker = ThermalTracker(replace(DetectorSettings(), end_condition=end_condition))
     readings = sorted(
         (stamp, name, value)
@@ -40,7 +40,7 @@ def weight(record, end_condition):
         for stamp, value in zip(stamps.tolist(), values.tolist(), strict=True)
     )
     at, result = 0, []
-    # The dynamic set's weight changes over 300 s, so every fourth sample (2 Hz) suffices.
+    # The weight of dynamic curves changes over 300 s, so every fourth sample (of 2 Hz) suffices.
     for stamp in record.accel_stamp_ns[::4].tolist():
         while at < len(readings) and readings[at][0] <= stamp:
             tracker.read(readings[at][1], readings[at][0], readings[at][2])
@@ -110,7 +110,7 @@ def test_products_and_determinant_equal_those_of_the_dense_matrix(rng, noise):
 
 
 def drawn(rng, n, steps, noise):
-    """Draw n positions on three axes: Gauss-Markov noise plus white noise of varying weight."""
+    """Draw the noise of n positions on three axes: Gauss-Markov noise plus white noise."""
     time = np.cumsum(rng.uniform(20.0, 100.0, steps))
     weight = rng.uniform(0.3, 1.0, steps)
     slow = np.sqrt(noise.ratio) * rng.standard_normal((n, steps, 3))
@@ -131,7 +131,7 @@ def test_variance_ratio_and_correlation_time_are_estimated(rng, noise):
 
 
 def test_white_noise_is_not_taken_for_gauss_markov_noise(rng):
-    # In 1 % of all series of white noise the fit finds Gauss-Markov noise, but not in these ten.
+    # In 1 % of all series of white noise a fit finds Gauss-Markov noise, but not in the ten drawn.
     for _ in range(10):
         whitener, weight, series = drawn(rng, 5, 100, Noise())
         assert whitener.estimate(series, weight) == Noise()
@@ -170,17 +170,17 @@ def test_few_norms_that_both_models_predict_do_not_select_the_model():
 
 
 def test_a_larger_model_must_not_explain_the_errors_of_a_coarse_thermometer():
-    # WHY: readings in steps of 1 K have equal errors in all bags of one temperature program. Knees
+    # WHY: with readings in steps of 1 K all bags of a temperature program have equal errors. Knees
     # of a curve halved the left-out drift, but doubled the error in other temperature programs.
     by_thermometer = 49.0
     curve, parts, bends = (score(drift, (), by_thermometer) for drift in (120.0, 46.0, 20.0))
     assert is_better(curve, parts)
     assert not is_better(parts, bends)
-    # A curve is chosen if |f| errors without it far exceed those by the thermometer, 49 ug.
+    # A curve that reduces errors of |f| from 3000 to 60 ug is chosen, one from 60 to 30 ug is not.
     flat, curved = (score(46.0, size * np.ones(9), by_thermometer) for size in (3000.0, 60.0))
     assert is_better(flat, curved)
     assert not is_better(curved, score(20.0, 30.0 * np.ones(9), by_thermometer))
-    # If errors by the thermometer are 5 ug, a left-out drift of 20 ug is better than one of 46 ug.
+    # With thermometer errors of only 5 ug, a left-out drift of 20 ug is better than one of 46 ug.
     assert is_better(score(46.0, (), 5.0), score(20.0, (), 5.0))
 
 

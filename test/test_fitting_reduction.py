@@ -68,7 +68,7 @@ def test_the_reduction_does_not_depend_on_how_samples_are_divided_into_blocks(rn
 
 @pytest.mark.parametrize('rest_s', [30, 45])
 def test_short_rests_of_slow_samples_are_found(rng, rest_s):
-    # WHY: at 1 Hz samples were averaged over 30 s, over several attitudes, to |f| = 0.07 m/s^2.
+    # WHY: at 1 Hz means were over 30 s and several attitudes, so |f| of a mean was 0.07 m/s^2.
     ups = np.repeat(positions(18, 1), rest_s, axis=0)
     samples = 9.8 * (ups + 5e-6 * rng.standard_normal(ups.shape))
     tumble = ArrayBlock(stamps(len(samples), 1.0), samples)
@@ -76,7 +76,7 @@ def test_short_rests_of_slow_samples_are_found(rng, rest_s):
     assert len(bag.intervals) >= 18
     for interval in bag.intervals:
         size = np.linalg.norm(interval.mean, axis=1)
-        # A sample has a noise of 5 ug; a window has ten samples, the last window of a rest fewer.
+        # A sample has a noise of 5 ug; a window has ten samples, or fewer at the end of a rest.
         np.testing.assert_allclose(size, 9.8, rtol=2e-5)
     # Samples at 1 Hz in random attitudes, without a rest, keep windows of 30 s.
     alone = replace(tumble, accel=samples[rng.integers(rest_s, size=len(samples))])
@@ -307,7 +307,7 @@ def soak_ramp_soak(quantum, noise, rng):
 def test_thermometer_settings_are_estimated_from_readings(quantum, noise, rng):
     learned = learn_thermometer([soak_ramp_soak(quantum, noise, rng)], ThermometerSettings())
     assert learned.quantum_c == pytest.approx(quantum, rel=1e-6)
-    # Rounded readings show noise only where they pass an edge slowly, at the end of the ramp.
+    # Rounded readings show noise only at a rounding edge passed slowly, at the end of the ramp.
     assert learned.noise_sd_c == pytest.approx(noise, rel=0.4 if quantum else 0.1)
     # Means over 60 s determine the lag of the thermometer, 300 s, to a third.
     assert learned.lag_s == pytest.approx(300.0, rel=0.35)
@@ -392,7 +392,7 @@ def test_steps_of_a_converter_after_a_constant_soak_do_not_divide_a_rest(rng, st
 
 
 def test_a_turn_between_constant_samples_is_not_taken_for_a_step_of_the_converter(rng):
-    # WHY: if samples change only at a turn, the change at the turn counted as a converter step.
+    # WHY: if samples changed only as the unit was turned, this change counted as an ADC step.
     rest = Rest(rng, sd=0.0)
     rest.accel[rest.time > 300.0] = (GRAVITY, 0.0, 0.0)
     bag = reduce_source(rest.source(), full_scale=None)

@@ -104,7 +104,7 @@ class Dense:
             state.tilt.ravel() / prior.tilt_sd,
             state.turn_on.ravel() / prior.turn_on_sd,
             state.start.ravel() / np.sqrt(prior.start_variance_ratio),
-            # The initial lag states averaged over all bags have 0.1 of the prior sd of one bag.
+            # An initial lag state averaged over all bags has 0.1 of its prior sd in one bag.
             state.start.mean(axis=0) / (0.1 * np.sqrt(prior.start_variance_ratio)),
         ]
         if len(state.pose):
@@ -112,7 +112,7 @@ class Dense:
             basis = tangent_basis(self.at.state.pose)[posed]
             change = state.up[state.pose_of >= 0] - state.pose[posed]
             from_pose = np.einsum('pi,pij->pj', change, basis)
-            # Each pose has a prior sd of 1 rad about the mode.
+            # Each pose has a prior sd of 1 rad about its value at the mode.
             parts += [from_pose.ravel() / prior.pose_sd, x[self.at.layout.pose].ravel()]
         for weights, sd in zip(state.weights, prior.column_sd, strict=True):
             parts.append((weights[:, sd > 0.0] / sd[sd > 0.0]).ravel())
@@ -151,7 +151,7 @@ def solved(request):
     windows = replace(windows, weight=weight, bag=bag, pose=pose)
     regression, state = begin(windows, up)
     # The derivatives of the regression omit products of parameter changes. In one or two poses
-    # bias, scale and misalignment are undetermined; narrow priors keep their changes small.
+    # bias, scale and misalignment are undetermined; narrow priors limit their changes.
     narrow = {'scale_sd': 1e-5, 'misalignment_sd': 1e-5, 'bias_sd': np.full(3, 1e-4)}
     narrow['column_sd'] = column_sd(('curve', 'board'), 1e-2, 1e-5)
     narrow = narrow if pose_of else {}
@@ -182,7 +182,7 @@ def test_covariance_and_evidence_agree_with_dense_linear_algebra(solved):
         at, jacobian = dense.residual(np.zeros(dense.n)), dense.jacobian(np.zeros(dense.n))
         hessian, sd, n = jacobian.T @ jacobian, np.sqrt(mode.variance), mode.layout.n_unit
         covariance = np.linalg.inv(hessian * np.outer(sd, sd))[:n, :n]
-        # Of the derivatives' eight digits, correlations of 0.999 in the Hessian lose three.
+        # Correlations of 0.999 in the Hessian lose three of the eight digits of the derivatives.
         correlation = mode.covariance / np.outer(sd[:n], sd[:n])
         np.testing.assert_allclose(correlation, covariance, atol=1e-4)
         assert np.diag(covariance) == pytest.approx(1.0, rel=1e-4)
@@ -248,8 +248,8 @@ def refit_of(whole, regression, prior, kept):
 
 
 #: The left-out score is computed by linear steps from the fit to all rows. With the groups LINEAR
-#: the model is linear in all parameters but attitudes, and the score is exact. With the
-#: groups PRODUCTS it neglects (change of an initial lag state) * (change of this lag's weight).
+#: the model is linear in all parameters but attitudes, and the score is exact. With PRODUCTS
+#: the score neglects (change of an initial lag state) * (change of this lag's weight).
 LINEAR, PRODUCTS = ('curve',), ('curve', 'board')
 
 
@@ -298,7 +298,7 @@ def test_the_left_out_error_of_a_section_is_that_of_a_fit_to_all_others(rng, gro
         size = np.sqrt(np.mean(expected**2))
         assert score.sections.square[section] == pytest.approx(size**2, rel=2.0 * tolerance)
     assert score.sections.rms == pytest.approx(np.sqrt(score.sections.square.mean()))
-    # With one position no position can be left out: the score is the drift of left-out sections.
+    # With a single position the score is the drift of |f| in left-out sections of this position.
     alone, state = begin(rows_of(windows, np.arange(24)), up[:1])
     alone_score = score_of(alone, alone.solve(state, prior))
     assert np.isnan(alone_score.positions.rms)
@@ -316,8 +316,8 @@ def test_a_position_that_alone_determines_a_parameter_has_no_left_out_norm(rng):
     score = score_of(regression, mode)
     assert np.isnan(score.force).all()
     assert np.isnan(score.norms.square).all()
-    # The drift of |f| in a left-out position is predicted without bias and scale: it has a score.
-    # M keeps its prior mean and sd.
+    # The drift of |f| in a left-out position does not depend on bias and scale, so it is
+    # predicted. M keeps its prior mean and sd.
     assert np.isfinite(score.positions.square).all()
     np.testing.assert_allclose(mode.state.misalignment, 0.0, atol=1e-6)
     places = mode.layout.misalignment

@@ -175,8 +175,8 @@ def test_rounding_removes_no_correlation_time_from_the_search():
 
 
 def test_the_estimated_prior_sd_of_a_column_is_the_rms_of_its_true_weights(calm):
-    # Prior variance of a column: sum of its squared weights / 3 effective parameters. A hyperprior
-    # of variance (ln 10)^2 = 5.3 moves ln sd 1 / (2 x 3 x 5.3) of the way to its centre.
+    # Prior variance of a column: sum of its squared weights / 3 effective parameters. A
+    # hyperprior of variance (ln 10)^2 = 5.3 moves ln sd by 3 % of the distance to its centre.
     regression, chosen, truth = calm
     true = np.sqrt(np.mean((truth.on_bias * regression.rms) ** 2, axis=0))
     np.testing.assert_allclose(chosen.posterior.prior.column_sd[0, :4], true[:4], rtol=0.25)
@@ -203,7 +203,7 @@ def test_errors_of_fitted_parameters_in_claimed_sd_have_an_rms_near_1(noisy):
     errors = truth.errors(regression, chosen.posterior)
     # Weights that the fit pruned have no sd and are not in `errors`.
     every = np.concatenate([*errors.values()])
-    # The RMS of 30 values of error / sd is uncertain by 13 %; estimated prior sd lower the RMS.
+    # The RMS of 30 values of error / sd is uncertain by 13 %; estimates of prior sd lower the RMS.
     assert len(every) > 20
     assert 0.5 < np.sqrt(np.mean(every**2)) < 1.5
     assert np.abs(every).max() < 4.0
@@ -267,7 +267,7 @@ def test_noise_is_not_reported_as_an_effect_that_the_model_lacks(noise):
     truth = Truth(noise=noise)
     windows, up = table_of(truth, 12, np.random.default_rng(1))
     _, chosen = selected_of(truth, without_starts(windows), up)
-    # An effect counts as missing if the left-out drift is twice the estimated noise.
+    # An effect counts as missing if left-out data drift by over twice the noise.
     assert not chosen.lacks_effects
     calmer = replace(chosen.posterior.prior, sigma=0.3 * chosen.posterior.prior.sigma)
     assert replace(chosen, posterior=replace(chosen.posterior, prior=calmer)).lacks_effects
@@ -406,8 +406,8 @@ def test_the_sd_of_gravity_adds_a_common_error_to_all_scale_factors():
 
 
 def test_the_drift_of_scale_factors_determines_the_sd_of_turn_on_offsets():
-    # WHY: nine constants fit |f| of nine positions exactly, so the estimated offset sd was
-    # 5 ug instead of 300 ug, and the constants were wrong by 75 claimed sd.
+    # WHY: nine constants fit |f| of nine positions exactly: the estimated sd of turn-on offsets
+    # was 5 ug instead of 300 ug, and the constants were wrong by 75 claimed sd.
     on_scale = np.outer([1.0, -0.7, 1.3], [1e-4, 0.0, 0.0, 0.0, 0.0, 0.0])
     truth = Truth(offset_sd=300.0 * MICRO, sigma=np.full(3, 0.5 * MICRO), on_scale=on_scale)
     windows, up = table_of(truth, 9, np.random.default_rng(2), n_windows=60)

@@ -57,9 +57,9 @@ def windows_of(bags):
 
 
 def test_a_rest_partly_in_the_range_of_the_model_is_used_there_only(bags):
-    # WHY: an update by three positions that reached 3 K beyond the range of the prior, in a unit
-    # whose bias and scale had changed by 100 ug and 100 ppm, increased its error from 270 to
-    # 600 ug; without the windows beyond the range the update leaves 162 ug.
+    # WHY: bias and scale of a unit had changed by 100 ug and 100 ppm. An update by positions that
+    # reached 3 K beyond the range of the prior increased the error from 270 to 600 ug; without the
+    # windows beyond the range the update leaves 162 ug.
     everything = windows_of(bags)
     lower, upper = np.quantile(everything.temperature, (0.3, 0.7))
     for range_c, is_used in (((lower, upper), True), ((90.0, 95.0), False)):
@@ -70,8 +70,8 @@ def test_a_rest_partly_in_the_range_of_the_model_is_used_there_only(bags):
 
 
 def test_the_sets_differ_only_with_soaks_at_several_temperatures(bags):
-    # WHY: in bags with 4 static windows of 1035 the static set was chosen freely: after a soak of
-    # 50 min the error of z was 341 ug, and is 21 ug without a difference of the sets.
+    # WHY: bags with 4 static windows of 1035 hardly determine the static curves: after a soak of
+    # 50 min the error of z was 341 ug, and is 21 ug with equal curves in both regimes.
     ramps = windows_of(bags)
     soaks = replace(ramps, weight=1.0 * (np.abs(ramps.rate) > 1e-3))
     of_sets = np.array(ramps.data.groups) == 'set'
@@ -179,8 +179,8 @@ def test_windows_with_a_silent_or_stuck_thermometer_are_left_out(bags, name, is_
         readings = Readings(readings.stamp_ns[~lost], readings.value[~lost])
     message = replace(bag, temperatures={**bag.temperatures, name: readings})
     windows = windows_of([message])
-    # A silent thermometer counts as missing after 120 s (60 s time-out, 5 intervals, a window), a
-    # stuck one after 600 s.
+    # A thermometer counts as missing within 120 s if silent (time-out of 60 s, 5 intervals between
+    # readings, and a window), within 600 s if stuck.
     seen_s = 600.0 if is_stuck else 120.0
     assert not ((windows.data.time > start + seen_s) & (windows.data.time < stop)).any()
     whole = windows_of([bag])
@@ -326,7 +326,7 @@ def test_sections_and_kelvins_of_columns_agree_with_formulas(bags):
         assert (np.diff(section) >= 0).all()
         assert np.ptp(np.bincount(section, minlength=N_SECTIONS)) <= 2
     rms = np.sqrt(np.mean(data.columns**2, axis=0))
-    # `kelvins`: RMS of a column divided by its largest slope over t: 1 for t, 2 max |t| for t^2.
+    # `kelvins`: RMS of a column / its largest slope over t (1 for t, 2 max |t| for t^2).
     lines = [0, *(k for k, column in enumerate(bank(), start=6) if column.group == 'board')]
     np.testing.assert_allclose(data.kelvins[lines], rms[lines], rtol=1e-6)
     assert data.kelvins[1] == pytest.approx(rms[1] / (2.0 * np.abs(t).max()), rel=0.02)

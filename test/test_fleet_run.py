@@ -172,7 +172,7 @@ def test_ctrl_c_while_workers_start_prints_no_traceback(tmp_path):
         stderr=subprocess.STDOUT, text=True, start_new_session=True,
     )  # fmt: skip
     pause = threading.Event()
-    # The first worker is a child of the fork server, which is a child of the command.
+    # The first worker is a child of the fork server, and the fork server a child of the command.
     while not any(map(children_of, children_of(process.pid))):
         assert process.poll() is None
         pause.wait(0.01)

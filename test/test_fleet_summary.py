@@ -20,7 +20,7 @@ MONDAY = datetime(2026, 1, 5)
 
 
 def fleet_of(n, rng, *, lots=('',), day=0.0, like=()):
-    """Draw values of n units (log-normal if logarithms are compared) or add noise to `like`."""
+    """Draw table rows of n units (log-normal if compared by logarithms) or add noise to `like`."""
     rows = []
     for i in range(n):
         cells = {}

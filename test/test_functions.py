@@ -207,10 +207,10 @@ def test_ramp_states_equal_those_of_the_memory_of_the_fit(rate):
         if isinstance(quantity, Gradient):
             assert state[place] == pytest.approx(100.0 * rate)
         elif isinstance(quantity, Lag):
-            # In `memory_on_grid` the gradient rises within 1 s, in `ramp_states` it rises at once.
+            # `gradient` rises within 1 s in `memory_on_grid`, but at once in `ramp_states`.
             assert state[place] == pytest.approx(lived[place - first], rel=2e-3), quantity
         elif isinstance(quantity, Play) and not quantity.tau_s:
-            # Plays of lags are not tested: a lag takes half an hour to change by a half-width.
+            # Plays of lags are not tested: a lag needs half an hour to change by `width_k`.
             assert state[place] == pytest.approx(-quantity.width_k * np.sign(rate))
             assert state[place] == pytest.approx(lived[place - first])
 

@@ -96,7 +96,7 @@ def test_the_corrected_rate_of_a_mems_gyroscope_has_only_noise(unit, fitted, hel
     assert rms(raw - raw.mean(axis=0)) > 100.0 * FLOOR
     assert rms(changes) < 1.15 * FLOOR
     assert (np.sqrt(np.mean(changes**2, axis=0)) < 1.3 * FLOOR).all()
-    # Expected: claimed variance without sample noise, plus (Earth's rate)^2 / 3 per axis.
+    # Expected square of a mean rate: claimed variance less sample noise + (Earth's rate)^2 / 3.
     message = gyroscope.noise_density_rad_s_sqrt_hz[0] ** 2 / calibration.unit.cycle_time_s
     claimed = np.sqrt(out.angular_rate_variance.mean(axis=0) - message + EARTH_RATE**2 / 3.0)
     assert (np.abs(means.mean(axis=0)) < 3.0 * claimed).all()
@@ -137,7 +137,7 @@ def test_a_gyroscope_does_not_change_the_accelerometer_s_fit(unit):
     (messages,) = (finding.message for finding in result.findings if finding.name == 'rate')
     assert messages == 'first: not every sample has an angular rate, so no gyroscope was fitted'
     assert 'rate' not in {finding.name for finding in (*with_rate.findings, *without.findings)}
-    # If the stated |f| of rests differs, the file says, too, why it has no gyroscope.
+    # If the stated |f| differs between rests, the file says, too, why it has no gyroscope.
     known = KnownForce('stated', (Section(0.0, math.inf, 1.002 * STANDARD_GRAVITY, 0.0),))
     result = fit([replace(plain[0], force=known), plain[1]], options)
     notes = result.calibration.provenance.notes

@@ -97,7 +97,7 @@ def test_a_move_between_two_parts_of_a_recording_gives_two_rests(rng):
 
 def test_recordings_that_are_not_parts_of_one_are_not_joined(rng):
     whole = recorded(rng, 400.0)
-    # After a pause of up to 60 s parts are joined; in a longer one the unit may have restarted.
+    # Parts are joined after a pause of up to 60 s; in a longer pause the unit may have restarted.
     for pause_s, n in ((1.0, 1), (50.0, 1), (61.0, 2)):
         assert len(joined(reduced(cut(whole, (200.0,), pause_s=pause_s)))) == n
     known = KnownForce('part', parse_sections('0 400 2.0'))

@@ -79,7 +79,7 @@ def judged(bag, calibration, **keys):
 
 
 def made(residual, raw, claimed, n=40, dynamic=10, outside=0):
-    """Make windows of one position, z up, from residual, raw residual and claimed sd [ug]."""
+    """Make windows of one position, z up, with residual, raw residual and claimed sd [ug]."""
     force, constant = np.zeros((n, 3)), np.zeros((n, 3))
     force[:, 2] = GRAVITY + residual * MICRO_G
     constant[:, 2] = GRAVITY + raw * MICRO_G
@@ -138,7 +138,7 @@ class TestWindows:
     @pytest.mark.parametrize('rate_hz', [0.5, 1.0, 3.0, 4.0, 50.0])
     @pytest.mark.parametrize('window_s', [60.0, 120.0])
     def test_windows_at_rest_have_the_stated_length(self, tmp_path, rate_hz, window_s):
-        # WHY: at 4 Hz windows consisted of cells of 32 samples (8 s): 10 s windows lasted 16 s.
+        # WHY: at 4 Hz windows consisted of means of 32 samples (8 s): 10 s windows lasted 16 s.
         bag = resting(tmp_path / 'bag', 20.0, minutes=20.5, rate_hz=rate_hz, noise=0.3)
         windows = judged(bag, calibration(), window_s=window_s).windows
         assert windows.window_s == window_s
@@ -318,7 +318,7 @@ class TestVerdict:
         _, upper = CLAIMING.static.temperature_range_c
         judgement = judged(resting(tmp_path / 'out', upper + 2.0), CLAIMING)
         assert judgement.kind is Verdict.OUTSIDE
-        # WHY: the message named temperatures only, also for windows outside the range of rates.
+        # WHY: for windows outside the range of rates, the message named temperatures only.
         assert '+0.00 K/min; calibrated at 5.0 to 35.0 degC and -1.00 to +1.00' in judgement.reason
         assert f'at {upper + 2.0:.1f} to {upper + 2.0:.1f} degC' in judgement.reason
         # A soak 0.01 K above the range counts as inside, because thermometer noise may be 0.01 K.
@@ -401,7 +401,7 @@ def test_an_axis_that_repeats_one_value_in_a_rest_is_named(tmp_path):
 
 
 def test_a_bag_with_temperatures_in_kelvins_is_refused(tmp_path):
-    # WHY: the verdict on such a bag was only that its temperatures are outside the calibration's.
+    # WHY: the verdict on a bag in kelvins was only that it is outside the calibrated temperatures.
     bag = resting(tmp_path / 'hot.mcap', 293.15)
     with pytest.raises(
         RecordingError, match=r'hot\.mcap: temperature/board reads 293\S* degC .* kelv'

@@ -39,7 +39,7 @@ def test_a_value_with_the_last_stamp_replaces_the_last_value():
 def test_the_variance_of_a_lag_after_a_gap_agrees_with_the_formula():
     bank = LagBank((100.0, 1000.0))
     bank.step(0, 0.0)
-    # A gap of 50 s adds variance to a lag if it exceeds tau / 10: for tau = 100 s, not for 1000 s.
+    # A gap above tau / 10 adds variance to a lag: 50 s do so for tau = 100 s, not for 1000 s.
     bank.step(50 * SECOND_NS, 2.0)
     lost = 2.0 * (1.0 - math.exp(-0.5))
     assert bank.extra == pytest.approx([lost**2, 0.0])
@@ -114,10 +114,10 @@ def test_the_lag_of_a_part_coupled_to_board_and_case_agrees_with_a_solver(rng):
     np.testing.assert_allclose(board - streamed[:, 0], part, atol=1e-5)
     on_grid = memory_on_grid(spec, 30.0, board, [case - board])
     np.testing.assert_allclose(on_grid[:, [0, 2, 4]], streamed[:, [0, 2, 4]], atol=1e-9)
-    # In a part's lag the lagged gradient has a negative sign: the states' covariance is below 0.
+    # The lag of a part contains the lagged gradient with a minus sign: their covariance is < 0.
     P = start_covariance(spec.lags)
     assert P[0, 1] < 0.0 < P[0, 0] + 2.0 * P[0, 1] + P[1, 1]
-    # The age of a lag with two inputs counts from the first value of the later input.
+    # The age of a lag with two inputs counts from the first value of the input that begins later.
     late = ThermalMemory(spec)
     late.board_step(0, 20.0)
     late.banks['case'].step(600 * SECOND_NS, 1.0)
@@ -163,7 +163,7 @@ def test_the_prior_of_the_initial_state_of_two_stages_is_that_of_a_random_walk(r
         parts[:, 0] *= math.exp(-step / tau[0])
         parts[:, 1] += (parts[:, 0] - parts[:, 1]) * -math.expm1(-step / tau[1])
     P = start_covariance([TWO_STAGES])
-    # The variance of n draws is uncertain by sqrt(2 / n) = 2.2 %; a step is 4 % of tau = 150 s.
+    # The variance of n draws is uncertain by sqrt(2 / n) = 2.2 %; time step: 4 % of tau = 150 s.
     assert np.mean(parts[:, 1] ** 2) == pytest.approx(P[0, 0], rel=0.11)
     for age in (150.0, 900.0, 2700.0):
         first = parts[:, 0] * math.exp(-age / tau[0])
@@ -188,8 +188,8 @@ def plays(*widths):
 
 
 def test_the_hysteresis_loop_of_a_play_agrees_with_the_formula():
-    # The output of a play with half-width 1 K is v - 1 while its input v rises, v + 1 while v
-    # falls, and constant after a reversal until v has changed by 2 K.
+    # The output of a play operator (half-width 1 K) is v - 1 while its input v rises, v + 1 while
+    # v falls, and constant after a reversal until v has changed by 2 K.
     memory = plays(1.0)
     way = np.concatenate((np.linspace(0, 5, 51), np.linspace(5, 0, 51), np.linspace(0, 5, 51)))
     P = []
@@ -218,7 +218,7 @@ def test_the_prior_covariance_of_initial_lag_states_agrees_with_the_formula():
 
 
 def test_the_prior_of_initial_lag_states_is_their_covariance_after_a_random_walk(rng):
-    # `start_covariance` equals that of lags after a long random walk of T_board.
+    # `start_covariance` equals the covariance of lags after a long random walk of T_board.
     D = 0.005
     tau = np.array([60.0, 240.0, 960.0])
     n, step = 4000, 6.0
@@ -228,7 +228,7 @@ def test_the_prior_of_initial_lag_states_is_their_covariance_after_a_random_walk
         e = np.exp(-step / tau)
         m = m * e + walk * (tau / step) * (1.0 - e)
     P = start_covariance([('board', t) for t in tau])
-    # The variance of n draws is uncertain by sqrt(2 / n) = 2.2 %; a step is 10 % of tau = 60 s.
+    # The variance of n draws is uncertain by sqrt(2 / n) = 2.2 %; time step: 10 % of tau = 60 s.
     np.testing.assert_allclose(m.T @ m / n, P, rtol=0.11)
 
 

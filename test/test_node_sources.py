@@ -144,7 +144,7 @@ def numbered(begin, period_s, until_s, start_s=0.0):
 @pytest.mark.parametrize('period_s', [0.01, 0.0101, 0.02, 0.05, 0.9])
 def test_two_publishers_that_send_are_never_mixed(offset, period_s):
     first = [(*message, 'own') for message in numbered(500, 0.01, 12.0)]
-    begins = 500 + 200 + offset  # first sequence number of driver 2, near driver 1's at 2 s
+    begins = 500 + 200 + offset  # first number of driver 2, near that of driver 1 at 2 s
     other = [(*message, 'other') for message in numbered(begins, period_s, 8.0, start_s=2.003)]
     sources, used = Sources(), []
     for at_s, number, name in sorted(first + other):

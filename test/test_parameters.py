@@ -105,7 +105,7 @@ def test_pages_contain_the_generated_table_of_parameters(root):
 
 def test_the_parameter_file_states_the_defaults(root):
     text = (root / 'config' / 'thermo_comp.params.yaml').read_text(encoding='utf-8')
-    # The file has the QoS settings as a comment only: they do not apply to remapped topics.
+    # The file has QoS settings only as a comment, because they do not apply to remapped topics.
     before, overrides_text = text.split('    # The defaults of the overrides:\n    #\n')
     stated = yaml.safe_load(before)['/**']['ros__parameters']
     expected = {entry.name: entry.default for entry in fields(NodeConfig)}

@@ -34,7 +34,7 @@ SOAKS = tuple(program(celsius, 25.0) for celsius in (8.0, 19.0, 34.0))
 
 
 def study_of(*name, up=9, corners=cases.HALF, held=HELD, grade=cases.navigation, **given):
-    """Return a unit and its bags: for a fit, in directions `up` (or their number); held-out."""
+    """Return a unit and a study: fit bags in directions `up` (or their number), held-out bags."""
     rng = rng_of(*name)
     unit = grade(rng, **given)
     is_mems = grade is not cases.navigation
@@ -98,7 +98,7 @@ def test_lags_of_parts_coupled_to_board_and_case_are_fitted():
     parts = {term.part for term in calibration.response if term.kind == 'board'}
     assert {part.second_tau_s for part in parts} == {0.0}
     taus, _, shares, leads = np.array(sorted(parts)).T
-    # Ramps determine time constants to 1 %, and the case's share in a part's input to 0.01.
+    # Ramps determine time constants to 1 %, and the share of T_case in a part's input to 0.01.
     assert taus == pytest.approx(unit.part_s, rel=0.02)
     assert shares == pytest.approx(case_share, abs=0.02)
     assert not leads.any()
@@ -108,8 +108,8 @@ def test_lags_of_parts_coupled_to_board_and_case_are_fitted():
 @pytest.mark.slow
 @pytest.mark.parametrize('sensors', [('board',), ('board', 'case')])
 def test_lags_of_the_thermometers_themselves_are_fitted(sensors):
-    # WHY: without the thermometer lag in the model the fit chose a bank of time constants instead
-    # of one per part; in a held-out program the error of |f| was 57 ug, the claimed sd 2 ug.
+    # WHY: without the thermometer lag in the model the fit chose several fixed time constants, not
+    # one per part; in a held-out program the error of |f| was 57 ug, the claimed sd 2 ug.
     given = {'part_s': PARTS_S, 'thermometer_s': 60.0, 'sensors': sensors}
     unit, study = study_of('slow thermometer', **given)
     calibration = strangers.fitted(study)
@@ -134,7 +134,7 @@ def test_with_a_coarse_or_noisy_thermometer_the_fit_is_as_good_as_a_cubic_by_sci
     bags = [minutes(bag) for bag in study.tests['']]
     correct = strangers.scipy_baselines(study)['cubic']
     by_cubic = strangers.error_of([correct(bag) for bag in bags], bags, is_drift=False)
-    # The ratio (error of the fit) / (error of the cubic) of a unit scatters by some 20 %.
+    # Between units the ratio (error of the fit) / (error of the cubic) scatters by some 20 %.
     assert ours.vector < 1.2 * by_cubic.vector
     assert ours.ratio < 1.5
 
@@ -216,7 +216,7 @@ def test_a_bump_of_the_bias_over_temperature_is_fitted_by_knees():
     # The three stated groups of columns make the fit three times as fast as a choice of groups.
     calibration = strangers.fitted(study, groups=('curve', 'part', 'bend'))
     judgement = judged(calibration, study)
-    # The bump is a bell curve (sd 0.85 K) of the bias, fitted by straight lines of 0.5 K each.
+    # The bump of the bias, a bell curve (sd 0.85 K), is fitted by straight lines of 0.5 K each.
     assert judgement.norm < 60.0
     assert judgement.norm_ratio < 1.5
 
@@ -289,7 +289,7 @@ def test_the_claimed_sd_between_two_soaks_includes_the_undetermined_curve():
 
 @pytest.mark.slow
 def test_the_claimed_sd_includes_a_curve_that_soaks_do_not_determine():
-    # WHY: each axis is vertical at one temperature only; errors were 15 times the claimed sd.
+    # WHY: with each axis vertical at one temperature only, force errors were 15 claimed sd.
     _, study = study_of('confounded soaks', up=np.vstack((FACES, np.eye(3))), corners=SOAKS)
     assert judged(strangers.fitted(study), study).ratio < 1.5
 
@@ -322,7 +322,7 @@ def test_a_bias_decay_after_power_on_is_not_fitted_by_a_lag():
         for way, n in ((cases.WARM, 12), (cases.WARM_HELD, 4))
     )
     study = cases.Study('', fit, cases.one_test(held), {'full_scale': 32767.0})
-    # The bias decay has an RMS of 0.32 mg over a bag, and a smaller mean, which constants absorb.
+    # The decay of the bias has an RMS of 0.32 mg; its mean, below 0.32 mg, is in the constants.
     assert judged(strangers.fitted(study), study).vector < np.sqrt(2.0) * 320.0
 
 

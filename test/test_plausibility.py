@@ -44,7 +44,7 @@ def soak(tracker, celsius=20.0, seconds=60, start_s=0):
 
 
 def test_the_first_reading_of_a_sensor_may_be_wrong():
-    """A DS18B20 reads 85 degC before its first conversion; six of ten later ones must be used."""
+    """A DS18B20 reads 85 degC before its first conversion; six of ten later readings are used."""
     tracker = tracker_of()
     tracker.read('board', 0, 85.0)
     tracker.read('board', SECOND_NS, 85.0)
@@ -125,7 +125,7 @@ def test_a_frozen_sensor_is_detected_by_changes_of_the_second_sensor(sensor, fro
 
 @pytest.mark.parametrize('sensor', ['board', 'case'])
 def test_a_jump_that_stays_is_claimed_until_the_readings_jump_back(sensor):
-    # WHY: three lags after a jump by 5 K the claimed sd of the temperature had forgotten the jump.
+    # WHY: three lags after a jump by 5 K the claimed sd of the temperature no longer covered it.
     tracker = tracker_of(memory=LAG)
     place = VAR_BOARD if sensor == 'board' else VAR_GRADIENT
     for second in range(12_000):
@@ -194,7 +194,7 @@ def test_no_fault_is_reported_of_a_working_unit_in_a_chamber(preset, sensor):
         assert tracker.checks['case'].fault == Fault.NONE
 
 
-# The preset 'mems' is left out: its board lags the case by seconds, a difference below 1 K.
+# The preset 'mems' is left out: its board lags the case by seconds, so they differ by < 1 K.
 @pytest.mark.parametrize(
     ('preset', 'sensor'),
     [

@@ -28,7 +28,7 @@ from thermo_comp.unit.prediction import in_a_soak
 
 PROGRAM = parse_cyclogram('20 5min, 33@1 15min, 8@1 15min')
 KIND = triad('products', 1)
-#: Groups of columns that the unit needs: a third of all columns, half of the fit's time.
+#: Groups of columns that the unit needs: with a third of all columns a fit takes half the time.
 OPTIONS = FitOptions(STANDARD_GRAVITY, groups=('curve', 'board', 'product'))
 
 
@@ -116,7 +116,7 @@ def test_chance_correlations_between_parameters_of_twelve_units_are_reduced(rng)
     n = layout.n_parameters
 
     def share_left(units, k):
-        """Return the share of the variance of parameter k that all others do not explain."""
+        """Return the share of the variance of parameter k that no other parameter explains."""
         deviations = (units - units.mean(axis=0)) / np.sqrt(len(units) - 1.0)
         scatter = _scatter(deviations, layout, np.ones(3))
         return 1.0 / (np.linalg.inv(scatter)[k, k] * scatter[k, k])
@@ -172,8 +172,8 @@ def helped():
 @pytest.mark.slow
 def test_a_fit_begins_with_the_widest_of_its_priors():
     # WHY: a fit that began with the narrow prior of three units found mounting offsets of 190 ug,
-    # a local minimum: |f| - g of a held-out bag was 271 ug, not 0.9 ug. WHAT: of all priors it
-    # tries, a fit begins with that of largest variance in all directions.
+    # a local minimum: |f| - g of a held-out bag was 271 ug, not 0.9 ug. WHAT: a fit tries
+    # several priors, and begins with the one of largest variance in all directions.
     *tried, widest = (prior.root.T @ prior.root for prior in helped())
     assert len(tried) > 2
     root = np.sqrt(np.diag(widest))

@@ -78,7 +78,7 @@ def check_positions(result):
         assert np.array(position['up']) @ up > np.cos(np.radians(1.0))
         assert position['reason'] == ''
         assert set(position['thermometers']) == {'board', 'case', 'lid'}
-        # Cells (3 s at 10 Hz) next to a motion do not count as rest.
+        # Means of samples (over 3 s at 10 Hz) next to a motion do not count as rest.
         assert position['still_s'] == pytest.approx(SOAK_S, abs=20.0)
 
 

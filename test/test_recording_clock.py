@@ -150,7 +150,7 @@ def test_a_good_recording_has_no_findings(tmp_path):
         (up_and_down(5.0, 35.0), {'gap_s': 30.0, 'backwards': True},
          ['gaps between samples: 1, the longest 30.2 s',
           'samples with a stamp not later than an earlier stamp: 1; these samples are left out']),
-        # WHY: for a clock that jumps back, of which a fit leaves out 3000 samples, it stated 1.
+        # WHY: after a clock jumped back, a fit left out 3000 samples; the survey stated 1 sample.
         (up_and_down(5.0, 35.0), {'gap_s': -600.0}, ['an earlier stamp: 3000; these']),
         (up_and_down(5.0, 35.0), {'gap_s': -7200.0},
          ['than an hour (1 times): a fit takes each jump']),

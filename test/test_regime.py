@@ -73,7 +73,7 @@ def headline(sensor):
     [
         ('1 mK', 45.0, 90.0),
         pytest.param('10 mK', 150.0, 180.0, marks=pytest.mark.slow),
-        # The second step of 62.5 mK is detected, on average at 94 mK, reached after 146 +- 6 s.
+        # The second step of 62.5 mK is detected: on average at 94 mK, 146 +- 6 s after the onset.
         pytest.param('1 mK, 62.5 mK steps', 158.0, 180.0, marks=pytest.mark.slow),
         ('10 mK, 62.5 mK steps', 150.0, 180.0),
     ],
@@ -126,7 +126,7 @@ def test_each_ramp_switches_the_regime_to_dynamic_once(noise, quantum, rate_k_mi
     delays, _ = onsets(noise, quantum, rate_k_min, lag, 2 if dt < 1.0 else 3, dt=dt, end_s=end_s)
     for each in delays:
         assert [regime for _, regime, _ in each] in ([DYNAMIC], [STATIC, DYNAMIC])
-        # The slowest detection needs two steps of 1 K at 0.2 K/min behind a lag of 15 min.
+        # The slowest detection waits for two steps of 1 K, at 0.2 K/min behind a lag of 15 min.
         assert each[-1][0] < 0.5 * end_s
 
 
@@ -159,7 +159,7 @@ def test_three_soaks_of_5_h_have_at_most_two_false_alarms(sensor):
 def test_the_rate_of_false_alarms_is_below_that_of_the_setting():
     # The setting allows 20 false alarms per hour, 1000 in 50 h; the readings are noise only. The
     # threshold is set by Rice's formula for crossings; as crossings come in groups, there are
-    # fewer separate alarms. A lower limit of alarms excludes a detector that does nothing.
+    # fewer separate alarms. The lower limit 50 excludes a detector without alarms.
     settings = ThermometerSettings(0.01, lag_s=LAG_S)
     test = ChangeDetector(settings, 0.2 / 60.0, ripple=0.0, false_alarms=20.0 / 3600.0)
     rng = np.random.default_rng(6)
@@ -181,7 +181,7 @@ def test_the_rate_of_false_alarms_is_below_that_of_the_setting():
 @pytest.mark.parametrize('dt', [0.1, 1.0, 10.0])
 def test_the_threshold_follows_from_the_noise_of_the_filter(dt):
     # Expected threshold: filter gain by the Riccati equation, noise and correlation by the impulse
-    # response, alarms by Rice's formula. The first-order formulas of `_tune` differ by up to 4 %.
+    # response, alarms by Rice's formula. `_tune` has first-order formulas: errors up to 4 %.
     test = ChangeDetector(ThermometerSettings(0.01, lag_s=LAG_S), 0.2 / 60.0, 0.0, 0.02 / 3600.0)
     test._tune(dt)
     for threshold, power in zip(test._thresholds, test._powers, strict=True):

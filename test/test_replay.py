@@ -92,7 +92,7 @@ def test_replay_of_constants_needs_no_thermometer(tmp_path):
 
 
 def test_infinite_board_readings_hide_no_warning_of_the_range(tmp_path):
-    # WHY: they gave a RuntimeWarning of numpy, and the note about the range was missing.
+    # WHY: infinite readings gave a RuntimeWarning, and the note about the range was missing.
     bag, stamps = tmp_path / 'bag', START_NS + np.arange(300) * SECOND_NS
     celsius = np.full(300, 90.0)
     celsius[100:150], celsius[200:205] = np.inf, -np.inf

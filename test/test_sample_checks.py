@@ -160,7 +160,7 @@ def test_no_sample_of_a_working_sensor_is_stuck_whatever_its_bandwidth(correlati
 
 @pytest.mark.parametrize('step', [1.0, 2.0, 5.0])
 def test_a_sensor_that_is_quieter_than_its_calibration_is_not_stuck(step, rng):
-    # The calibrated noise is of a vibrating chamber; at rest noise is far below a converter step.
+    # The calibration has the noise in a vibrating chamber; noise at rest is 0.1 rounding steps.
     compensator = Compensator(noisy_unit(3.0))
     edge = np.array([0.5, 0.0, 0.5])
     centre = step * (np.round(K * GRAVITY * np.array(UP) / step) + edge)
@@ -258,7 +258,7 @@ def test_a_jump_back_in_time_does_not_restore_a_refuted_calibration(rng, is_mend
     stream(compensator, events(0.0 if is_mended else 100.0))
     assert compensator.counters.n_time_jumps == 1
     if is_mended:
-        # Output returns after three 5 s windows: the first has none before it to compare with.
+        # Output returns after three windows of 5 s, as the first has no window before it.
         assert compensator.counters.n_out - n_out == pytest.approx(4500, abs=200)
     else:
         assert compensator.counters.n_out == n_out
@@ -362,8 +362,8 @@ def test_a_smooth_coordinated_turn_is_an_acceleration_and_not_a_wrong_calibratio
 
 
 def test_a_vibration_of_whole_periods_between_readings_is_no_rest(rng):
-    # WHY: the check uses few samples, at the stamps of the readings, 1 s apart. All of them had
-    # the same phase of a vibration of 20 Hz, and looked like a rest with a wrong |f|.
+    # WHY: the check uses few samples, at the stamps of the readings, 1 s apart. In a
+    # vibration of 20 Hz these samples had equal phases, and looked like a rest with a wrong |f|.
     sway = np.sin(2.0 * np.pi * 0.2 * np.arange(5) + 1.0)
 
     def shaken(k):

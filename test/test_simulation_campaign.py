@@ -84,7 +84,7 @@ def test_a_slipping_joint_has_a_closed_hysteresis_loop():
         quick, _ = effect.change(_history(there_and_back))
         slow, _ = effect.change(_history(np.repeat(there_and_back, 7), 60.0))
         np.testing.assert_array_equal(slow[::7], quick)
-        # The joint slips at the stress of 1 K of free strain, so at 2 ug/K the bias is +-2 ug.
+        # The joint slips at a stress of 1 K (of free strain), so with 2 ug/K the bias is +-2 ug.
         assert quick[199, 0] == pytest.approx(2.0, rel=0.01)
         assert quick[-1, 0] == pytest.approx(-2.0, rel=0.02)
         # A second cycle ends with the bias of the first cycle: the hysteresis loop is closed.

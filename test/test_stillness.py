@@ -138,7 +138,7 @@ def test_the_user_can_set_the_length_of_the_shortest_rest(rng):
 
 
 def test_a_drift_in_a_ramp_is_not_taken_for_a_motion(rng):
-    # A tilt by 0.1 mrad is a motion, a drift of 60 ug per cell (30 s), 60 times its noise, is not.
+    # A tilt by 0.1 mrad is a motion; a drift of 60 ug in 30 s (noise of a mean: 1 ug) is not.
     time = np.arange(7200.0)
     stamps = START_NS + np.rint(time * 1e9).astype(np.int64)
     ramp = np.clip(time - 1800.0, 0.0, 2400.0) * 2e-3 * MG
@@ -174,18 +174,18 @@ def test_time_and_size_of_a_jump_along_gravity_are_found(rng, with_gyro):
     # The jump is between two samples, and `find_jumps` returns the interval between these samples.
     assert event.time == pytest.approx(301.0, abs=1.5 / rest.rate_hz)
     assert event.duration_s == pytest.approx(1.0 / rest.rate_hz, rel=1e-6)
-    # Trends through 250 samples (noise 3 mg) per side: sd 2 * 3 mg * sqrt(2 / 250); limit 4 sd.
+    # Step of trends through 250 samples of 3 mg per side: sd 2 * 3 mg * sqrt(2 / 250); limit 4 sd.
     np.testing.assert_allclose(np.array(event.step) / MG, (2.0, 0.0, 20.0), atol=2.2)
     assert event.along / MG == pytest.approx(20.0, abs=2.2)
-    # Trends through 20 readings (noise 20 mK) per side: sd 2 * 0.02 K * sqrt(2 / 20).
+    # Step of trends through 20 readings (noise 20 mK) per side: sd 2 * 0.02 K * sqrt(2 / 20).
     assert event.temperature_change_sd == pytest.approx(0.0126, rel=0.4)
     assert abs(event.temperature_change) < 4.0 * event.temperature_change_sd
 
 
 @pytest.mark.parametrize('rate_hz', [0.5, 2.0, 5.0])
 def test_a_jump_is_found_at_low_sample_rates(rng, rate_hz):
-    # WHY: at 2 Hz the gap of 120 samples between the rests before and after a jump was 60 s, above
-    # the limit of 30 s, so the jump was not found.
+    # WHY: at 2 Hz the gap of 120 samples between the rests before and after a jump lasted 60 s
+    # (limit: 30 s), so the jump was not found.
     rest = Rest(rng, duration_s=8000.0 / rate_hz, rate_hz=rate_hz, pace_s=4000.0)
     rest.add((0.0, 0.0, 20.0 * MG), from_s=4000.0 / rate_hz)
     source = rest.source()
@@ -274,7 +274,7 @@ def test_low_pass_filtered_noise_gives_one_rest_without_a_jump(rng, tau_s):
     bag = reduce_source(rest.source(), full_scale=None)
     assert len(bag.intervals) == 1
     assert find_jumps(bag) == ()
-    # At most 2 % of the cells, those at the ends of the rest, may count as motion.
+    # At most 2 % of the means, those at the ends of the rest, may count as motion.
     assert bag.n_still_cells > 0.98 * bag.n_cells
 
 

@@ -219,7 +219,7 @@ def test_the_scipy_cubic_fits_a_cubic_bias_and_constants_do_not():
     held = of_attitudes(given, np.array([8.0, 29]))
     forces = (by_norm([fit], order=order)(held) for order in (3, 0))
     cubic, constants = (strangers.error_of([force], [held], is_drift=False) for force in forces)
-    # The scipy cubic neglects products of small terms, e.g. misalignment times bias, below 5 ug.
+    # The cubic fitted by scipy neglects products below 5 ug, e.g. misalignment times bias.
     assert cubic.vector < 5.0
     assert constants.vector > 50.0
 

@@ -79,8 +79,8 @@ PARTS = {
 @pytest.mark.parametrize('sensor', SENSORS)
 def test_squared_errors_are_on_average_below_5_claimed_variances(errors, sensor, part):
     # In soaks and ramps the claimed variance is a few times the mean squared error, because it
-    # allows for the onset or end of a ramp at any time. Sensors with steps have few independent
-    # errors, whose mean square is uncertain by a factor of 2.
+    # allows for the onset or end of a ramp at any time. Readings with steps have few independent
+    # errors, so their mean square is uncertain by a factor of 2.
     begin, end = PARTS[part]
     rows = errors[sensor]
     rows = rows[(rows[:, 0] >= begin) & (rows[:, 0] < end)]
@@ -115,7 +115,7 @@ def test_a_change_between_steps_of_1_k_determines_the_temperature():
     assert thermometer.var_temperature == pytest.approx(1.0 / 12.0, rel=0.2)
     thermometer.update(600 * SECOND_NS, 21.0)
     assert thermometer.temperature == pytest.approx(20.5, abs=0.03)
-    # When the reading changes, the sd is the noise plus the temperature change per reading.
+    # At a change of the reading the estimate's sd is the noise plus the change between readings.
     assert 0.005 < math.sqrt(thermometer.var_temperature) < 0.03
 
 
@@ -211,7 +211,7 @@ def test_readings_that_are_not_finite_or_not_newer_do_not_change_the_state(stamp
 
 
 def test_a_reading_15_sd_from_its_prediction_is_down_weighted():
-    # A reading 6 to 30 sd off gets a noise with which it is 6 sd off; beyond 30 sd it is not used.
+    # A reading 6 to 30 sd from its prediction counts as 6 sd away; farther away it is not used.
     thermometer = settled()
     assert thermometer.update(600 * SECOND_NS, 20.015)
     assert abs(thermometer.temperature - 20.0) < 0.004
@@ -279,7 +279,7 @@ def test_the_extrapolation_is_linear_for_5_s_and_then_constant():
         assert wider > variance
     held, _, wide = thermometer.at(last_ns + 60 * SECOND_NS)
     assert held == pytest.approx(temperature + 0.05, abs=1e-5)
-    # After 5 s the extrapolation is constant; its sd is 0.01 K/s times the remaining 55 s.
+    # After 5 s the extrapolation is constant; its sd is 0.01 K/s times 55 s, the rest of 60 s.
     assert math.sqrt(wide) == pytest.approx(0.55, rel=0.05)
     assert thermometer.at(last_ns - SECOND_NS)[0] == pytest.approx(temperature - 0.01, abs=1e-5)
 

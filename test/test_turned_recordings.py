@@ -99,7 +99,7 @@ def test_an_update_after_a_new_turn_on_gives_the_mean_of_both_turn_ons():
     first = tc.fit(bags[:1], **options)
     for both in (tc.fit(bags[1:], prior=first, **options), tc.fit(bags, **options)):
         share = (bias_of(both) - bias_of(first)) / change
-        # The noise of 13 rests of 400 s gives `share`, a ratio of two bias changes, an sd of 2 %.
+        # The noise of 13 rests of 400 s gives the ratio `share` of two bias changes an sd of 2 %.
         assert np.abs(share - 0.5).max() < 0.05
 
 

@@ -31,8 +31,8 @@ from thermo_comp.unit.prediction import SlowUncertainty, bias_scale_and_sd, ramp
 
 def test_the_claimed_sd_covers_a_start_in_a_ramp():
     # WHY: after a restart in a ramp the claimed sd was a third of the error. At the start
-    # the lag of a part is unknown: 1 K in a ramp of 1 K/min (tau = 60 s), its sd 0.4 K in a soak.
-    # The claimed sd must not change if the ramp ends 40 s after the start.
+    # the lag of a part (tau = 60 s) is unknown: its sd in a soak is 0.4 K; in a ramp of 1 K/min it
+    # is 1 K. The claimed sd must not change if the ramp ends 40 s after the start.
     unit = calibration(response=(term('board', (30.0, 0.0, 0.0), tau_s=60.0),))
     sd = {}
     for rate, end in ((0.0, 60), (1.0 / 60.0, 60), (1.0 / 60.0, 40)):
@@ -194,7 +194,7 @@ def sd_at(unit, board, behind=0.0, force=0.0):
 
 def test_beyond_the_range_curve_and_lag_do_not_cancel_in_the_claimed_sd():
     # Inside the range the slopes of curve and lag over board temperature cancel. Outside of the
-    # range the sum of both slopes is unknown, so the claimed sd is that of the curve alone.
+    # range the sum of these slopes is unknown, and the claimed sd is that of the curve alone.
     parts = regime_set(axis_set((0.0, 0.5), residual_sd_m_s2=1e-6))
     lag = term('board', (-0.5, 0.0, 0.0), tau_s=600.0)
     unit = calibration(static=parts, dynamic=parts, response=(lag,))
@@ -248,7 +248,7 @@ def test_outside_its_range_a_set_follows_the_curve_of_the_other_set():
     )
     celsius = [-20.0, -7.5, -3.0, 0.0, 5.0, 30.0, 35.0, 38.0, 42.5, 60.0]
     static, dynamic = curves_at(unit, celsius)[:, 0]
-    # Outside the common range, 5 to 30 degC, both curves differ by as much as at its nearer end.
+    # Outside 5 to 30 degC, the common range, the sets differ as at the nearer end of this range.
     np.testing.assert_allclose((dynamic - static)[:5], dynamic[4] - static[4], rtol=1e-12)
     np.testing.assert_allclose((dynamic - static)[5:], dynamic[5] - static[5], rtol=1e-12)
     wavy, bent = np.polynomial.Polynomial(WAVY), np.polynomial.Polynomial(BENT)
@@ -323,8 +323,8 @@ def test_with_lags_the_sd_in_a_ramp_does_not_depend_on_the_calibrated_rates():
 
 
 def test_the_distance_of_a_squared_column_from_its_range_is_that_of_its_quantity():
-    # WHY: a lag of 10 K is 100 times the range of the bags, 0.1 K; the square of the lag is 10000
-    # times its range. For a lag counted as 10000 times its range the claimed sd was 0.1 g.
+    # WHY: a lag of 10 K is 100 times the largest lag in the bags, 0.1 K. The distance from
+    # the range was that of the squares, 10000 times the range, and the claimed sd was 0.1 g.
     unit = calibration(response=(term('square', (1.0, 0.0, 0.0), tau_s=600.0, range=(0.0, 0.01)),))
     correction = Correction(unit)
     state = np.zeros(StateLayout(correction.memory).width)

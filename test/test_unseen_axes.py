@@ -158,7 +158,7 @@ def test_rests_in_one_pose_use_the_mounting_sd_that_the_user_stated():
 )
 def test_the_claimed_sd_is_right_if_one_ramp_cannot_separate_bias_and_scale(draw, unit, is_cold):
     # WHY: thermometer noise in rests at constant temperature was taken for temperature changes
-    # without effect on the bias. The drift in the only ramp was attributed to scale factors: 470
+    # without effect on the bias. In the only ramp the drift was attributed to scale factors: 470
     # ppm/K instead of -36 ppm/K. In warm-ups of a cold unit the effect of a lag was attributed to
     # the scale factor alone.
     rng = rng_of('bench beside a ramp', unit)

@@ -165,7 +165,7 @@ def prior(
     """
     Make the prior of a type of unit from calibrations of several units.
 
-    The prior is the mean and scatter of the calibrations. With `fit --prior`
+    A prior is the mean and scatter of units' parameters. With `fit --prior`
     a further unit of the type needs less time in the chamber than without.
     Nonlinear terms (K2, K3) of the calibrations are left out.
 

@@ -70,7 +70,7 @@ def argument(text: str, default: Any = ..., **rules: Any) -> Any:
 
 
 def expanded(command: Callable[..., Any]) -> Any:
-    """Turn a command into a function of all options from which its parameters are built."""
+    """Replace parameters of a command whose defaults are functions by the functions' options."""
     makers: dict[str, Callable[..., Any]] = {}
     options: list[inspect.Parameter] = []
     for name, parameter in inspect.signature(command).parameters.items():

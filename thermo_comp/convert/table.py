@@ -81,7 +81,7 @@ class Stamp:
 
 @dataclass(frozen=True)
 class Table:
-    """Columns of a table, in file order, shape (n,)."""
+    """Columns of a table of n rows, in file order."""
 
     line: Ints  # line of each row in the file, from 1; in Parquet the number of the row
     values: dict[Column, Floats]  # NaN if a cell is not a number

@@ -5,7 +5,7 @@ Owns the informative prior of a fit, from a calibration of the unit or its type 
 
 The mean and the covariance of the Gaussian prior of the regression are the parameters of the
 calibration and their covariance, increased by the ageing of the unit since the calibration. The
-regression has the columns of the calibration.
+regression has this calibration's columns, without a selection.
 """
 
 from __future__ import annotations

@@ -333,7 +333,7 @@ def span_of(bag: ReducedBag) -> tuple[int, float]:
 def widest(bags: Sequence[ReducedBag]) -> int:
     """Return the index of the bag with the widest range of T_board; if several, the longest."""
     spans = [float(np.ptp(bag.board.value)) if len(bag.board.value) else 0.0 for bag in bags]
-    # Ranges within 5 % and durations equal in whole minutes count as equal: take the first bag.
+    # Of bags with equal range (within 5 %) and duration (in whole minutes), take the first.
     candidates = [i for i, span in enumerate(spans) if span >= 0.95 * max(spans)]
     return max(candidates, key=lambda i: (round((bags[i].end_ns - bags[i].start_ns) / 60e9), -i))
 

@@ -31,7 +31,7 @@ class Truth:
     The true bias, scale and force of a run, on the thermal grid (m points) and in the n conversion
     cycles of the accelerometer.
 
-    Bias is in counts per cycle (`rate_bias`: in rad/s), scale is relative; `bias_grid` is
+    Bias is in counts per conversion (`rate_bias`: rad/s), scale is relative; `bias_grid` is
     `thermal_bias` plus a random walk. `cycle_s` are the middles of the cycles [s].
     `specific_force` is constant, (3,), or in a rotation the force in each cycle, (n, 3).
     """

@@ -183,7 +183,7 @@ def start_covariance(lags: Sequence[tuple[Any, ...]]) -> Floats:
 def start_root(lags: Sequence[tuple[Any, ...]]) -> Floats:
     """
     Return a matrix whose product with its transpose is `start_covariance`, shape (n, number of
-    first-order lags) [K]. The covariance may be singular, as of two nearly equal lags.
+    first-order lags) [K]. `start_covariance` may be singular: two lags may be nearly equal.
 
     The input before the first reading is modelled as a random walk with ``D = 2 sd^2 /
     START_TAU_S`` [K^2/s]: lags k, l of one input have the covariance ``P_kl = D tau_k tau_l /

@@ -37,8 +37,8 @@ STILL_S: Final = 5.0
 STILL_PROBABILITY: Final = 1e-9
 #: Number of equal readings in a row that are doubtful if the quantum is not far above the noise.
 DOUBTFUL_READINGS: Final = 4
-#: A sensor with constant readings counts as frozen if the other sensor's temperature changes by
-#: more than its noise, the quanta and this margin [K]; the second: if quantum far exceeds noise.
+#: Constant readings of a sensor count as frozen if the other sensor's temperature changes by more
+#: than its noise, the quanta and a margin [K]; `BEYOND_CELL`: if quantum far exceeds noise.
 OTHER_MOVED: Final = 0.3
 OTHER_MOVED_BEYOND_CELL: Final = 0.7
 #: Largest assumed error of a sensor with constant readings [K].
@@ -313,7 +313,7 @@ class LeadCheck:
         self._is_against = False
 
     def update(self, is_static: bool) -> None:
-        """Use the last estimates of both sensors; called after each reading of the case."""
+        """Compare the estimates of case and board; called after each reading of the case."""
         case, board = self._case, self._board
         calm = self._calm_rate
         if is_static or (-calm < case.rate < calm and -calm < board.rate < calm):

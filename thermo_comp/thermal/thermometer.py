@@ -60,7 +60,7 @@ class Thermometer:
     `interval_s`: typical interval between readings; `n_in_row`: number of readings since the
     filter last started; `n_restarts`: starts after a gap or a step; `is_ready`: `n_in_row` is 2 or
     more, which gives a rate. `measured` and its variance: the last reading or, if the quantum far
-    exceeds the noise, a Gaussian measurement of equal information (none: infinite variance).
+    exceeds the noise, a Gaussian measurement in its place (infinite variance: no information).
     `bending`: probability of the bending mode, in which the acceleration changes.
     """
 

@@ -51,7 +51,7 @@ class Curves:
         self._lacks = {regime: np.array(rows).T for regime, rows in enumerate(lacks) if rows}
 
     def excess(self, states: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Return distances of T_board [K] and rate [K/s] from the ranges, also in half ranges."""
+        """Return excess of T_board [K] and rate [K/s] over fitted ranges, also in half ranges."""
         t, rate = states[BOARD] - self._reference, states[RATE]
         over, too_fast = t - hold(t, *self._t_range), rate - hold(rate, *self._rate_range)
         span, rate_span = (edges[1] - edges[0] for edges in (self._t_range, self._rate_range))
