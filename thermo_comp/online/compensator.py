@@ -133,11 +133,7 @@ class Compensator:
         return gravity, self.config.gravity_tolerance_m_s2
 
     def push(self, name: str, stamp_ns: int, celsius: float) -> None:
-        """
-        Queue a reading [degC] of ``'board'`` or of one of the calibration's `sensors`.
-
-        Raises ValueError for any other name.
-        """
+        """Queue a reading [degC]; a thermometer that the calibration lacks has no effect."""
         self.thermal.push(name, stamp_ns, celsius)
         self.event_ns = min(self.event_ns, stamp_ns)
         self.reading_ns = max(self.reading_ns, stamp_ns)
