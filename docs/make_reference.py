@@ -190,7 +190,7 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | a temperature stamped more than 5 s after the next reading of the same thermometer | the reading is not used |
 | a sample whose stamp repeats, or goes back by less than a second | dropped, counted |
 | a sample stamped more than 15 s (or ten cycles, if longer) after the last sample, until a reading or a second sample confirms the time | dropped, counted |
-| a sample whose stamp goes back by a second or more | dropped, counted, until a second sample confirms the time; then all estimators restart, which is reported once |
+| a sample whose stamp goes back by a second or more | all estimators restart, which is reported once |
 
 [Faults](faults.md) lists every fault with its test.
 """

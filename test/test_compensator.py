@@ -188,24 +188,6 @@ def test_a_sample_with_a_stamp_20_s_ahead_is_dropped_unless_the_next_stamp_agree
         assert compensator.counters.n_time_jumps == 0
 
 
-@pytest.mark.parametrize(
-    'run', [lambda *given: stream(*given)[1], lambda *given: batch(*given).index.tolist()]
-)
-def test_a_jump_back_of_the_stamps_needs_a_second_sample(run):
-    # WHY: in a flight one sample stamped 0 in 40 s reset the lags: 237 ug instead of 9 ug.
-    usual = 10**12 + np.arange(1, 6) * SECOND_NS // 100
-    for stamps, kept, n_jumps in (
-        (np.insert(usual, [2, 2, 4], 0), [0, 1, 4, 5, 7], 0),
-        # The fourth sample confirms the time of the third; then there is no board temperature.
-        (np.where(np.arange(5) < 2, usual, usual - 2 * SECOND_NS), [0, 1], 1),
-    ):
-        compensator = Compensator(thermal_calibration())
-        samples = [('accel', int(at), (1.0, 2.0, 3.0 + k)) for k, at in enumerate(stamps)]
-        assert run(compensator, [('board', 10**12, 20.0), *samples]) == kept
-        assert compensator.counters.n_time_jumps == n_jumps
-        assert compensator.counters.n_out_of_order == (1 if n_jumps else 3)
-
-
 @pytest.mark.parametrize('is_read', [False, True])
 def test_a_reading_with_a_near_stamp_confirms_a_sample_20_s_ahead(is_read):
     compensator = Compensator(thermal_calibration())

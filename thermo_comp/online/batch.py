@@ -105,12 +105,11 @@ def _runs(compensator: Compensator, stamps: Stamps, arrivals: _Arrivals) -> list
     for number, stamp_ns in enumerate(stamps.tolist()):
         while waiting and waiting[-1][0] <= number:
             compensator.reading_ns = max(compensator.reading_ns, waiting.pop()[3])
-        is_back = stamp_ns <= last_ns - TIME_JUMP_NS
-        if (stamp_ns <= last_ns and not is_back) or compensator.is_leap(stamp_ns):
-            continue
-        if is_back:
+        if stamp_ns <= last_ns - TIME_JUMP_NS:
             runs.append([])
             compensator.reading_ns = EVER_NS
+        elif stamp_ns <= last_ns or compensator.is_leap(stamp_ns):
+            continue
         runs[-1].append(number)
         compensator.last_ns = last_ns = stamp_ns
     compensator.last_ns = before_ns

@@ -34,8 +34,7 @@ from .status import CompensatorConfig, Counters, GravityResidual
 #: Smallest backward step of the stamps that counts as a jump of time, as in a looped bag [ns].
 TIME_JUMP_NS: Final = 1_000_000_000
 #: A forward step of the stamps above both limits ([ns], [cycles]) is accepted only if a reading or
-#: a second sample confirms the step, a jump back only if a second sample confirms the jump;
-#: otherwise a damaged stamp would erase the thermal memory.
+#: a second sample confirms the step; otherwise a damaged stamp would erase the thermal memory.
 LEAP_NS: Final = 15_000_000_000
 LEAP_CYCLES: Final = 10.0
 #: Age above which a board temperature is stale: number of reading intervals, and lower bound [s].
@@ -194,13 +193,12 @@ class Compensator:
 
     def _process_first(self, stamp_ns: int, x: float, y: float, z: float) -> Corrected | None:
         """Correct and check the first sample after a reading or the end of a segment."""
-        is_back = stamp_ns <= self.last_ns - TIME_JUMP_NS
-        if (stamp_ns <= self.last_ns and not is_back) or self.is_leap(stamp_ns):
-            self.counters.n_out_of_order += 1
-            return None
-        if is_back:
+        if stamp_ns <= self.last_ns - TIME_JUMP_NS:
             self.jump_back(stamp_ns)
             self.reading_ns = EVER_NS
+        elif stamp_ns <= self.last_ns or self.is_leap(stamp_ns):
+            self.counters.n_out_of_order += 1
+            return None
         thermal = self.thermal
         thermal.flush(stamp_ns)
         fresh_ns = thermal.fresh_until_ns
@@ -241,11 +239,10 @@ class Compensator:
         return None if self.is_refusing else row
 
     def is_leap(self, stamp_ns: int) -> bool:
-        """Whether a stamp is too far ahead, or behind, to be accepted from a single sample."""
+        """Whether a rising stamp is too far ahead to be accepted from a single sample."""
         leapt_ns, self.leapt_ns = self.leapt_ns, None
         near_ns = stamp_ns - self.leap_ns
-        is_ahead = self.last_ns != EVER_NS and max(self.last_ns, self.reading_ns) < near_ns
-        is_far = is_ahead or stamp_ns < self.last_ns
+        is_far = self.last_ns != EVER_NS and max(self.last_ns, self.reading_ns) < near_ns
         if is_far and (leapt_ns is None or stamp_ns <= leapt_ns):
             self.leapt_ns = stamp_ns
             self.event_ns = EVER_NS  # the next sample is checked by `is_leap`, too
