@@ -13,7 +13,7 @@ from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, FitSource, normal_gravity
 from thermo_comp.fitting.raw_checks import judge_bags
 from thermo_comp.fitting.reduction import Readings, is_spike, reduce_source, rounding_sd
-from thermo_comp.fitting.sensors import learn_detector, learn_thermometer
+from thermo_comp.fitting.sensors import averaged, learn_detector, learn_thermometer
 from thermo_comp.recording.stillness import CellAccumulator
 from thermo_comp.simulation.campaign import positions
 from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
@@ -397,3 +397,46 @@ def test_a_turn_between_constant_samples_is_not_taken_for_a_step_of_the_converte
     rest.accel[rest.time > 300.0] = (GRAVITY, 0.0, 0.0)
     bag = reduce_source(rest.source(), full_scale=None)
     assert len(bag.intervals) == 2
+
+
+def dense(rng, noise_sd, quantum=0.0):
+    """Return a bag with readings at 10 Hz of a temperature that rises by 0.01 K/s."""
+    stamp = stamps(6000, 10.0)
+    celsius = 20.0 + 1e-11 * (stamp - START_NS) + noise_sd * rng.standard_normal(len(stamp))
+    celsius = np.rint(celsius / quantum) * quantum if quantum else celsius
+    bag = reduced([block(still(rng, 30.0, UP))])
+    return replace(bag, temperatures=dict.fromkeys(('board', 'case'), Readings(stamp, celsius)))
+
+
+def test_dense_readings_are_averaged_over_steps_and_have_the_noise_of_a_mean(rng):
+    bag, noise = dense(rng, 0.05), ThermometerSettings(noise_sd_c=0.05)
+    # Averaging must leave an impossible reading and its neighbours as they are.
+    bag.board.value[3000] = 85.0
+    detector = DetectorSettings(board=noise, case=noise)
+    means, settings = averaged(bag, detector, ('board', 'case'), 2.0)
+    for readings, sensor in ((means.board, settings.board), (means.case, settings.case)):
+        assert sensor.noise_sd_c == pytest.approx(0.05 / np.sqrt(20.0), rel=0.01)
+        is_mean = np.diff(readings.stamp_ns, prepend=0) > 1_500_000_000
+        error = readings.value - 20.0 - 1e-11 * (readings.stamp_ns - START_NS)
+        # An sd estimated from some 300 means has a relative sd of 1 / sqrt(2 * 300) = 4 %.
+        assert np.std(error[is_mean]) == pytest.approx(sensor.noise_sd_c, rel=0.16)
+    assert 85.0 in means.board.value
+    assert averaged(bag, detector, ('board', 'case'), 0.1) == (bag, detector)
+
+
+def test_means_of_equal_dense_readings_are_equal(rng):
+    bag = dense(rng, 0.05)
+    bag.board.value[:] = 20.1
+    means, _ = averaged(bag, DetectorSettings(), ('board', 'case'), 1.7)
+    assert set(means.board.value) == {20.1}
+
+
+def test_of_dense_readings_with_a_wide_quantum_each_change_is_kept(rng):
+    bag = dense(rng, 0.0, quantum=0.5)
+    wide = ThermometerSettings(quantum_c=0.5)
+    detector = DetectorSettings(board=wide, case=wide)
+    kept, settings = averaged(bag, detector, ('board', 'case'), 2.0)
+    assert settings == detector
+    changed = np.flatnonzero(np.diff(bag.board.value)) + 1
+    assert np.isin(bag.board.stamp_ns[changed], kept.board.stamp_ns).all()
+    assert len(kept.board.value) <= 301 + len(changed)

@@ -164,10 +164,12 @@ class TestWindows:
         # A mean over 100 samples with a noise of 0.3 counts has a noise of 0.1 mm/s^2.
         assert np.sqrt(np.mean(windows.residual**2)) < 3.0 * 0.3 / K / 10.0
 
-    def test_residuals_of_white_noise_agree_with_their_claimed_sd(self, tmp_path):
-        # The calibration has the density of the bag's white noise, 0.3 counts per sample at 10 Hz.
-        knows = of_noise(0.3 / K)
-        bag = resting(tmp_path / 'bag', 20.0, minutes=40.0, noise=0.3)
+    @pytest.mark.parametrize('rate_hz', [10, 40])
+    def test_residuals_of_white_noise_agree_with_their_claimed_sd(self, tmp_path, rate_hz):
+        # The calibration, at 10 Hz, has the density of the bag's white noise: 0.3 counts per
+        # sample at 10 Hz, 0.6 at 40 Hz.
+        knows, noise = of_noise(0.3 / K), 0.3 * np.sqrt(rate_hz / 10.0)
+        bag = resting(tmp_path / 'bag', 20.0, minutes=40.0, rate_hz=rate_hz, noise=noise)
         windows = judged(bag, knows, window_s=10.0).windows
         ratio = windows.residual / windows.claimed_sd
         # The RMS of 240 standard normal numbers is 1 within 3 / sqrt(2 * 240) = 0.14.

@@ -17,8 +17,9 @@ from operator import itemgetter
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
+from ..thermal.plausibility import LARGEST_STEP
 from ..thermal.settings import OBVIOUS_SHARE, RAMP_K_MIN, DetectorSettings, ThermometerSettings
-from ..typing import Floats
+from ..typing import Floats, Ints
 from .reduction import Readings, ReducedBag
 
 # Interval between temperature rates [s]; intervals on each side in their central difference.
@@ -254,6 +255,51 @@ def board_span(bags: Sequence[ReducedBag], reference: float) -> tuple[float, flo
         return 0.0, 0.0
     lower, upper = (np.quantile(values, (0.005, 0.995)) - reference).tolist()
     return lower, upper
+
+
+def averaged(
+    bag: ReducedBag, detector: DetectorSettings, inputs: Sequence[str], step_s: float
+) -> tuple[ReducedBag, DetectorSettings]:
+    """
+    Average readings over steps of time if there are at least two per step, as from IMU drivers.
+
+    Returned are the bag with these means as readings, and the settings with the noise of a mean.
+    `inputs`: the thermometers, the board's first; all others have the settings of the case's.
+    """
+    temperatures = {**bag.temperatures}
+    settings = [detector.board, detector.case]
+    for k, names in enumerate((inputs[:1], inputs[1:])):
+        steps = [bag.readings(name).stamp_ns // round(1e9 * step_s) for name in names]
+        n = min((len(step) / len(np.unique(step)) for step in steps if len(step)), default=1.0)
+        if n < 2.0:
+            continue
+        for name, step in zip(names, steps, strict=True):
+            if len(step):
+                temperatures[name] = _means(bag.readings(name), step, settings[k].has_cells)
+        if not settings[k].has_cells:
+            noise = np.hypot(settings[k].noise_sd_c, settings[k].quantum_c / np.sqrt(12.0))
+            settings[k] = replace(settings[k], noise_sd_c=float(noise / np.sqrt(n)), quantum_c=0.0)
+    board, case = settings
+    return replace(bag, temperatures=temperatures), replace(detector, board=board, case=case)
+
+
+def _means(readings: Readings, step: Ints, has_cells: bool) -> Readings:
+    """Average readings of equal `step`; if a reading is a cell, keep the changed readings."""
+    stamp_ns, value = readings
+    is_first = np.diff(step, prepend=-1) != 0
+    if has_cells:
+        is_first[1:] |= np.diff(value) != 0.0
+        return Readings(stamp_ns[is_first], value[is_first])
+    first = np.flatnonzero(is_first)
+    least, most = np.minimum.reduceat(value, first), np.maximum.reduceat(value, first)
+    # The tracker must see impossible steps of the readings as they are.
+    is_first |= np.repeat(most - least > LARGEST_STEP, np.diff(first, append=len(step)))
+    first = np.flatnonzero(is_first)
+    n = np.diff(first, append=len(step))
+    # Means of equal readings are equal: rounding must not hide that a sensor stands still.
+    after_ns, after = (values - np.repeat(values[first], n) for values in readings)
+    mean_ns = stamp_ns[first] + np.add.reduceat(after_ns, first) // n
+    return Readings(mean_ns, value[first] + np.add.reduceat(after, first) / n)
 
 
 def readings_in_order(bag: ReducedBag, inputs: Sequence[str]) -> list[tuple[str, int, float]]:

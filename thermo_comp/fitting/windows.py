@@ -29,7 +29,7 @@ from ..unit.columns import Column, ColumnTable, Part, memory_of
 from ..unit.functions import Polynomial, TemperatureFunction
 from .initial_triad import block_means
 from .reduction import ReducedBag, StillInterval
-from .sensors import readings_in_order
+from .sensors import averaged, readings_in_order
 from .unknowns import Windows
 
 #: Groups of columns: the curve, the difference of the static and dynamic sets, bends (changes of
@@ -438,14 +438,16 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
         still[:, BOARD] = model.reference_temperature
         end_s = 1.0 + (bag.end_ns - bag.start_ns) * 1e-9
         return Track(-1e9, 1e9 + end_s, still, np.ones(2, dtype=bool))
-    config = ThermalConfig()
-    tracker = ThermalTracker(model.detector, spec, config)
-    board, *others = tracker.thermometers.values()
     lengths_s = (float(np.median(np.diff(i.time))) for i in bag.intervals if len(i.time) > 1)
     step_s = max(min(lengths_s, default=1.0) / 5.0, 0.1)
+    inputs = spec.inputs
+    bag, detector = averaged(bag, model.detector, inputs, step_s)
+    config = ThermalConfig()
+    tracker = ThermalTracker(detector, spec, config)
+    board, *others = tracker.thermometers.values()
     step_ns, begin_ns = round(step_s * 1e9), max(int(bag.board.stamp_ns[0]), bag.start_ns)
     rows, is_heard = [], []
-    readings = iter(readings_in_order(bag, ('board', *spec.sensors)))
+    readings = iter(readings_in_order(bag, inputs))
     reading = next(readings, None)
     for stamp_ns in range(begin_ns, max(bag.end_ns, begin_ns) + step_ns, step_ns):
         # As in the node, a state depends on all readings with a stamp up to that of the state.

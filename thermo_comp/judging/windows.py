@@ -133,7 +133,9 @@ def corrected_windows(
         noise = along**2 @ np.array(Correction(calibration).noise)
         # A mean has no rounding noise: the converter adds the remainder to the next sample.
         white = along**2 @ np.square(calibration.noise_density_m_s2_sqrt_hz)
-        mean_white = white / (calibration.unit.cycle_time_s * table['count'])
+        # Samples at more than the calibrated rate have more noise each: their mean has no less.
+        covered_s = np.minimum(calibration.unit.cycle_time_s * table['count'], window_s)
+        mean_white = white / covered_s
         variance = np.maximum(table['variance'] - noise, 0.0) + mean_white
         claimed_sd = np.sqrt(variance + table['size_sd'] ** 2)
         noise_sd = np.sqrt(mean_white)
