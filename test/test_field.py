@@ -206,7 +206,7 @@ def test_a_change_of_gravity_is_not_taken_for_a_change_of_three_scales(day):
     (text,) = (line for line in change_texts(result) if 'as if gravity' in line)
     assert text.startswith('from 2026-')
     assert 'as if gravity differed from the stated 9.80665 m/s^2: no scale was changed' in text
-    # If gravity is stated as certain, the update takes the step of |f| for three scale changes.
+    # If gravity is stated as certain, the update explains the step of |f| by three scale changes.
     certain = update(series_of(stepped(history, size, day), unit), unit, is_gravity_certain=True)
     assert certain.solution.gravity == ()
     assert all(axis.scale > 150e-6 for axis in certain.axis_changes)

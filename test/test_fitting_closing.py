@@ -170,8 +170,9 @@ def test_few_norms_that_both_models_predict_do_not_select_the_model():
 
 
 def test_a_larger_model_must_not_explain_the_errors_of_a_coarse_thermometer():
-    # WHY: with readings in steps of 1 K all bags of a temperature program have equal errors. Knees
-    # of a curve halved the left-out drift, but doubled the error in other temperature programs.
+    # WHY: with readings in steps of 1 K all bags of a temperature program have equal errors. A
+    # curve with knees halved the drift error on left-out bags, but doubled that in other
+    # temperature programs.
     by_thermometer = 49.0
     curve, parts, bends = (score(drift, (), by_thermometer) for drift in (120.0, 46.0, 20.0))
     assert is_better(curve, parts)

@@ -104,7 +104,7 @@ class Dense:
             state.tilt.ravel() / prior.tilt_sd,
             state.turn_on.ravel() / prior.turn_on_sd,
             state.start.ravel() / np.sqrt(prior.start_variance_ratio),
-            # An initial lag state averaged over all bags has 0.1 of its prior sd in one bag.
+            # The mean initial lag state over all bags has 0.1 of the prior sd of one bag's state.
             state.start.mean(axis=0) / (0.1 * np.sqrt(prior.start_variance_ratio)),
         ]
         if len(state.pose):

@@ -153,11 +153,12 @@ def test_the_uncertainty_budget_adds_up_to_the_claimed_sd(tmp_path):
     standards = {source.name: source.standard for source in budget(evidence(), CertificateInfo())}
     assert standards['gravity'] is None
     assert standards['thermometers'] is None
-    # As the residual is below the claimed sd, `noise`, `attitude` and `model` add up to this sd.
+    # The claimed sd is the root sum square of `noise`, `attitude` and `model`.
     windows = evidence().judgement.windows
     claim = float(np.sqrt(np.mean(windows.claimed_sd[windows.is_inside] ** 2)))
     parts = [standards[name] for name in ('noise', 'attitude', 'model')]
     assert float(np.linalg.norm(parts)) == pytest.approx(claim)
+    # The residual is below the claimed sd.
     assert standards['repeatability'] == 0.0
     # Uncertainties of gravity and thermometers that the laboratory states are in the budget.
     info = load_certificate_info(lab(tmp_path))

@@ -91,7 +91,7 @@ def test_constant_samples_are_found_in_batches_of_any_size(parts, cuts, period):
             collected += batched.find(stamps[begin:end], samples[begin:end]).tolist()
         begin = end
     assert collected == expected
-    # `last` is NaN before the first sample.
+    # `last`, a sample and its stamp, has NaN as x, y, z before the first sample.
     np.testing.assert_array_equal(batched.last, single.last)
     for run, other in zip(single.runs, batched.runs, strict=bool(single.runs)):
         np.testing.assert_array_equal(np.hstack(run), np.hstack(other))

@@ -118,7 +118,7 @@ def _over_offsets(
     is_single = windows.n_turn_ons == 1 < n_mountings
     if scale <= 0.0:
         # An sd stated by the user is that of mounting plus turn-on offset. In the regression the
-        # mean of m mounting offsets has the variance sd^2 / m: add the other (1 - 1 / m) sd^2.
+        # bias shared by m mountings has the variance sd^2 / m: add (1 - 1 / m) sd^2, in all sd^2.
         variance = offset_sd**2 * (1.0 - 1.0 / n_mountings) if is_single else 0.0
         return posterior.covariance, offset_sd, variance
     kind = 'mounting' if is_single or windows.has_turn_ons else 'both'

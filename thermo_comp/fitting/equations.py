@@ -298,7 +298,7 @@ def without_inactive(state: State, layout: Layout) -> State:
 
 
 def with_step(state: State, step: Floats, layout: Layout) -> State:
-    """Add a step to a state; inactive weights and coefficients are set to 0."""
+    """Add a step of the unknowns to the fit's state; set inactive weights, coefficients to 0."""
     padded = np.append(step, 0.0)
     turn, pose = padded[layout.up], state.pose
     if layout.pose.size:

@@ -169,7 +169,8 @@ def _is_gradual(
 ) -> bool:
     """
     Whether a change over 0.1 K or more of the board temperature explains the samples better than a
-    step: by a factor of e^2 in likelihood. A steep curve over temperature changes so in a ramp.
+    step: by a factor of e^2 in likelihood. In a ramp a steep curve over temperature changes the
+    bias gradually, without a step.
     """
     (at, r), sd = place_and_colour, np.maximum(sd, 1e-9)
     board_s, board = _readings(bag, time[0], time[-1])

@@ -229,9 +229,9 @@ def is_near(chosen: Score, other: Score) -> bool:
 
 def _beyond_thermometer(before: Score, after: Score) -> list[tuple[float, float] | None]:
     """
-    Return the log ratios of `Score.kinds` (`Folds.gain_of`), None for a kind whose errors a coarse
-    thermometer explains. Thermometer errors repeat in all bags of one chamber program: a model
-    that fits them is better on left-out bags, but fails in another program.
+    Return for each kind of folds the log ratio of mean square errors (`Folds.gain_of`), None if a
+    coarse thermometer explains the errors. Thermometer errors repeat in all bags of one chamber
+    program: a model that fits them is better on left-out bags, but fails in another program.
     """
     is_known = before.norms.rms > _NOISE_RATIO * before.by_thermometer
     keep = (not before.is_by_thermometer, not before.is_by_thermometer, is_known)

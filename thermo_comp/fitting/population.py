@@ -209,7 +209,7 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
         return [(shortest, share**column.term.order)]
     if at == len(FINE_TAUS):
         return [(replace(column, tau_s=FINE_TAUS[-1]), 1.0)]
-    # The factors of four lags of the bank are Lagrange polynomials in log time constant.
+    # Interpolate in log time constant between four lags of the bank: Lagrange polynomials.
     first = min(max(at - 2, 0), len(FINE_TAUS) - 4)
     near = FINE_TAUS[first : first + 4]
     result = []

@@ -3,8 +3,9 @@
 """
 Owns the correction of arrays of samples; the result equals that of single samples bit for bit.
 
-Temperature readings are applied one by one. The segments between readings are collected and
-evaluated together; then all samples are corrected by the same operations as single samples.
+Temperature readings are applied one by one. The intervals of linear correction between readings
+are collected and evaluated together; then all samples are corrected by the same operations as
+single samples.
 """
 
 from collections.abc import Callable, Sequence

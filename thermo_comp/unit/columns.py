@@ -99,7 +99,7 @@ class Column:
     sensor_share: Annotated[
         float,
         QUANTITIES['share'],
-        'The part lags T_board + sensor_share * g_s (kinds board, square, cube, play, bend).',
+        "The part's T lags T_board + sensor_share * g_s (kinds board, square, cube, play, bend).",
     ] = 0.0
     lead_s: Annotated[
         _Lag,
@@ -107,7 +107,9 @@ class Column:
         '`sensor_share` is 0; 0 = none.',
     ] = 0.0
     width_k: Annotated[
-        float, QUANTITIES['width'], 'Width of kind gradient_even, half-width of a play.'
+        float,
+        QUANTITIES['width'],
+        'Kind gradient_even: `width` in its formula; kind play: half-width of the hysteresis.',
     ] = 0.0
     rest_k: Annotated[
         _Kelvin,

@@ -27,7 +27,7 @@ class Curves:
         self._reference = calibration.reference_temperature_c
         sets = calibration.regime_sets()
         edges = np.array([(part.temperature_range_c, part.rate_range_k_min) for part in sets])
-        # Edges of the ranges of both regimes, shape (2, 2, 1): lower edges, then upper edges.
+        # Edges of the fitted ranges of both regimes, (2, 2, 1): lower edges, then upper edges.
         self._t_range = (edges[:, 0].T - self._reference)[:, :, np.newaxis]
         self._rate_range = (edges[:, 1].T / 60.0)[:, :, np.newaxis]
         self._rows = [

@@ -7,8 +7,8 @@ The value of a column is ``u = form.value(x)``, ``x = (n - centre) / width``; n 
 the thermal state (`source`) or, if `is_temperature`, ``t - source``: the temperature of a part
 that lags the board by `source`, less T_ref. Notation: ``t = T_board - T_ref``, ``g_s = T_s -
 T_board`` of a sensor s, and ``q_s = g_s - rest``. The constant `rest` is 0 or, in a unit that
-heats itself, g_s in a soak. Even functions of q_s have equal values in heating and in cooling at
-the same rate.
+heats itself, g_s in a soak. Even functions of q_s = g_s - rest have equal values in heating and in
+cooling at the same rate.
 """
 
 from __future__ import annotations
