@@ -198,6 +198,23 @@ def test_the_prior_sd_of_a_slope_stays_below_the_steepest_plausible_slope():
     assert per_kelvin == pytest.approx(STEEPEST[0])
 
 
+def test_bends_have_one_prior_sd_of_the_change_of_slope():
+    # WHY: with a prior sd for each bend, rounding errors decided which bends a fit kept.
+    truth = Truth()
+    windows, up = table_of(truth, 12, np.random.default_rng(2), n_windows=20)
+    windows = replace(windows, groups=('curve', 'curve', *['bend'] * 4))
+    regression, state = begin(windows, up)
+    candidates = candidates_of(windows)
+    first, settled = (
+        settle(regression, state, replace(constants(truth), column_sd=sd), candidates).prior
+        for sd in (candidates.typical, candidates.typical * (1.0, 1.0, 0.3, 0.3, 3.0, 3.0))
+    )
+    slopes = settled.column_sd[:, 2:] / windows.kelvins[2:]
+    np.testing.assert_allclose(slopes, slopes[:, [0]] * np.ones(4), rtol=1e-9)
+    # A fit is settled if no sd changes by more than about 5 %.
+    np.testing.assert_allclose(settled.column_sd[:, 2:], first.column_sd[:, 2:], rtol=0.1)
+
+
 def test_errors_of_fitted_parameters_in_claimed_sd_have_an_rms_near_1(noisy):
     regression, chosen, truth = noisy
     errors = truth.errors(regression, chosen.posterior)

@@ -4,10 +4,12 @@
 Owns the estimation of prior sds and noises, and the removal of columns of small log Bayes factor.
 
 Each column has one prior standard deviation of its weights in the bias of all axes and one in the
-scale. Newton's steps move each sd that is not fixed to the mode of log evidence [1]_ plus the log
-of a hyperprior, which is log-normal with centre sd0 and variance tau^2 of log sd. At this mode
-``effective parameters + log(sd / sd0) / tau^2 = sum w^2 / sd^2``, w being the weights of
-the column on the three axes. Without information about a column its prior sd stays at sd0.
+scale. All bends (changes of slope at knees) have one sd of the change of slope in the bias and one
+in the scale, which are the smoothness of the curves. Newton's steps move each sd that is not fixed
+to the mode of log evidence [1]_ plus the log of a hyperprior, which is log-normal with centre sd0
+and variance tau^2 of log sd. At this mode ``effective parameters + log(sd / sd0) / tau^2 = sum w^2
+/ sd^2``, w being the weights of the column on the three axes. Without information about a column
+its prior sd stays at sd0.
 
 References
 ----------
@@ -32,7 +34,7 @@ from .gains import log_bayes_factors
 from .initial_triad import white_noise_of
 from .regression import PosteriorMode, Regression
 from .unknowns import POSE_SD, Noise, Prior, State
-from .windows import LAGS, PRODUCTS
+from .windows import BEND, LAGS, PRODUCTS
 
 #: Degrees of freedom of the half-Student prior of the sd of mounting offsets, as in [2]_.
 STUDENT_NU = 4.0
@@ -82,11 +84,19 @@ def _updated(
     prior, layout, determined = posterior.prior, posterior.layout, posterior.determined
     sd, power = prior.column_sd, np.sum(posterior.state.weights**2, axis=1)
     moves = (sd > 0.0) & ~candidates.fixed
-    safe, centre = np.where(moves, sd, 1.0), np.where(moves, candidates.typical, 1.0)
-    effective = posterior.effective_parameters
-    slope = np.log(safe / centre) / LOG_VARIANCE
-    step = _toward(effective, power, safe, slope, 1.0 / LOG_VARIANCE)
-    column_sd = np.where(moves, np.minimum(safe * np.exp(step), candidates.largest), sd)
+    centre = np.where(moves, candidates.typical, 1.0)
+    # Sds and weights relative to the typical sd of each column.
+    relative, power = np.where(moves, sd, 1.0) / centre, power / centre**2
+    effective = posterior.effective_parameters.copy()
+    for part, of_part in enumerate(moves & (np.array(regression.windows.groups) == BEND)):
+        bends = np.flatnonzero(of_part)
+        if bends.size:
+            relative[part, bends] = np.exp(np.mean(np.log(relative[part, bends])))
+            effective[part, bends] = effective[part, bends].sum()
+            power[part, bends] = power[part, bends].sum()
+    step = _toward(effective, power, relative, np.log(relative) / LOG_VARIANCE, 1.0 / LOG_VARIANCE)
+    new_sd = np.minimum(centre * relative * np.exp(step), candidates.largest)
+    column_sd = np.where(moves, new_sd, sd)
     turn_on_sd = prior.turn_on_sd
     if prior.informative is None:
         # With a prior calibration the sd of turn-on offsets keeps its value, because the few
