@@ -102,6 +102,7 @@ def test_a_reload_while_samples_flow_loses_no_sample(peer, tmp_path):
 
         # An atomic request with a wrong value changes no parameter.
         assert not peer.set_atomically(transition_time=5, calibration_file=str(broken)).successful
+        assert peer.set_atomically(no_such=5).reason == 'there is no parameter `no_such`'
         result = peer.set_atomically(transition_time=5, calibration_file=str(tmp_path / 'none'))
         assert 'none: cannot be read: No such file' in result.reason
         names = ['transition_time', 'frame_id']

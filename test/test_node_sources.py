@@ -183,6 +183,17 @@ def test_readings_of_a_second_publisher_are_not_used(peer, unit):
         assert board.stamp_ns < ros.START_NS + 20 * ros.CYCLE_NS
 
 
+def test_another_publisher_of_the_output_is_reported(peer, unit):
+    # WHY: a filter got the samples of two nodes, or raw samples of a driver, without a warning.
+    with ros.node_in_thread(*ros.node_arguments(unit)):
+        heard = peer.listen(DiagnosticArray, '/diagnostics')
+        other = peer.node.create_publisher(Imu, 'imu/data_raw', ros.DEEP)
+        text = '2 publishers on /imu/data_raw, the output of this node: its subscribers'
+        ros.status_with(peer, heard, text)
+        peer.node.destroy_publisher(other)
+        peer.poll(lambda: text not in heard[-1].status[0].message, 'a report without the warning')
+
+
 def test_a_driver_with_incompatible_qos_or_type_is_named(peer, unit):
     reliable = 'qos_overrides./accel/counts.subscription.reliability:=reliable'
     with ros.node_in_thread(*ros.node_arguments(unit, reliable)):

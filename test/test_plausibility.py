@@ -213,6 +213,20 @@ def test_swapped_topics_are_reported(preset, sensor):
     pytest.fail('the board has never led the case')
 
 
+def test_a_ramp_after_a_soak_without_board_readings_has_finite_variances():
+    # WHY: a board thermometer that started after the soak gave a variance of NaN in the ramp, and
+    # the node dropped all samples until the next soak.
+    tracker = tracker_of()
+    for second in range(120):
+        tracker.read('case', second * SECOND_NS, 20.0 + 0.004 * (-1) ** second)
+    assert tracker.detector.regime is Regime.STATIC
+    for second in range(120, 300):
+        tracker.read('board', second * SECOND_NS, 20.0 + 0.01 * (second - 120))
+        tracker.read('case', second * SECOND_NS, 20.0 + 0.05 * (second - 120))
+        assert all(map(math.isfinite, tracker.sample(second * SECOND_NS)))
+    assert tracker.detector.regime is Regime.DYNAMIC
+
+
 def test_the_warm_up_after_power_on_is_not_taken_for_swapped_topics():
     # WHY: a board that leads the case, as in the warm-up after power-on, was taken for exchanged
     # topics; the claimed sd was 20 times too large. WHAT: the board warms up by 4 K, the case by

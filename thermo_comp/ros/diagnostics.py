@@ -37,6 +37,9 @@ IDLE_S = 5.0
 AHEAD_S = 5.0
 #: Samples have stopped if none arrives for this number of conversion cycles and this time [s].
 SILENT_CYCLES, SILENT_S = 5.0, 0.5
+#: Time for which the level must be lower before this is logged [s], so that a fault that comes and
+#: goes does not fill the log.
+RELIEF_S = 5.0
 #: Largest error of |f| at rest without a warning, in standard deviations of the error.
 GRAVITY_SIGMAS = 5.0
 
@@ -72,12 +75,14 @@ Finding = tuple[int, str]  # level and text
 
 
 class Reporter:
-    """Publishes the diagnostics of a node; logs each change of their level."""
+    """Publishes the diagnostics of a node; logs each lasting change of their level."""
 
     def __init__(self, loop: WaitLoop, relay: Relay) -> None:
         self._loop, self._node, self._relay = loop, loop.node, relay
         self._publisher = loop.publisher(DiagnosticArray, STATUS.name, qos_of(STATUS))
-        self._level = DiagnosticStatus.STALE
+        #: The level in the last line of the log, and the time of the last report of this level or
+        #: a higher level.
+        self._level, self._level_s = b'', time.monotonic()
         self._n_publishers = 0
         self._last_samples = time.monotonic()
         # All counters, and the stamp of the newest sample, at the time of the last report.
@@ -124,8 +129,11 @@ class Reporter:
         array = DiagnosticArray(status=[message])
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(array)
-        if message.level != self._level:
-            self._level, log = message.level, self._node.get_logger()
+        now_s, is_lower = time.monotonic(), message.level < self._level
+        if not is_lower:
+            self._level_s = now_s
+        if message.level > self._level or (is_lower and now_s - self._level_s >= RELIEF_S):
+            self._level, self._level_s, log = message.level, now_s, self._node.get_logger()
             # rclpy refuses a line of source that logs with a second severity, so each severity has
             # a separate line.
             if message.level == DiagnosticStatus.OK:
@@ -168,6 +176,10 @@ class Reporter:
             elif not n_publishers and (mismatch := _mismatch(self._node, source.subscription)):
                 level = _ERROR if name in ('sample', 'board') else _WARN
                 yield level, f'messages of a publisher on {topic} are not received: {mismatch}'
+        output = self._relay.output_topic
+        if (n_publishers := self._node.count_publishers(output)) > 1:
+            text = f'{n_publishers} publishers on {output}, the output of this node'
+            yield _WARN, f'{text}: its subscribers receive the messages of other nodes, too'
         rests = self._relay.rests
         if rests is not None and rests.log.reason:
             lost = counted(rests.log.n_lost, 'rest')

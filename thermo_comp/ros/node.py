@@ -130,12 +130,14 @@ class CompensationNode:
         loaded, model = new or (before.loaded, before.compensator.thermal.model)
         config = parameters.updated(before.config, changes)
         self._check(loaded, config, before.compensator.thermal.inputs)
-        known = [change.name for change in changes if self.node.has_parameter(change.name)]
-        values = self.node.get_parameters(known)
+        for change in changes:
+            if not self.node.has_parameter(change.name):
+                raise parameters.ParameterError(f'there is no parameter `{change.name}`')
+        values = self.node.get_parameters([change.name for change in changes])
         try:
             after = self._relay.successor(loaded, model, config)
             self._run_with(after)
-            # rclpy refuses unknown and fixed parameters.
+            # rclpy refuses fixed parameters.
             result = self.node.set_parameters_atomically(changes)
             if not result.successful:
                 raise parameters.ParameterError(result.reason)

@@ -72,7 +72,7 @@ def read(name: str, directory: str = '') -> LoadedCalibration:
         raise CalibrationError(error.rule, name) from error
     except Exception as error:
         # No error of a file may end the node; `expanduser` raises RuntimeError for unknown users.
-        has_reason = isinstance(error, OSError) or type(error) is ValueError
+        has_reason = isinstance(error, OSError) or type(error) in (ValueError, RuntimeError)
         reason = getattr(error, 'strerror', None) or (has_reason and str(error))
         raise CalibrationError(
             f'cannot be read: {reason or type(error).__name__}', name

@@ -72,6 +72,7 @@ class Relay:
         self._check_topics(loop.node.resolve_topic_name(output))
         imu = loop.publisher(Imu, output, qos_of(IMU_OUT))
         self._publish: Callable[[bytes], None] = imu.handle.publish_raw
+        self.output_topic: str = imu.topic_name
         self._flags = [
             (loop.publisher(message_class(flag.type), flag.name, qos_of(flag)).publish, pack)
             for flag, pack in FLAGS.items()

@@ -320,7 +320,8 @@ class LeadCheck:
             self._n_alike, self.extra_variance = 0, 0.0
             stamp_ns = case.stamp_ns or 0
             self._calm_ns = stamp_ns if self._calm_ns is None else self._calm_ns
-            if is_static or stamp_ns - self._calm_ns >= _CALM_NS:
+            is_calm = is_static or stamp_ns - self._calm_ns >= _CALM_NS
+            if is_calm and board.stamp_ns is not None:
                 self._calm = (case.temperature, board.temperature)
             return
         self._calm_ns = None
