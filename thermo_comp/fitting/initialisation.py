@@ -30,7 +30,7 @@ from .options import FitOptions
 from .priors import informative_priors, offset_sd_of, with_calibration
 from .reduction import ReducedBag
 from .regression import Regression
-from .selection import LARGE_OFFSETS, Fit, fit_all, select
+from .selection import LARGE_OFFSETS, Fit, Selected, fit_all, select
 from .unknowns import BIAS_SD, SCALE_SD, InformativePrior, Prior, State, misalignment_scale
 from .windows import CURVE, PART, SET, ThermalWindows
 
@@ -132,9 +132,9 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     is_few = n_directions < POSITIONS_NEEDED
     narrow = _narrowed(prior, regression, state) if is_few else prior
     without_slow = replace(candidates, typical=candidates.typical * ~_is_slow(windows))
-    selected = select(
+    selected = _selected(
         *(regression, state, narrow, without_slow),
-        progress=lambda part: problem.progress(0.7 + 0.25 * part),
+        lambda part: problem.progress(0.7 + 0.25 * part),
     )
     chosen = selected.posterior
     full_prior = replace(chosen.prior, bias_sd=prior.bias_sd, scale_sd=prior.scale_sd)
@@ -144,6 +144,26 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     full, used = (_typical_slopes(steepness, limit, options.gravity) for limit in limits)
     claimed = candidates.typical * (full / used)[:, np.newaxis]
     return Fit(windows, regression, selected, claimed)
+
+
+def _selected(
+    regression: Regression,
+    state: State,
+    prior: Prior,
+    candidates: Candidates,
+    progress: Callable[[float], None],
+) -> Selected:
+    """
+    Select the model. If `_with_faces` has reduced the misalignment sd, also select the model with
+    the sensor's sd: this model is kept if its errors of left-out |f| are clearly smaller.
+    """
+    selected = select(regression, state, prior, candidates, progress)
+    if not prior.unseen_misalignment_sd:
+        return selected
+    full = replace(prior, misalignment_sd=prior.unseen_misalignment_sd, unseen_misalignment_sd=0.0)
+    other = select(regression, state, full, candidates, progress)
+    norms = selected.score.norms.gain_of(other.score.norms)
+    return other if norms is not None and norms[0] > 2.0 * norms[1] else selected
 
 
 def _updating_priors(
