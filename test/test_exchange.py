@@ -368,6 +368,18 @@ def test_kalibr_files_without_bias_and_with_several_imus_are_read():
         import_calibration(f'imu0:\n{imu}imu1:\n{imu}', serial='7')
 
 
+def test_rate_and_noise_that_a_kalibr_file_states_are_imported():
+    # WHY: the calibration of a file with 400 Hz had 200 Hz, at which the node drops samples.
+    imu = 'imu0:\n  accelerometers:\n    M: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n'
+    text = f'{imu}  update_rate: 400.0\n  accelerometer_noise_density: 0.0025\n'
+    back = import_calibration(text, serial='7')
+    assert (back.unit.cycle_time_s, back.noise_density_m_s2_sqrt_hz) == (0.0025, (0.0025,) * 3)
+    assert import_calibration(text, serial='7', cycle_time_s=0.01).unit.cycle_time_s == 0.01
+    assert import_calibration(imu, serial='7').unit.cycle_time_s == 0.005
+    with pytest.raises(CalibrationError, match=r'imu0\.update_rate: must be 0 or more'):
+        import_calibration(f'{imu}  update_rate: -1\n', serial='7')
+
+
 def test_px4_rate_polynomials_of_different_degree_are_imported(cubic):
     # WHY: the import failed for an axis whose rate polynomial has no third power.
     rows = [(1e-3, 0.0, 0.0, 0.0), (2e-3, 1e-4, 0.0, 0.0), (0.0, 1e-4, -2e-6, 3e-8)]

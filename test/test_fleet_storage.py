@@ -2,10 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bags of a fleet are found on disk or in a storage; its fits equal those of `thermo_comp fit`."""
 
+import errno
 import json
+import os
 import shutil
 import tempfile
 from dataclasses import replace
+from pathlib import Path
 from uuid import uuid4
 
 import numpy as np
@@ -174,6 +177,27 @@ class TestDiscovery:
         (fleet / 'nowhere.mcap').symlink_to(tmp_path / 'gone')
         units = find_units(Storage(str(fleet)))
         assert [name for unit in units for name in unit.bags] == ['unit/1.mcap']
+
+    def test_a_folder_that_cannot_be_read_is_named(self, tmp_path, monkeypatch):
+        # WHY: without permission for the folder of a unit, the fleet lacked this unit, and the
+        # exit code was 0.
+        write_unit(tmp_path / 'u1', 1, 1)
+        for name in ('u2', '.hidden'):
+            (tmp_path / name).mkdir()
+        scan = os.scandir
+
+        def refusing(path):
+            if Path(path).name in ('u2', '.hidden'):
+                raise PermissionError(errno.EACCES, 'Permission denied', str(path))
+            return scan(path)
+
+        monkeypatch.setattr(os, 'scandir', refusing)
+        with pytest.raises(
+            ThermoCompError, match=r'cannot be listed: Permission denied in .*/u2$'
+        ):
+            find_units(Storage(str(tmp_path)))
+        (tmp_path / 'u2').rmdir()
+        assert [unit.name for unit in find_units(Storage(str(tmp_path)))] == ['u1']
 
     def test_a_relative_path_of_a_fleet_becomes_absolute(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)

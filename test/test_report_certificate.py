@@ -3,6 +3,7 @@
 """The certificate prints statements of the laboratory, and right budgets and rounded values."""
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -191,7 +192,10 @@ def test_without_a_stated_uncertainty_of_gravity_that_of_scale_factors_is_withhe
     assert 'withheld' not in render_report(evidence(), info)
     # If the fit was given an sd of gravity, the covariance contains it, and no U is withheld.
     stated = replace(evidence(), gravity_sd=2e-5)
-    assert 'withheld' not in render_report(stated)
+    page = render_report(stated)
+    assert 'withheld' not in page
+    # WHY: the sd given to the fit was in every U, and its line in the certificate was blank.
+    assert re.search(r'Standard uncertainty of gravity<[^0-9]*2e-05 m/s²', page)
     assert {source.name: source.standard for source in budget(stated, info)}['gravity'] == 0.0
 
 

@@ -217,10 +217,15 @@ def import_(
     serial: str = option('Serial of the unit.', ..., callback=options.check_serial),
     number: int | None = option('Number of the set of parameters (TC_A0, INS_TCAL1, imu0).'),
     gravity: float = option('Local gravity in m/s^2.', STANDARD_GRAVITY, min=9.01, max=10.49),
-    rate_hz: float = option('Samples per second of the unit.', 200, min=0.1),
+    rate_hz: float | None = option(
+        'Samples per second of the unit; default: as stated by a file of Kalibr, else 200.',
+        min=0.1,
+    ),
     full_scale_g: float = option('Full scale in g.', 16.0, min=0.1),
-    noise_ug: float = option(
-        'Noise density in ug/sqrt(Hz), for the covariance of samples.', 200.0, min=0.01
+    noise_ug: float | None = option(
+        'Noise density in ug/sqrt(Hz), for the covariance of samples; default: as stated by a '
+        'file of Kalibr, else 200.',
+        min=0.01,
     ),
     force: bool = options.FORCE,
     out: Output = options.out,
@@ -247,9 +252,9 @@ def import_(
             serial=serial,
             number=number,
             gravity=gravity,
-            cycle_time_s=1.0 / rate_hz,
+            cycle_time_s=None if rate_hz is None else 1.0 / rate_hz,
             full_scale=full_scale_g * 1e6 * MICRO_G,
-            noise_density=noise_ug * MICRO_G,
+            noise_density=None if noise_ug is None else noise_ug * MICRO_G,
         )
     except (CalibrationError, ValueError) as failure:
         raise CalibrationError(str(failure), path=path) from failure

@@ -196,13 +196,15 @@ def import_calibration(
     serial: str,
     number: int | None = None,
     gravity: float = STANDARD_GRAVITY,
-    cycle_time_s: float = 0.005,
+    cycle_time_s: float | None = None,
     full_scale: float = 16.0 * STANDARD_GRAVITY,
-    noise_density: float = 200.0 * MICRO_G,
+    noise_density: float | None = None,
 ) -> Calibration:
     """
     Read the file of one of `TOOLS`, recognised by its content; both regimes get the same curves.
     `number` chooses a parameter set or IMU (None: the only one in use); `full_scale` is in m/s^2.
+    `cycle_time_s` [s] and `noise_density` [m/s^2/sqrt(Hz)] default to those of the file; if the
+    file does not state them, to 5 ms and 200 ug/sqrt(Hz).
     """
     readings = (tool.read(text, number) for tool in TOOLS.values())
     content = next((reading for reading in readings if reading is not None), None)
@@ -214,6 +216,9 @@ def import_calibration(
     lower, upper = content.range_c
     if not lower < upper:
         raise CalibrationError(f'temperature range {lower:g}..{upper:g} degC is empty')
+    white, _, rate_hz = content.noise
+    cycle_time_s = cycle_time_s or 1.0 / (rate_hz or 200.0)
+    noise_density = noise_density or white or 200.0 * MICRO_G
     rotation, matrix = ql(content.matrix)
     K = 1.0 / np.diag(matrix)
     is_si = bool((K < _NEAR_ONE).all() and (K > 1.0 / _NEAR_ONE).all())

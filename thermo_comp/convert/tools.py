@@ -22,7 +22,7 @@ If a tool's matrix is not lower triangular, the tool's frame is rotated relative
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -58,7 +58,8 @@ class Content:
     range_c: tuple[float, float]
     notes: list[str]  # parts of the calibration that are lost or missing
     source: str = ''  # the tool and the parameter set that was read
-    # For export: white noise [m/s^2/sqrt(Hz)], random walk [m/s^2/sqrt(h)], sample rate [Hz].
+    # White noise [m/s^2/sqrt(Hz)], random walk [m/s^2/sqrt(h)], sample rate [Hz]; in a file that
+    # was read, 0 means that the file does not state the value.
     noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rate_bias: Floats | None = None  # like `bias`, for the angular rate [rad/s]
     text: str = ''  # the written file
@@ -285,21 +286,29 @@ def _read_imu_calib(text: str, _number: int | None) -> Content | None:
 
 def _read_kalibr(text: str, number: int | None) -> Content | None:
     """Read an IMU of Kalibr's YAML, by the number of the IMU; None if no IMU has a matrix."""
-    imus = {}
-    for name, part in _mapping(text).items():
-        sensor = _dictionary(_dictionary(part).get('accelerometers'))
-        if 'M' in sensor:
-            imus[name] = sensor
+    imus = {
+        name: part
+        for name, part in _mapping(text).items()
+        if 'M' in _dictionary(_dictionary(part).get('accelerometers'))
+    }
     if not imus:
         return None
     name = next(iter(imus)) if number is None else f'imu{number}'
     if name not in imus or (number is None and len(imus) > 1):
         raise CalibrationError(f'choose an IMU with --number: the file has {", ".join(imus)}')
-    part = imus[name]
+    part = imus[name]['accelerometers']
     matrix = _regular(_array(part['M'], f'{name}.accelerometers.M', 9).reshape(3, 3))
     bias = _array(part.get('bias', [0, 0, 0]), f'{name}.accelerometers.bias', 3)
     lacks = '' if 'bias' in part else '; the file of Kalibr has no bias: 0 is used'
-    return _triad(f'Kalibr {name}', np.asarray(np.linalg.inv(matrix), np.float64), bias, lacks)
+    stated = []
+    for key in ('accelerometer_noise_density', 'update_rate'):
+        value = float(_array(imus[name].get(key, 0.0), f'{name}.{key}', 1)[0])
+        if value < 0.0:
+            raise CalibrationError('must be 0 or more', key=f'{name}.{key}')
+        stated.append(value)
+    white, rate = stated
+    inverse = np.asarray(np.linalg.inv(matrix), np.float64)
+    return replace(_triad(f'Kalibr {name}', inverse, bias, lacks), noise=(white, 0.0, rate))
 
 
 def _regular(matrix: Floats) -> Floats:

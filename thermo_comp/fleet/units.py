@@ -99,10 +99,22 @@ class Storage:
 
 def _scan(root: str) -> Iterator[str]:
     """Yield the files of a local tree, following links (fsspec does not follow links)."""
-    for folder, folders, names in os.walk(root, followlinks=True):
+
+    def refuse(error: OSError) -> None:
+        if error.errno not in (errno.ENOENT, errno.ENOTDIR):
+            raise OSError(error.errno, f'{error.strerror} in {one_line(error.filename)}')
+
+    # A folder that cannot be read may be a unit, which must not be missing without a word.
+    for folder, folders, names in os.walk(root, onerror=refuse, followlinks=True):
         here = Path(folder).resolve()
-        # Skip links to a folder that contains the link, because the scan would never end.
-        folders[:] = [n for n in folders if Path(folder, n).resolve() not in (here, *here.parents)]
+        # Skip hidden folders; and links to a folder that contains the link, because the scan
+        # would never end.
+        folders[:] = [
+            name
+            for name in folders
+            if not name.startswith('.')
+            and Path(folder, name).resolve() not in (here, *here.parents)
+        ]
         yield from (str(path) for name in names if (path := Path(folder, name)).is_file())
 
 

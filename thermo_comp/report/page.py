@@ -61,6 +61,7 @@ def render_report(evidence: Evidence, info: CertificateInfo | None = None) -> st
     title = 'Thermal calibration certificate' if evidence.calibration else 'Thermal test record'
     contributions = certificate.budget(evidence, info)
     corrections = [*evidence.residuals, *([LEFT_OUT] if evidence.left_out else [])]
+    gravity_sd = info.gravity.standard_uncertainty_m_s2
     return render(
         'certificate.html',
         title=f'{evidence.serial}: {title}',
@@ -78,6 +79,7 @@ def render_report(evidence: Evidence, info: CertificateInfo | None = None) -> st
         over_temperature=certificate.over_temperature(evidence, info),
         programs=certificate.programs(evidence.calibration) if evidence.calibration else (),
         groups={CURVE: 'curve over temperature', SET: 'difference of the sets', **GROUPS},
+        gravity_sd=(evidence.gravity_sd or None) if gravity_sd is None else gravity_sd,
         is_gravity_known=certificate.unclaimed_gravity_sd(evidence, info) is not None,
         error=position_error,
         schuler=schuler_peak,
