@@ -181,13 +181,14 @@ class TestDiscovery:
     def test_a_folder_that_cannot_be_read_is_named(self, tmp_path, monkeypatch):
         # WHY: without permission for the folder of a unit, the fleet lacked this unit, and the
         # exit code was 0.
+        unread = '.hidden', 'lost+found'
         write_unit(tmp_path / 'u1', 1, 1)
-        for name in ('u2', '.hidden'):
+        for name in ('u2', *unread):
             (tmp_path / name).mkdir()
         scan = os.scandir
 
         def refusing(path):
-            if Path(path).name in ('u2', '.hidden'):
+            if Path(path).name in ('u2', *unread):
                 raise PermissionError(errno.EACCES, 'Permission denied', str(path))
             return scan(path)
 

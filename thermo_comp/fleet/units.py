@@ -107,12 +107,13 @@ def _scan(root: str) -> Iterator[str]:
     # A folder that cannot be read may be a unit, which must not be missing without a word.
     for folder, folders, names in os.walk(root, onerror=refuse, followlinks=True):
         here = Path(folder).resolve()
-        # Skip hidden folders; and links to a folder that contains the link, because the scan
-        # would never end.
+        # Skip hidden folders and the file system's `lost+found`; and links to a folder that
+        # contains the link, because the scan would never end.
         folders[:] = [
             name
             for name in folders
             if not name.startswith('.')
+            and name != 'lost+found'
             and Path(folder, name).resolve() not in (here, *here.parents)
         ]
         yield from (str(path) for name in names if (path := Path(folder, name)).is_file())
