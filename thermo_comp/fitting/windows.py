@@ -4,7 +4,8 @@
 Owns the table of windows and columns of the regression, made from the statistics of bags.
 
 Fit and compensator use the same thermal tracker and the same columns, of `unit.columns`, so a
-column has the same values in the fit and online.
+column has the same values in the fit and online; if readings are averaged (`sensors.averaged`),
+the same values within the noise of a reading.
 """
 
 from __future__ import annotations
@@ -450,7 +451,8 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
     readings = iter(readings_in_order(bag, inputs))
     reading = next(readings, None)
     for stamp_ns in range(begin_ns, max(bag.end_ns, begin_ns) + step_ns, step_ns):
-        # As in the node, a state depends on all readings with a stamp up to that of the state.
+        # As in the node, a state depends on all readings with a stamp up to that of the state. A
+        # mean of readings has the mean of their stamps: some may be later, by up to half a step.
         while reading is not None and reading[1] <= stamp_ns:
             tracker.read(*reading)
             reading = next(readings, None)

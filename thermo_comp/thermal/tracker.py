@@ -4,8 +4,9 @@
 Owns the tracker of a unit's thermal state: thermometers, regime, memory, dynamic weight.
 
 The compensator, the fit and the report all run `ThermalTracker`, so a regressor has the same value
-in the fit and in the correction. `ThermalTracker` is causal and reads no clock: each reading has a
-stamp, and the thermal state is requested for a stamp.
+in the fit and in the correction; where the fit averages readings, the same value within the noise
+of a reading. `ThermalTracker` is causal and reads no clock: each reading has a stamp, and the
+thermal state is requested for a stamp.
 """
 
 from copy import copy
