@@ -21,7 +21,7 @@ from ..thermal.state import StateLayout
 #: Suffix of the files of a rest log; the name of a file is the day, as in 2026-11-25.rests.
 SUFFIX = '.rests'
 
-#: First two bytes after the checksum, in the line of a start and in the line of a rest.
+#: First two bytes after the checksum, in the line of a node start and in the line of a rest.
 _OF_START, _OF_REST = b' {', b' ['
 
 

@@ -25,7 +25,7 @@ from .unknowns import BIAS_SD, SCALE_SD, Windows
 
 @dataclass(frozen=True)
 class ConstantCalibration:
-    """Bias [input units], scale [input units per m/s^2] and M, without effects of temperature."""
+    """Constant bias [input units], scale [input units per m/s^2] and misalignment matrix M."""
 
     bias: Floats
     scale: Floats
@@ -70,7 +70,7 @@ def constant_calibration(
             f'an axis ({axes}) reads the same in all positions: the axis is dead, or the unit was '
             'never turned about another axis'
         )
-    # If no axis was held up and down, half range / g is below the scale: try 1.3 times it, too.
+    # Half the readings' range is below 1 g if no axis was held up and down: try 1.3 times it, too.
     scales = (float(np.max(half)) * spread / gravity for spread in (1.0, 1.3))
     starts = (np.where(half * 4.0 > np.max(half), scale, half / gravity) for scale in scales)
     tried = (_refine(means, gravity, bias, scale, misalignment_sd) for scale in starts)

@@ -133,7 +133,7 @@ def corrected_windows(
         noise = along**2 @ np.array(Correction(calibration).noise)
         # A mean has no rounding noise: the converter adds the remainder to the next sample.
         white = along**2 @ np.square(calibration.noise_density_m_s2_sqrt_hz)
-        # Samples at more than the calibrated rate have more noise each: their mean has no less.
+        # A higher sample rate increases the noise of a sample: the mean's noise does not decrease.
         covered_s = np.minimum(calibration.unit.cycle_time_s * table['count'], window_s)
         mean_white = white / covered_s
         variance = np.maximum(table['variance'] - noise, 0.0) + mean_white

@@ -126,8 +126,8 @@ def _push(
     while arrivals and arrivals[-1][0] <= place:
         _, _, name, stamp_ns, celsius = arrivals.pop()
         if len(thermal.queue) >= PENDING_LIMIT:
-            # As in the node while no samples come, a full queue is applied up to `DISORDER_NS`
-            # before the new reading, but once a sample has been processed, only up to `due_ns`.
+            # As in the node without samples, a full queue is applied up to `DISORDER_NS` before
+            # the new reading; after a first sample it is applied up to `due_ns` at most.
             limit_ns = NEVER_NS if compensator.now_ns is None else due_ns
             thermal.flush(min(limit_ns, stamp_ns - DISORDER_NS))
         thermal.push(name, stamp_ns, celsius)

@@ -291,7 +291,7 @@ class Compensator:
 
         The states of thermometers, regime and memory are kept if `model` has the detector
         settings, lags and play operators of the present model; otherwise only the last
-        temperatures are kept. Of the present and the new compensator, use only one from now on.
+        temperatures are kept. Both compensators share objects: use only one of them afterwards.
         """
         new = copy(self)
         new.take_over(model, config)

@@ -176,7 +176,7 @@ class _Watch:
         sd, relaxed = sqrt(sensor.var_rate), self._relaxed
         stamp, self._stamp_ns = self._stamp_ns, stamp_ns
         if stamp is None or sd > relaxed:
-            self._mean = rate  # restart the mean rate while the rate is too uncertain
+            self._mean = rate  # the rate is too uncertain for a mean
         else:
             dt = (stamp_ns - stamp) * 1e-9
             self._mean += dt / (dt + self._memory_s) * (rate - self._mean)
