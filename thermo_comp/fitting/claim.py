@@ -324,7 +324,7 @@ def _norm_evidence(
     weight = np.add.reduceat(regression.weight, first)
     residual = regression.weight[:, None] * regression.residual(state, layout)
     residual = np.add.reduceat(residual, first) / weight[:, None]
-    # Average derivatives and errors of |f| over each mounting; the errors include its offset.
+    # Average derivatives and errors (with offset) of |f| over the rests of each mounting.
     errors = np.sum(point.norm_by_axes * (residual + state.offset), axis=1)
     first = np.flatnonzero(np.diff(regression.windows.mounting, prepend=-1))
     rows = np.column_stack((along, errors, np.ones(len(along))))

@@ -62,7 +62,7 @@ def next_direction(covariance: Floats, sd: float, positions: Floats) -> Floats:
     force, averaged over all attitudes.
 
     The direction to a face of a cube, which is easiest to hold, is returned if it reduces the
-    variance at least half as much as the best direction; else that to an edge, else to a corner.
+    variance at least half as much as the best direction; else to an edge, else to a corner.
     Directions within 20 degrees of a direction in `positions`, shape (n, 3), are not proposed.
     """
     columns = force_columns(_SPHERE)

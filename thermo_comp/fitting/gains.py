@@ -20,7 +20,7 @@ import numpy as np
 
 from ..typing import Bools, Floats, Ints
 
-# Squares of factors to try on the prior sd of new columns; that with the largest gain is used.
+# Squares of factors to try on the prior sd of new columns; the factor of largest gain is used.
 _SQUARED_FACTORS = (10.0 ** np.arange(-4.0, 1.01, 0.25))[:, None] ** 2
 
 

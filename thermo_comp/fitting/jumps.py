@@ -33,8 +33,8 @@ from .sources import angular_velocity
 _MARGIN_S = 10.0
 # Smallest number of samples before a step, and after it, for a test of the step.
 _FEWEST_SAMPLES = 8
-# Smallest significant ratio of a step to its sd. In noise without a step, the largest ratio over
-# all possible times of a step is about 5.
+# Smallest significant ratio of a step to its sd. Steps fitted to noise alone, at all possible
+# times, reach a ratio of about 5.
 _STEP_SDS = 8.0
 
 
@@ -136,7 +136,7 @@ def _examine(
     if r:
         is_step = np.abs(step) > _STEP_SDS * step_sd
         # The change of the mean level must be at least half of the step within one sample, and
-        # exceed four of its standard deviations.
+        # exceed 4 sd of this change.
         is_step &= lasting * np.sign(step) > 0.5 * np.abs(step)
         is_step &= np.abs(lasting) > 4.0 * lasting_sd
     else:

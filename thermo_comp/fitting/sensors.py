@@ -296,7 +296,7 @@ def _means(readings: Readings, step: Ints, has_cells: bool) -> Readings:
     is_first |= np.repeat(most - least > LARGEST_STEP, np.diff(first, append=len(step)))
     first = np.flatnonzero(is_first)
     n = np.diff(first, append=len(step))
-    # Means of equal readings are equal: rounding must not hide that a sensor stands still.
+    # Means of equal readings must be equal, or rounding would hide that readings are constant.
     after_ns, after = (values - np.repeat(values[first], n) for values in readings)
     mean_ns = stamp_ns[first] + np.add.reduceat(after_ns, first) // n
     return Readings(mean_ns, value[first] + np.add.reduceat(after, first) / n)

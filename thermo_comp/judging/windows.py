@@ -181,7 +181,7 @@ def columns_of(windows: JudgedWindows, bags: Sequence[str]) -> dict[str, npt.NDA
 
 # A structured array of partial sums of samples, or of windows.
 _Table: TypeAlias = npt.NDArray[Any]
-# Integer fields of a window: `count` is the total of its partial sums, the others are those of its
+# Integer fields of a window: `count` is the total of the partial sums, the rest is copied from the
 # first partial sum. Fields in `_AVERAGED` and `_TRIPLES` are means over a window's partial sums.
 _ONCE = ('bag', 'position', 'start_ns', 'count')
 _AVERAGED = ('time', 'board', 'rate', 'weight', 'variance', 'swapped', 'size', 'size_sd')

@@ -250,7 +250,7 @@ class Calibration:
         check_limits(self, parameter_layout(self))
         if self.gyroscope is not None:
             try:
-                rate_triad(self)  # apply a triad's rules to the gyroscope
+                rate_triad(self)  # the rules of an accelerometer triad apply
             except ValueError as error:
                 raise ValueError(str(error).replace('`', '`gyroscope.', 1)) from error
 

@@ -42,8 +42,8 @@ BANK_TAUS: Final = FINE_TAUS[::2]
 EVEN_WIDTHS: Final = (0.375, 0.75, 1.5, 3.0, 6.0)
 PLAY_WIDTHS: Final = (0.4, 0.8, 1.6, 3.2, 6.4)
 PLAY_TAUS: Final[tuple[float, ...]] = (0.0, 450.0, 900.0, 1800.0)
-#: Kind bend: time constants [s]; least span of board temperatures per knee (change of slope) [K];
-#: most knees per lag without and with the argument `parts` of `bank` (with: a third of the span).
+#: Kind bend: time constants [s]; least span of board temperatures per knee (change of slope) [K],
+#: or a third of it if `bank` gets `parts`; most knees per lag without and with `parts`.
 BEND_TAUS: Final = (0.0, *FINE_TAUS[4:11])
 LEAST_KNEE_K, MOST_KNEES, MOST_PART_KNEES = 1.0, 20, 60
 
