@@ -267,7 +267,7 @@ def _over_mountings(
 
     fits = fits_with(tried)
     # A large sd of mounting offsets lets attitudes absorb errors of the model, so the log evidence
-    # of a fit rises: limit this rise to that of the log evidence of |f|, plus `CLEAR_GAIN`.
+    # of a fit rises: limit it to the rise of the log evidence of |f|, plus `CLEAR_GAIN`.
     of_data = np.array([fit.log_evidence for fit in fits])
     of_norms = _norm_evidence(regression, posterior, tried, fits[-1].root)
     nearest = int(np.argmin(np.abs(np.log(tried * n_rests**0.5 / prior.offset_sd))))

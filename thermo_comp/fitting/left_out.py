@@ -13,7 +13,7 @@ does not depend on the attitude) and, if the other positions determine |f|, ``|f
 
 Model A is better than B if the error of A is smaller by more than the standard error over folds,
 both for positions and for sections of the program; `gain` lists exceptions. Left-out positions
-detect effects of a single recording, left-out sections detect effects of a single chamber program.
+detect columns that fit only one recording, left-out sections columns that fit only one program.
 
 References
 ----------

@@ -50,7 +50,7 @@ def prior_model(calibration: Calibration) -> Model:
     Return the model of a calibration, with one curve for each regime.
 
     Windows more than 1 K beyond the temperature range of a calibration of the same unit are not
-    used: they would change its effects of temperature by extrapolated columns.
+    used: extrapolated columns would change the calibration's effects of temperature.
     """
     regimes = calibration.regime_sets()
     static, dynamic = (regime.x.bias_function for regime in regimes)

@@ -91,7 +91,7 @@ class Model:
     name: name of the model in the provenance
     parts: the lag of the part of each axis, or None in a model without one lag per axis
     sensors: thermometers other than the board's; the first is that of the case
-    range_c: range of board temperatures [degC]; of each rest only windows in it are used, if any
+    range_c: board temperatures [degC]; of a rest with windows in this range only these are used
     """
 
     name: str

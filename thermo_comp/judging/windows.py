@@ -46,12 +46,12 @@ class JudgedWindows:
     window's middle [s]; `count`, `mean`: number and mean of the window's raw samples. A position
     is a still interval, numbered through all bags. `rate`: rate of the board temperature [K/s].
     `is_dynamic`: the dynamic set has more than half the weight; `is_inside`: the window is
-    entirely inside the calibrated ranges; `is_swapped`: the board temperature leads that of the
-    case. `raw` is the specific force with the constants at the reference temperature, `force` with
-    the calibration, shapes (n, 3). `size`: the known |f|, which is gravity unless the bag states
-    another value. `claimed_sd`: sd of ``|force| - size`` due to the calibration, `size` and white
-    noise of the mean; `noise_sd`: sd due to the white noise alone. Rows of `gyro`: angular rate
-    raw and corrected, its claimed variances, the thermal state; empty without a gyroscope.
+    entirely inside the calibrated ranges; `is_swapped`: the board temperature leads the case
+    temperature. `raw` is the specific force with the constants at the reference temperature,
+    `force` with the calibration, shapes (n, 3). `size`: the known |f|, which is gravity unless the
+    bag states another value. `claimed_sd`: sd of ``|force| - size`` due to the calibration, `size`
+    and white noise of the mean; `noise_sd`: sd due to the white noise alone. Rows of `gyro`: raw
+    and corrected angular rate, claimed variances, thermal state; empty without a gyroscope.
     """
 
     window_s: float

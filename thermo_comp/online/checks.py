@@ -5,11 +5,11 @@ Owns the plausibility checks of samples: a stuck converter, more samples than th
 make, and |f| at rest, which must be gravity.
 
 A converter with noise does not repeat its numbers for seconds; three exact zeros indicate a dead
-wire. A converter counts charge per cycle, so the scale factor changes with the sample rate. With
-an aged calibration, or that of another unit, |f| at rest may differ from gravity by more than the
-stated uncertainty. |f| is averaged over windows of a second or longer. A window is still if its
-scatter is within the sensor's noise and its mean agrees with the mean of the previous window. A
-step of |f| from a rest to another rest is judged within 3 s.
+wire. A converter counts charge per cycle, so the scale factor changes with the sample rate. If a
+calibration is aged or of another unit, |f| at rest may differ from gravity by more than the stated
+uncertainty. |f| is averaged over windows of a second or longer. A window is still if its scatter
+is within the sensor's noise and its mean agrees with the mean of the previous window. A step of
+|f| from a rest to another rest is judged within 3 s.
 """
 
 import math

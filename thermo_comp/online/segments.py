@@ -206,7 +206,7 @@ class ThermalSide:
         return not self.model.needs_temperature and self.tracker.board.stamp_ns is None
 
     def sample(self, stamp_ns: int) -> tuple[float, ...]:
-        """Return the thermal state at a stamp, or if `is_unmeasured`, that of a soak at T_ref."""
+        """Return the thermal state at a stamp; if `is_unmeasured`, a soak at T_ref."""
         if self.is_unmeasured:
             gradients = (0.0, 0.0) * len(self.calibration.sensors)
             reference = self.calibration.reference_temperature_c

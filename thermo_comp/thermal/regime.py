@@ -171,7 +171,7 @@ class _Watch:
             return False
         change = self.change
         # When the temperature ripples, the rate from the third-order filter of `Thermometer`
-        # overshoots, and that from the detector's filters does not.
+        # overshoots, but the rate from the detector's filters does not.
         rate = change.rate if change.is_following(stamp_ns) else sensor.rate
         sd, relaxed = sqrt(sensor.var_rate), self._relaxed
         stamp, self._stamp_ns = self._stamp_ns, stamp_ns
