@@ -99,7 +99,7 @@ class Topics:
     case: str = CASE.name
     further: Mapping[str, str] = field(default_factory=dict)
     part: BagPart = WHOLE
-    input: Input = 'auto'  # 'auto': counts if a topic has their name, else Imu, else counts
+    input: Input = 'auto'  # 'auto': counts by the topic's name, else Imu, else counts by type
 
     @classmethod
     def named(cls, names: Mapping[str, str], **others: Any) -> 'Topics':
