@@ -153,7 +153,7 @@ coefficients of a calibration are not parameters: parameters arrive one at a tim
 coefficients gives a wrong correction.
 
 If lags, play operators and `detector` of the new calibration equal those of the running calibration, as after `update`, the
-estimates of temperatures and regime go on. With a calibration of a new fit these estimates restart from the last
+estimates of temperatures and regime go on. With a calibration of a new fit the estimation restarts from the last
 temperatures: after a reload in a ramp the output may step, with a larger covariance until `memory settled` in `/diagnostics`
 is True. Load a calibration of a new fit when the temperature has been constant for an hour.
 

@@ -266,8 +266,8 @@ def play(
     context: typer.Context,
     bag: Path = _BAG,
     rate: float = option(
-        'Speed relative to real time; 0: as fast as reliable subscribers receive. A subscriber '
-        'that processes fewer messages per second then loses messages.',
+        'Speed relative to real time; 0: as fast as reliable subscribers receive, so that a '
+        'subscriber that processes messages more slowly loses some.',
         1.0,
         min=0.0,
     ),

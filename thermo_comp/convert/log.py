@@ -231,7 +231,7 @@ def _refuse_wrong_units(log: ForeignLog, stillness: Stillness) -> None:
 def _log_times(stamp_ns: Ints, shifts: Ints | None = None) -> tuple[Ints, Ints]:
     """
     Return log times that never decrease, and the shift added after each restart of the clock [ns].
-    `shifts`: for stamps of temperature readings, the shifts that the samples' stamps got.
+    `shifts`: the shifts of the samples' stamps, if `stamp_ns` are stamps of temperature readings.
     """
     is_restart = np.diff(stamp_ns, prepend=stamp_ns[:1]) < -_RESTART_NS
     if shifts is None or len(shifts) != is_restart.sum():

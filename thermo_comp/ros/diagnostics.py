@@ -37,8 +37,8 @@ IDLE_S = 5.0
 AHEAD_S = 5.0
 #: Samples have stopped if none arrives for this number of conversion cycles and this time [s].
 SILENT_CYCLES, SILENT_S = 5.0, 0.5
-#: Time for which the level must be lower before this is logged [s], so that a fault that comes and
-#: goes does not fill the log.
+#: Time for which the level must be lower before a lower level is logged [s], so that a fault that
+#: comes and goes does not fill the log.
 RELIEF_S = 5.0
 #: Largest error of |f| at rest without a warning, in standard deviations of the error.
 GRAVITY_SIGMAS = 5.0
