@@ -87,14 +87,14 @@ def worse(after: list, new: Calibration, kalman: Floats) -> tuple[bool, bool]:
     Return whether the RMS of |f| - g on the rests of a day is larger than with the laboratory's
     calibration, for the updated calibration and for the Kalman filter.
 
-    An RMS counts as larger if it exceeds that with the laboratory's calibration by more than
+    An RMS counts as larger if it exceeds the RMS with the laboratory's calibration by more than
     claimed sd / sqrt(2 n), the standard error of an RMS over n turn-ons.
     """
     old, updated = (series_of(after, given) for given in (LABORATORY, new))
     counts = np.array([rest.mean for _, rest in after]) / K
     warmth = np.array([rest.state[0] for _, rest in after]) - REFERENCE_C
     of_best = np.linalg.norm(corrected(counts, warmth, kalman), axis=1) - G
-    # Average the windows of each rest in one attitude, as `series_of` does.
+    # Average |f| - g over the windows of each rest and attitude, as in the rows of `series_of`.
     group = np.repeat(np.arange(len(old)), old.n_windows)
     of_best = np.bincount(group, of_best) / old.n_windows
 

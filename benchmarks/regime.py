@@ -198,7 +198,7 @@ def part_soak(pool: Pool, arguments: argparse.Namespace) -> Tables:
 
 
 def part_matrix(pool: Pool, arguments: argparse.Namespace) -> Tables:
-    """Yield tables of missed ramps, onset delays and flagged shares over all simulated scenes."""
+    """Yield tables: missed ramps; onset delay and fraction of a ramp flagged dynamic by scene."""
     rates = arguments.rates or ((1.0, 0.1) if arguments.quick else tuple(RAMPS))
     matrix = run_matrix(pool, arguments.quick, arguments.seed, rates, arguments.ramps)
     yield 'Ramps by rate of the readings', rate_table(matrix)

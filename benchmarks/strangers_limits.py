@@ -121,8 +121,8 @@ LIMITS = {
     'plain': Limit(norm=1.3, vector=2.0, low=0.7, high=1.4),
     'one-pose: own bag': Limit(vector=2.0, low=0.7, high=1.4),
     'one-pose: other program': Limit(vector=5.0, low=0.7, high=1.4),
-    # `score` subtracts the smallest claimed variance of a bag, which in 'returned' contains the
-    # variance of a slope over temperature: error / claimed sd has no meaning and no limit.
+    # `score` subtracts the smallest claimed variance of a bag, which in case 'returned' contains
+    # the variance of a slope over temperature: error / claimed sd has no meaning and no limit.
     'returned': Limit(high=np.inf),
     'soaks': Limit(low=0.5, high=1.5, claim=3.0),
     'turn-on': _TURN_ON,

@@ -165,7 +165,7 @@ def test_one_bag_in_kelvins_among_others_is_refused_by_name(rng):
 
 
 def test_the_advice_for_rests_without_noise_names_the_parameter_of_the_node(rng):
-    # WHY: the node takes equal samples for those of a stuck converter: 60 % of all were dropped.
+    # WHY: the node takes equal samples for a stuck converter, and dropped 60 % of all samples.
     rests = rests_of(rng, sd=0.3 * MG)
     for rest in rests[:2]:
         # The samples have no noise; a drift of 40 mg changes them by steps of 4 mg.

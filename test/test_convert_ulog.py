@@ -83,7 +83,7 @@ def test_each_imu_of_a_log_can_become_a_bag(flight, tmp_path, imu):
     recording = read_recording(tmp_path / 'bag.mcap')
     bag = recording.columns
     assert report.messages['accel'] == N
-    # A stamp is the time at which this IMU took the sample, not that of its publication.
+    # A stamp is the time at which this IMU took the sample, not the time of publication.
     expected_ns = (5_000_000 + np.arange(N) * STEP_US + imu) * 1000
     np.testing.assert_array_equal(bag.accel_stamp_ns, expected_ns)
     np.testing.assert_array_equal(bag.accel, truth['force'][imu])

@@ -39,7 +39,7 @@ def left_by(pair, **options):
     time_s = held_out.time_s[: 8 * n].reshape(n, 8).mean(axis=1)
     counts = held_out.counts[: 8 * n].reshape(n, 8, 3).mean(axis=1)
     corrected = calibration.correct(time_s, counts, **held_out.temperatures)
-    # A fit to two positions leaves bias, K and M uncertain: in a third one an axis' sd is > 1 mg.
+    # A fit to two positions is uncertain by > 1 mg (sd of an axis) in a third position.
     sd = np.sqrt(np.nanmedian(np.einsum('nii->ni', corrected.covariance), axis=0))
     assert (sd > 1000.0 * MICRO_G).any()
     return np.asarray(minutes(corrected.specific_force).std(axis=0))
@@ -267,7 +267,7 @@ def test_the_bias_sd_of_one_recording_contains_the_sd_of_a_turn_on(rng):
     # WHY: the claimed bias sd was 1/6 of the bias error, as if each position had its own turn-on.
     offsets = 5e-3 * rng.standard_normal((8, 3))
     ups = positions(12, 3)
-    # `least` [m/s^2]: turn-on sd, by the prior for a sample noise of 0.02 m/s^2, or as stated.
+    # `least` [m/s^2]: turn-on sd, either of the prior (sample noise 0.02 m/s^2) or as stated.
     stated = fit([turned(rng, ups)], replace(OPTIONS, mounting_sd=5e-3))
     for result, least in ((tumbled(12), 1e-3), (stated, 5e-3)):
         calibration = result.calibration
@@ -325,7 +325,7 @@ def test_two_bags_without_a_pause_between_them_count_as_one_turn_on(rng):
         ]
         return [source_of(*part, name=name) for part, name in zip(arrays, 'ab', strict=True)]
 
-    # The second bag begins in the fifth position, which is two mountings if bags are not joined.
+    # The second bag begins in position 5, which counts as two mountings in bags not joined.
     source = turned(rng, positions(9, 3))
     whole = tumbled(9)
     parts, others = (fit(cut(source, 9400, pause_s), OPTIONS) for pause_s in (0.0, 60.0))

@@ -330,7 +330,7 @@ def test_the_prior_of_siblings_reduces_the_scale_error_of_a_unit_with_one_bag(sc
         *(('valid', 1, False), ('valid', 0, True), ('valid, but it only claims 5 mg', 0, True)),
         *(('recalibrate', 1, False), ('recalibrate', 0, False), ('no better than raw', 0, False)),
         *(('thermometers exchanged or loose: not judged', whole, False) for whole in (1, 0)),
-        # Of refused units `is_whole` is None if data are contradictory, 0 if data are missing.
+        # A refused unit has `is_whole` None if its data are contradictory, 0 if data are missing.
         *(('refused', None, False), ('refused', 0, True), ('failed', None, False)),
     ],
 )

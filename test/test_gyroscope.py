@@ -249,7 +249,7 @@ def test_the_changes_of_the_rate_are_compared_with_their_claimed_sd(unit, fitted
     assert judged.exit_code == 0
     for name in ('static', 'dynamic', 'all'):
         section = rate.sections[name]
-        # The claimed sd includes that of unknown initial lag states, so it exceeds the noise.
+        # The claimed sd includes unknown initial lag states, so it exceeds the noise.
         assert 0.7 < section.ratio < 1.2
         assert section.rms < 1.3 * FLOOR
         assert section.raw_rms > 50.0 * FLOOR

@@ -105,7 +105,7 @@ def test_recordings_that_are_not_parts_of_one_are_not_joined(rng):
     # Recordings of 2 s that begin at equal times are not parts of one recording.
     short = recorded(rng, 2.0)
     assert len(joined(reduced([short, short]))) == 2
-    # Of two recordings with equal stamps each is joined only with its own second part.
+    # Two recordings have equal stamps: each is joined only with its own second part.
     other = replace(whole, accel=-whole.accel)
     parts = [*cut(whole, (200.0,)), *cut(other, (200.0,))[::-1]]
     first, second = joined(reduced(parts))

@@ -260,7 +260,7 @@ def test_one_topic_given_for_both_thermometers_is_named_and_claimed(order):
     # In a ramp of 1 K/min the case of a unit with a board lag of 900 s is 15 K above the board.
     assert abs(state[GRADIENT]) < 0.1
     assert state[VAR_GRADIENT] ** 0.5 == pytest.approx(15.0, rel=0.2)
-    # A case reading that differs from the board reading ends the fault.
+    # Once a case reading differs from the board reading, the topics count as two thermometers.
     tracker.read('board', 300 * SECOND_NS, 25.0)
     tracker.read('case', 300 * SECOND_NS, 25.1)
     assert not tracker.copies['case'].is_copy

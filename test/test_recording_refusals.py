@@ -206,14 +206,14 @@ def driver_bag(path, *topics, metadata=None):
     [
         # imu/data_raw of REP 145 is chosen, the vector of a magnetometer is not.
         ([('imu/data_raw', 'imu'), ('imu/mag', 'vector')], '/imu/data_raw'),
-        # Free acceleration and angular rate of an Xsens are vectors, and not chosen.
+        # The vectors that an Xsens publishes, free acceleration and angular rate, are not chosen.
         ([('imu/data', 'imu'), ('filter/free_acceleration', 'vector')], '/imu/data'),
         ([('imu/data', 'imu'), ('imu/angular_velocity', 'vector')], '/imu/data'),
         # The input of a filter, imu/data_raw, is chosen, not the output of the filter, imu/data.
         ([('imu/data', 'imu'), ('imu/data_raw', 'imu')], '/imu/data_raw'),
         ([('a/imu/data_raw', 'imu'), ('a/accel/counts', 'vector')], '/a/accel/counts'),
         ([('adc/words', 'vector'), ('imu/mag', 'vector')], '/adc/words'),
-        # Neither of two topics of equal rank is chosen, nor is a magnetometer.
+        # If two topics suit equally, neither is chosen; a magnetometer is never chosen.
         ([('left/imu', 'imu'), ('right/imu', 'imu'), ('adc/words', 'vector')], None),
         ([('imu/mag', 'vector')], None),
         # imu/data_raw is an output of the node if regime/dynamic has the same namespace.

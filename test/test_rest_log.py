@@ -80,7 +80,7 @@ def finder():
 
 
 def check_blocks(stamps, samples, cuts, whole):
-    """Check that samples in blocks give the rests `whole` that all samples at once give."""
+    """Check that samples in blocks give the same rests as all samples at once (`whole`)."""
     pieces, found = finder(), []
     for cut in np.split(np.arange(len(samples)), cuts):
         if len(cut):

@@ -279,7 +279,7 @@ def test_the_extrapolation_is_linear_for_5_s_and_then_constant():
         assert wider > variance
     held, _, wide = thermometer.at(last_ns + 60 * SECOND_NS)
     assert held == pytest.approx(temperature + 0.05, abs=1e-5)
-    # After 5 s the extrapolation is constant; its sd is 0.01 K/s times 55 s, the rest of 60 s.
+    # After 5 s the extrapolation is constant; its sd after 60 s is 0.01 K/s times 55 s.
     assert math.sqrt(wide) == pytest.approx(0.55, rel=0.05)
     assert thermometer.at(last_ns - SECOND_NS)[0] == pytest.approx(temperature - 0.01, abs=1e-5)
 

@@ -70,8 +70,8 @@ def test_a_lag_is_corrected_at_twice_the_rates_of_the_fit():
     is_used = at_rest & np.isfinite(out.specific_force).all(axis=1)
     error = (out.specific_force - force)[is_used]
     error = error[: len(error) // 60 * 60].reshape(-1, 60, 3).mean(axis=1)
-    # The fit must correct three quarters of the effect of the lag; a fit with products of the lag,
-    # but without the lag itself, has an error above the whole effect of the lag.
+    # The error must be below a quarter of the effect of the lag. A fit with products of the lag,
+    # but without the lag itself, has an error larger than the effect of the lag.
     assert rms(of_lag) > 0.5e-3 * GRAVITY
     assert rms(error) < 0.25 * rms(of_lag)
 
