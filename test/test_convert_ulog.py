@@ -87,7 +87,7 @@ def test_each_imu_of_a_log_can_become_a_bag(flight, tmp_path, imu):
     expected_ns = (5_000_000 + np.arange(N) * STEP_US + imu) * 1000
     np.testing.assert_array_equal(bag.accel_stamp_ns, expected_ns)
     np.testing.assert_array_equal(bag.accel, truth['force'][imu])
-    # Each accelerometer sample has a board temperature; the barometer measures that of the case.
+    # Each accelerometer sample has a board temperature; the barometer gives T_case.
     np.testing.assert_array_equal(bag.temperatures['board'].celsius, truth['celsius'][imu])
     np.testing.assert_array_equal(bag.temperatures['case'].celsius, 20 + 0.5 * np.arange(12))
     assert recording.info.metadata['serial'] == f'px4-accel-{77 + imu}'
@@ -243,13 +243,10 @@ def test_the_report_on_a_log_at_1_hz_names_fits_for_which_1_hz_is_sufficient(tmp
     assert 'sensor_accel at 10 Hz' in printed
 
 
-def test_a_log_without_an_accelerometer_is_refused(tmp_path):
+def test_a_log_without_an_accelerometer_and_other_files_are_refused(tmp_path):
     log = UlogWriter(BARO)
     log.data(log.subscribe('sensor_baro', 0), struct.pack('<QQIffI', 1, 1, 9, 1e5, 20.0, 0))
     refused(tmp_path, log.body, 'the log holds no IMU')
-
-
-def test_files_that_are_not_a_ulog_are_refused(tmp_path):
     for content in (b'', b'ULog', b'time,x,y,z\n1,2,3,4\n' * 10):
         refused(tmp_path, content, 'not a ULog file')
 

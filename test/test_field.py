@@ -341,7 +341,7 @@ def test_the_command_update_writes_a_better_calibration(tmp_path, unit_file, cli
     written = load_calibration(new)
     assert written.provenance.sources[-1].name == 'rests until 2030-01-20T23:12:40, claim aged 1 d'
     assert 'before: 2029-12-31' in written.provenance.notes[-1]
-    # The date in the new calibration file is that of its last rest, not that of the command.
+    # The new calibration file has the date of its last rest, not of the command.
     assert written.provenance.date == '2030-01-20T23:12:40Z'
     assert 'from 0 bags and 1 rest log, ' in cli('info', new).stdout
     # The log judges the old calibration, which was made without the rests of the log.

@@ -84,11 +84,9 @@ def test_a_reload_while_samples_flow_loses_no_sample(peer, tmp_path):
         flow = Flow(peer)
         before = flow.more()
         assert flow.bias(before - 1) == 1.0
-
         # When the service answers, the node already uses the new calibration.
         assert [r.successful for r in peer.set_parameters(calibration_file=str(second))] == [True]
         flow.more()
-
         # A broken file is refused with path, key and reason; the node keeps its calibration.
         (result,) = peer.set_parameters(calibration_file=str(broken))
         assert not result.successful
@@ -99,7 +97,6 @@ def test_a_reload_while_samples_flow_loses_no_sample(peer, tmp_path):
         request = GetParameters.Request(names=['calibration_file'])
         (value,) = peer.call(GetParameters, 'thermo_comp/get_parameters', request).values
         assert value.string_value == str(second)
-
         # An atomic request with a wrong value changes no parameter.
         assert not peer.set_atomically(transition_time=5, calibration_file=str(broken)).successful
         assert peer.set_atomically(no_such=5).reason == 'there is no parameter `no_such`'
@@ -110,14 +107,12 @@ def test_a_reload_while_samples_flow_loses_no_sample(peer, tmp_path):
         values = peer.call(GetParameters, 'thermo_comp/get_parameters', request).values
         assert values[0].double_value == 30.0
         assert flow.bias(flow.more() - 1) == 2.0
-
         # Setting the present path reads its file again; a float parameter accepts an integer.
         save_calibration(of_bias(3.0), second)
         result = peer.set_atomically(transition_time=5, calibration_file=str(second))
         assert result.successful, result.reason
         values = peer.call(GetParameters, 'thermo_comp/get_parameters', request).values
         assert values[0].double_value == 5.0
-
         save_calibration(of_bias(4.0, unit=Unit('T-2', 'counts', 32767.0, 0.01)), third)
         (result,) = peer.set_parameters(serial='T-9')
         assert "unit.serial: must be 'T-9'" in result.reason
@@ -138,7 +133,6 @@ def test_a_reload_while_samples_flow_loses_no_sample(peer, tmp_path):
         assert node.is_alive, node.said
         assert node.stop() == 0
         assert 'Traceback' not in node.said
-
     # No sample after the first output is lost, repeated or out of order.
     stamps = [stamp_of(message) for message in flow.heard]
     assert stamps == list(range(stamps[0], stamps[-1] + 1, CYCLE_NS))

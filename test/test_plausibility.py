@@ -194,7 +194,7 @@ def test_no_fault_is_reported_of_a_working_unit_in_a_chamber(preset, sensor):
         assert tracker.checks['case'].fault == Fault.NONE
 
 
-# The preset 'mems' is left out: its board lags the case by seconds, so they differ by < 1 K.
+# The preset 'mems' is left out: its board lags the case by seconds, so T_case - T_board < 1 K.
 @pytest.mark.parametrize(
     ('preset', 'sensor'),
     [

@@ -12,6 +12,7 @@ import recording_helpers as rec
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import IndexType
+from test_recording_damage import read
 
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording.reader import open_recording, read_recording
@@ -40,10 +41,6 @@ def bags(draw, accel=rec.ACCEL, lowest=-3):
 
 def in_reading_order(messages):
     return sorted(messages, key=lambda message: message.log_ns)
-
-
-def read(path):
-    return read_recording(path, require=())
 
 
 @settings(max_examples=80, deadline=None)
@@ -208,7 +205,6 @@ def test_the_files_of_a_split_bag_are_read_in_order(tmp_path):
     rec.assert_columns(recording.columns, messages)
     assert recording.info.truncated is None
     assert recording.info.n_messages == len(messages)
-
     # Without metadata.yaml, as after a killed recorder, numbers in the file names give the order.
     (tmp_path / 'bag' / 'bag.mcap').rename(tmp_path / 'bag' / 'bag_0.mcap')
     (tmp_path / 'bag' / 'bag_1.mcap').rename(tmp_path / 'bag' / 'bag_2.mcap')

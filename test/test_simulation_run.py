@@ -178,7 +178,6 @@ def test_two_parts_follow_a_ramp_like_the_closed_solution():
     time = np.linspace(0.0, 5400.0, 91)
     decaying = np.exp(np.outer(time, modes)) * amplitude
     expected = rate * (time[:, None] - lag + decaying @ shapes.T)
-
     response = response_of(network, [0.0, 5400.0], [0.0, rate * 5400.0])
     np.testing.assert_allclose(response.temperatures(time), expected, atol=ROUNDING)
 

@@ -160,7 +160,7 @@ def drawn(rng):
     return rng.normal(size=3), root @ root.T
 
 
-def test_the_prediction_step_equals_matrix_algebra():
+def test_the_prediction_and_the_correction_step_equal_matrix_algebra():
     mean, covariance = drawn(np.random.default_rng(0))
     dt, lag, power = 1.7, 50.0, 0.3
     forward = np.array([[1.0, dt, dt**2 / 2.0], [0.0, 1.0, dt], [0.0, 0.0, 1 / (1.0 + dt / lag)]])
@@ -171,9 +171,6 @@ def test_the_prediction_step_equals_matrix_algebra():
     np.testing.assert_allclose(out[:3], forward @ mean, rtol=1e-13)
     expected = forward @ covariance @ forward.T + wander
     np.testing.assert_allclose(out[3:], expected[UPPER], rtol=1e-12)
-
-
-def test_the_correction_step_equals_matrix_algebra():
     mean, covariance = drawn(np.random.default_rng(1))
     out, innovation, spread = correct((*mean, *covariance[UPPER]), 5.0, 0.2)
     gain = covariance[:, 0] / (covariance[0, 0] + 0.2)
