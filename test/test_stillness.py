@@ -174,10 +174,10 @@ def test_time_and_size_of_a_jump_along_gravity_are_found(rng, with_gyro):
     # The jump is between two samples, and `find_jumps` returns the interval between these samples.
     assert event.time == pytest.approx(301.0, abs=1.5 / rest.rate_hz)
     assert event.duration_s == pytest.approx(1.0 / rest.rate_hz, rel=1e-6)
-    # Step between lines through 250 samples (3 mg) each: sd 2 * 3 mg * sqrt(2 / 250); limit 4 sd.
+    # Step between lines fitted to 250 samples of 3 mg: sd 2 * 3 mg * sqrt(2 / 250); limit: 4 sd.
     np.testing.assert_allclose(np.array(event.step) / MG, (2.0, 0.0, 20.0), atol=2.2)
     assert event.along / MG == pytest.approx(20.0, abs=2.2)
-    # Step between lines through 20 readings (20 mK) each: sd 2 * 0.02 K * sqrt(2 / 20).
+    # Step between lines fitted to 20 readings of 20 mK noise: sd 2 * 0.02 K * sqrt(2 / 20).
     assert event.temperature_change_sd == pytest.approx(0.0126, rel=0.4)
     assert abs(event.temperature_change) < 4.0 * event.temperature_change_sd
 
