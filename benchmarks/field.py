@@ -156,8 +156,8 @@ def unit(kind: str, seed: int, days: int) -> tuple[dict[str, Floats], list, floa
     kalman = filtered(history, process, days)
     f = corrected(counts, warmth, kalman)
     of_best = np.column_stack((np.linalg.norm(f, axis=1) - G, f - force))
-    # The claimed sd is that of |f| in a window one day after the update and after a further
-    # turn-on: add a turn-on offset, noise and a random walk over a day to the error.
+    # The claimed sd holds for |f| in a window one day after the update, after a further turn-on:
+    # add a turn-on offset, noise and a random walk over a day to the error.
     rng = np.random.default_rng([seed, 9])
     of_bias = np.hypot(process.turn_on, process.bias)
     more = (series.direction * rng.normal(0.0, of_bias, (N_PROBES, 3))).sum(axis=1)

@@ -6,7 +6,7 @@ Prints the figures of docs/regime.md: the regime detector in simulated ramps and
 A ramp of a chamber, with control ripple and a drift by self-heating, changes the temperatures of a
 case (first-order lag of the chamber) and of a board (first-order lag of the case). Sensors of
 several noises, quanta and rates read both temperatures. The detector's settings are the defaults
-except for noise, quantum, lags and ripple, which are those of the scene. All runs are seeded, so
+except for noise, quantum, lags and ripple, which the scene determines. All runs are seeded, so
 the command always prints the same figures, except for CPU times.
 
     python benchmarks/regime.py --quick            # seconds

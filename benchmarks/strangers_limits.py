@@ -73,8 +73,8 @@ class Result:
 @dataclass(frozen=True)
 class Limit:
     """
-    The limits of a row. By default the error may be up to 1.05 times that of the best baseline,
-    and the RMS of error / claimed sd up to 1.5.
+    The limits of a row. By default the error may be up to 1.05 times the error of the best
+    baseline, and the RMS of error / claimed sd up to 1.5.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ LIMITS = {
     # A single recording does not show how well turn-ons repeat: error / claimed sd has no limit.
     'sessions one': Limit(high=np.inf),
     'sessions two': Limit(low=0.7, high=1.4),
-    # The error after an update may exceed that of the joint fit by 5 %, as the two fits estimate
+    # The error of an update may exceed the error of a joint fit by 5 %, as the two fits estimate
     # the sd of turn-ons from different recordings.
     'sessions update': Limit(than='two', times=1.05),
     'ageing': Limit(),
@@ -228,7 +228,7 @@ def _row(results: Sequence[Result]) -> Row:
 
 
 def limit_of(title: str) -> Limit:
-    """Return the limits of a row: those of the longest key with which its title begins."""
+    """Return the limits of a row: the longest key with which its title begins determines them."""
     return LIMITS[max((key for key in LIMITS if title.startswith(key)), key=len)]
 
 

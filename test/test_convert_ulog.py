@@ -176,7 +176,7 @@ def write_combined(path, rng, later=None, **parameters):
         now = 7_000_000 + k * STEP_US
         rows = [(-200, vector)]
         if k == 3:
-            # Add a message without accelerometer sample, and one that repeats a sample.
+            # Add a message without accelerometer sample, and a message that repeats a sample.
             rows += [(2**31 - 1, vector), (-200 - 50, vector)]
         for j, (relative, own) in enumerate(rows):
             row = (now + (50 if j == 2 else 0), 0.1, 0.2, 0.3, 5000, relative, *own, 5000)
@@ -202,7 +202,7 @@ def test_sensor_combined_replaces_a_missing_sensor_accel(tmp_path, rng, cli):
     np.testing.assert_array_equal(read.accel, force)
     np.testing.assert_array_equal(read.stamp_ns, (7_000_000 - 200 + np.arange(N) * STEP_US) * 1000)
     np.testing.assert_allclose(read.gyro, np.tile([0.1, 0.2, 0.3], (N, 1)), rtol=1e-6)
-    # The only thermometer in the log is that of the barometer: it is taken as the board's.
+    # The only thermometer in the log, in the barometer, is taken as the board thermometer.
     np.testing.assert_array_equal(read.temperatures['board'].celsius, 40.0 + np.arange(6))
     assert 'case' not in read.temperatures
     printed = cli('convert', path, '-o', tmp_path / 'bag.mcap').stdout

@@ -135,7 +135,7 @@ def test_one_position_leaves_the_scale_at_its_prior(one_position):
     for axis in calibration.static.axes():
         # The scale's slope has the prior mean 0 and the prior sd 67 ppm/K, a third of 200 ppm/K.
         assert np.abs(axis.scale_function.value(np.array([-4.0, 15.0])) - 1.0).max() < 5e-4
-    # For a MEMS the prior sd of scale factors is 5 %, that of misalignments 0.01 rad.
+    # For a MEMS the prior sd is 5 % for scale factors, and 0.01 rad for misalignments.
     sd = np.sqrt(np.diag(calibration.posterior.covariance()))
     for block in parameter_layout(calibration).scale:
         assert sd[block.static] == pytest.approx(0.05, rel=0.3)
@@ -442,7 +442,7 @@ def test_six_attitudes_that_hardly_determine_the_scale_factors_give_scale_factor
     up /= np.linalg.norm(up, axis=1)[:, None]
     sensed = np.linalg.inv([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.02, 0.0, 1.0]])
     axes = fit([turned(rng, up @ sensed.T)], OPTIONS).calibration.axes
-    # The prior sd of a scale factor is 5 %, that of a bias 1 m/s^2.
+    # The prior sd is 5 % for a scale factor, and 1 m/s^2 for a bias.
     np.testing.assert_allclose([axis.scale_factor for axis in axes], 1.0, atol=0.05)
     np.testing.assert_allclose([axis.bias for axis in axes], (0.1, -0.2, 0.3), atol=0.5)
 

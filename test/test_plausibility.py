@@ -111,8 +111,8 @@ def test_a_frozen_sensor_is_detected_by_changes_of_the_second_sensor(sensor, fro
     other = tracker.checks['case'] if frozen == 'board' else tracker.checks['board']
     assert other.fault == Fault.NONE
     seen = getattr(tracker, frozen)
-    # Until a frozen board thermometer is detected its error is up to 4 quanta + 2 K, that of a
-    # frozen case thermometer up to 4 quanta + 12 K.
+    # Until detected, a frozen board thermometer has an error of up to 4 quanta + 2 K, and a frozen
+    # case thermometer has an error of up to 4 quanta + 12 K.
     lead = 10.0 if frozen == 'case' else 0.0
     off = (board if frozen == 'board' else case) - seen.temperature
     assert abs(off) < 4.0 * quantum + 2.0 + lead

@@ -295,7 +295,7 @@ def test_the_only_topic_of_a_type_is_used_in_place_of_the_default_topic(tmp_path
             '/imu/die, its only Temperature, is taken for board'
         )
     # No board topic is chosen by its type if the user names a topic, if there are two topics of
-    # this type, or if the only topic is that of the case.
+    # this type, or if its only topic belongs to the case.
     with pytest.raises(RecordingError, match='my/die: no such topic'):
         open_recording(path, Topics(board='my/die'), require=('board',))
     for topics in (('imu/die', 'baro/air'), ('temperature/case',), ('x/temperature/case',)):

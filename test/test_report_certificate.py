@@ -275,7 +275,7 @@ def test_the_uncertainty_of_gravity_is_part_of_that_of_the_scale_factors(tmp_pat
     info = load_certificate_info(lab(tmp_path, 'gravity: {standard_uncertainty_m_s2: 9.80665e-3}'))
     rows = {result.quantity: result for result in results(evidence(), info, ())}
     scale = fitted().calibration.axes.x.scale_factor
-    # The relative uncertainty of gravity, 1e-3, is far above that of the fit; U is twice 1e-3.
+    # Gravity, with a relative uncertainty of 1e-3, dominates the scale's uncertainty U = 2e-3.
     assert float(rows['scale factor x'].expanded) == pytest.approx(2e-3 * scale, rel=0.05)
     assert rows['bias x'] in results(evidence(), CertificateInfo(), ())
 

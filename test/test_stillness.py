@@ -274,7 +274,7 @@ def test_low_pass_filtered_noise_gives_one_rest_without_a_jump(rng, tau_s):
     bag = reduce_source(rest.source(), full_scale=None)
     assert len(bag.intervals) == 1
     assert find_jumps(bag) == ()
-    # At most 2 % of the means, those at the ends of the rest, may count as motion.
+    # At most 2 % of the means, at the ends of the rest, may count as motion.
     assert bag.n_still_cells > 0.98 * bag.n_cells
 
 

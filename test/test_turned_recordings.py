@@ -89,8 +89,8 @@ def test_the_claimed_sd_of_a_mems_with_a_single_turn_on_is_0_3_to_1_5_mg():
 
 @pytest.mark.slow
 def test_an_update_after_a_new_turn_on_gives_the_mean_of_both_turn_ons():
-    # WHY: an update took the difference of the turn-ons for ageing, and replaced the bias by that
-    # of the latest turn-on: the error after a third turn-on was larger than without the update.
+    # WHY: an update took the difference of two turn-ons for ageing, and took the bias of the later
+    # turn-on alone: the error after a third turn-on was larger than without the update.
     rng = np.random.default_rng(5)
     change = 1e-3 * GRAVITY * np.array([1.0, -0.8, 0.6])
     bags = [turned(rng, ((0.0, 20.0), (5400.0, 20.0)), name)[0] for name in ('one', 'two')]

@@ -54,7 +54,7 @@ def test_the_claimed_sd_covers_a_start_in_a_ramp():
 
 def test_the_claimed_sd_covers_a_lagged_gradient_after_a_start_in_a_ramp():
     # WHY: after a start in a ramp the error of a lag of the gradient was five claimed sds. The
-    # case leads the board by 5 K; at the start the lagged gradient may still be that of a soak.
+    # case leads the board by 5 K; at the start the lagged gradient may have its value in a soak.
     # A ramp that begins over a lag (600 s) after the start does not increase the sd.
     response = (term('gradient_lag', (30.0, 0.0, 0.0), tau_s=600.0),)
     unit = replace(calibration(response=response), board_lag_s=300.0)
