@@ -48,7 +48,7 @@ def test_the_offset_is_half_the_sum_of_signed_counts():
 
 
 def test_a_corrected_sample_agrees_with_the_formula_of_the_static_set():
-    # Expected: the formula with the static curves at t = 10 K, for a gradient and a rate of 0.
+    # Expected: the correction formula with the static curves at t = 10 K, gradient 0 and rate 0.
     axis = axis_set((0.0, 0.5, 0.01), (1.0, 1e-4), delta=2.0)
     unit = calibration(
         axes=equal_axes(300.0, 7.0),

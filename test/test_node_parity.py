@@ -145,7 +145,7 @@ def test_node_and_replay_give_equal_output_for_imu_messages(tmp_path):
     published, _, _ = output_of(tmp_path / 'live.mcap')
     given = given.imu.take(np.flatnonzero(np.isin(given.accel_stamp_ns, published.accel_stamp_ns)))
     is_rate = given.angular_velocity_covariance[:, 0] != -1.0
-    # The node corrects a measured angular rate, and publishes one marked as missing unchanged.
+    # The node corrects measured angular rates, and does not change rates marked as missing.
     moved = np.abs(published.imu.angular_velocity - given.angular_velocity)
     assert moved[~is_rate].max() == 0.0
     # The biases of `rich_gyroscope` at the reference temperature are 10 mrad/s and more.

@@ -80,7 +80,7 @@ def finder():
 
 
 def check_blocks(stamps, samples, cuts, whole):
-    """Check that samples in blocks give the rests `whole` that all samples at once give."""
+    """Check that samples in blocks give the same rests as all samples at once (`whole`)."""
     pieces, found = finder(), []
     for cut in np.split(np.arange(len(samples)), cuts):
         if len(cut):
@@ -288,7 +288,6 @@ def test_the_diagnostics_warn_of_a_full_disk(small_disk, unit, peer):
         heard = peer.listen(DiagnosticArray, '/diagnostics')
         driver = drive(peer, node)
         send(driver, standing(12 * RATE_HZ))
-
         text = 'not kept in the rest log: No space left on device'
         peer.wait_for(lambda: any(text in each.status[0].message for each in heard), text)
 
