@@ -105,6 +105,19 @@ def test_logged_windows_are_means_over_10_s_at_rest():
     check_blocks(stamps, samples, [7, 333, 334, 1201], whole)
 
 
+def test_a_rest_in_which_an_angular_rate_is_missing_has_no_mean_rate():
+    # WHY: blocks of messages with and without rates had 6 and 3 columns, which ended the log.
+    samples = np.hstack((standing(25 * RATE_HZ), np.full((25 * RATE_HZ, 3), 0.01)))
+    samples[7, 3:] = np.nan
+    stamps = START_NS + np.arange(len(samples)) * CYCLE_NS
+    first, second = finder().add(stamps, samples)
+    assert (first.rate, len(second.rate)) == ((), 3)
+    # The second with a sample without acceleration does not count as a rest.
+    samples[7, :3] = np.nan
+    rests = finder().add(stamps, samples)
+    assert [(row.stamp_ns - START_NS) / SECOND_NS for row in rests] == [6.0, 16.0]
+
+
 @pytest.mark.parametrize('rate', [1.0, 2.0, 3.3, 5.0, 50.0, 2000.0])
 def test_rests_are_found_at_any_rate_of_samples(rate, rng):
     # Rests of one minute in two attitudes, with jitter of the stamps. Samples at rates up to

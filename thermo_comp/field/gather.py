@@ -135,6 +135,7 @@ class RestFinder:
         within = sum(cell.squares - cell.total[:3] ** 2 / cell.n for cell in self._run)
         sd = np.sqrt(within / (n - len(self._run)))
         states, shares = zip(*(cell.state for cell in self._run), strict=True)
-        parts = mean[:3], sd, weights @ np.array(states), weights @ np.array(shares), mean[3:]
+        rate = mean[3:] if np.isfinite(mean).all() else mean[:0]
+        parts = mean[:3], sd, weights @ np.array(states), weights @ np.array(shares), rate
         stamp_ns = (self._run[0].begin + self._run[-1].last + 1) * _SECOND_NS // 2
         return Rest(stamp_ns, n, *(tuple(part.tolist()) for part in parts))
