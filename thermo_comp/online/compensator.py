@@ -135,7 +135,12 @@ class Compensator:
         return gravity, self.config.gravity_tolerance_m_s2
 
     def push(self, name: str, stamp_ns: int, celsius: float) -> None:
-        """Queue a reading [degC]; a thermometer that the calibration lacks has no effect."""
+        """
+        Queue a reading [degC]; a thermometer that the calibration lacks has no effect.
+
+        At most 4096 readings wait for a sample with an equal or later stamp. If more wait, the
+        older half is dropped and counted as rejected.
+        """
         self.thermal.push(name, stamp_ns, celsius)
         self.event_ns = min(self.event_ns, stamp_ns)
         self.reading_ns = max(self.reading_ns, stamp_ns)
