@@ -56,6 +56,7 @@ format_version: 2
 unit: {serial: EXAMPLE-1, input: counts, full_scale: 32767.0, cycle_time_s: 0.01}
 reference_temperature_c: 20.0
 gravity_m_s2: 9.80665                # local gravity, input of the fit
+gravity_sd_m_s2: 0.0                 # its sd, input of the fit
 axes:                                # at the reference temperature
   x: {scale_factor: 299.1, bias: 4.2}   # counts per m/s^2, counts
 static:                              # the set of the static regime

@@ -258,6 +258,7 @@ def fitted(request, all_bags):
         patch.setattr(import_module('thermo_comp.fitting.fit'), 'claim_of', keep)
         result = fit_bags(all_bags, options)
     (claim,) = claims
+    assert result.calibration.gravity_sd_m_s2 == options.gravity_sd
     return result, claim
 
 

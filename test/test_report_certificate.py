@@ -26,7 +26,7 @@ from thermo_comp.report.certificate import (
 from thermo_comp.report.page import render_report
 from thermo_comp.report.statements import CertificateInfo, load_certificate_info
 from thermo_comp.report.style import rounded
-from thermo_comp.unit.calibration_file import save_calibration
+from thermo_comp.unit.calibration_file import dump_calibration, parse_calibration, save_calibration
 from thermo_comp.unit.gravity import MICRO_G
 from thermo_comp.unit.prediction import in_a_soak
 
@@ -191,7 +191,10 @@ def test_without_a_stated_uncertainty_of_gravity_that_of_scale_factors_is_withhe
     info = load_certificate_info(lab(tmp_path))
     assert 'withheld' not in render_report(evidence(), info)
     # With an sd of gravity given to the fit, no expanded uncertainty U is withheld.
-    stated = replace(evidence(), gravity_sd=2e-5)
+    # WHY: the file of the calibration did not store this sd, so `report` after `fit` withheld U.
+    unit = replace(evidence().calibration, gravity_sd_m_s2=2e-5)
+    read = parse_calibration(dump_calibration(unit).encode())
+    stated = replace(evidence(), calibration=read)
     page = render_report(stated)
     assert 'withheld' not in page
     # WHY: gravity's sd was in all expanded uncertainties, but its line in the page was blank.

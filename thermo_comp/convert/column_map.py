@@ -191,7 +191,7 @@ def table_log(path: Path, columns: ColumnMap) -> ForeignLog:
         clip=accel.clip and (accel.clip[0] - accel.offset, accel.clip[1] - accel.offset),
         frame_id=columns.frame_id,
         serial=columns.serial or '',
-        n_short=table.n_short,
+        short=table.short,
         not_used=table.not_used,
         continued=continued,
     )

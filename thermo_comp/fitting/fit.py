@@ -299,6 +299,7 @@ def _fit(
         calibration = build_calibration(
             fit, claim, bags, _unit(bags, options), residuals, earlier, nonlinearity
         )
+        calibration = replace(calibration, gravity_sd_m_s2=options.gravity_sd)
         rates: tuple[RateRow, ...] = ()
         if earlier is not None or not is_beyond(fit.windows):
             calibration, rates = add_gyroscope(calibration, fit.windows, bags, options)
