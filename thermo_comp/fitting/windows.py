@@ -442,7 +442,8 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
     lengths_s = (float(np.median(np.diff(i.time))) for i in bag.intervals if len(i.time) > 1)
     step_s = max(min(lengths_s, default=1.0) / 5.0, 0.1)
     inputs = spec.inputs
-    bag, detector = averaged(bag, model.detector, inputs, step_s)
+    # The filter of a thermometer needs more time for a reading than the tracker for a state.
+    bag, detector = averaged(bag, model.detector, inputs, 2.0 * step_s)
     config = ThermalConfig()
     tracker = ThermalTracker(detector, spec, config)
     board, *others = tracker.thermometers.values()
