@@ -45,7 +45,7 @@ from thermo_comp.typing import Floats
 def cost(
     node: CompensationNode, relay: Relay, keeper: RestKeeper, seconds: int
 ) -> tuple[list[float], list[float]]:
-    """Return CPU times per sample [us]: of seconds with the rest log, of seconds without it."""
+    """Return CPU times per sample [us] in each second with the rest log, and in each without."""
     found: tuple[list[float], list[float]] = ([], [])
     time.sleep(2.0 - time.time() % 2.0)
     for _ in range(seconds):

@@ -190,7 +190,7 @@ def other(content):
 
 
 def one_by_one(data):
-    """Return (place, size, channel, log time) of each message, other records, and the end."""
+    """Return (place, size, channel, log time) of each message, other records, last end."""
     at, messages, others = 0, [], []
     while at + 9 <= len(data):
         opcode, length = struct.unpack_from('<BQ', data, at)

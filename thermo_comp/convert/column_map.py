@@ -269,7 +269,7 @@ def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
 
 
 def _unnamed(width: int) -> Headings:
-    """Return the columns ``[t] ax ay az [wx wy wz]``, by their numbers."""
+    """Return the numbers of columns ``[t] ax ay az [wx wy wz]`` without headings."""
     if width not in (3, 4, 6, 7):
         raise RecordingError(
             f'{width} columns without headings cannot be identified, only 3, 4, 6 or 7 columns '

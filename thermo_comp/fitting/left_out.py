@@ -229,9 +229,10 @@ def is_near(chosen: Score, other: Score) -> bool:
 
 def _beyond_thermometer(before: Score, after: Score) -> list[tuple[float, float] | None]:
     """
-    Return for each kind of folds the log ratio of mean square errors (`Folds.gain_of`), None if a
-    coarse thermometer explains the errors. Thermometer errors repeat in all bags of one chamber
-    program: a model that fits them is better on left-out bags, but fails in another program.
+    Return the log ratio of mean square errors, `before` / `after` (`Folds.gain_of`), for each kind
+    of folds, None if a coarse thermometer explains the errors. Thermometer errors repeat in all
+    bags of one chamber program: a model that fits them is better on left-out bags, but fails in
+    another program.
     """
     is_known = before.norms.rms > _NOISE_RATIO * before.by_thermometer
     keep = (not before.is_by_thermometer, not before.is_by_thermometer, is_known)
@@ -371,8 +372,8 @@ def _by_sections(
     is_within: bool = False,
 ) -> tuple[Folds, Floats]:
     """
-    Score left-out sections by their drift about the mean of the position's remaining windows. Each
-    fit without sections is `n_steps` Gauss-Newton steps from the fit of all data.
+    Score left-out sections by their drift about the mean of the position's remaining windows. The
+    fit without the sections of a fold is `n_steps` Gauss-Newton steps from the fit of all data.
 
     `folds`: sections of each fold; `is_within`: score only temperatures that occur in the fit
     """

@@ -58,8 +58,8 @@ class _Shape(NamedTuple):
 
 # Ratio of the RMS residual to white noise up to which no other shape or lag is tried.
 _EXPLAINED_RATIO = 1.1
-# Shapes of the curves, in the order of the trials. A spline of 4 nodes determines a lag best, but
-# cannot describe a kink of the bias, so its limit `most_noise` is low.
+# Shapes of curves over part temperature, in the order of trials. A spline of 4 nodes determines a
+# lag best, but cannot describe a kink of the bias, so its limit `most_noise` is low.
 _SHAPES = (
     _Shape(4, _EXPLAINED_RATIO),
     _Shape(4, _EXPLAINED_RATIO, has_gradient=True),

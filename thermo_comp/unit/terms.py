@@ -90,7 +90,7 @@ class Term:
         return (column.source.largest + abs(self.centre(column))) ** self.order
 
     def steepest(self, column: Column, raw: Floats, flow_k: float) -> float:
-        """Return the largest slope of a column's value u [1/K]: for bounded u, 1 / `flow_k`."""
+        """Return the largest slope of u [1/K]; of bounded u, 1 / `flow_k`, the RMS gradient."""
         if self.bounds is not None:
             return 1.0 / flow_k
         largest = float(np.abs(raw).max(initial=0.0)) ** (1.0 / self.order)
