@@ -160,7 +160,7 @@ class Correction:
         shares = 1.0 - state[WEIGHT], state[WEIGHT]
         curves = sum(w * (a + b) for w, a, b in zip(shares, relative, by_rate, strict=True))
         raw = self.table.raw(states)
-        beyond = (raw - self.table.held(raw))[:, 0].tolist()
+        beyond = self.table.beyond(raw)[:, 0].tolist()
         columns = zip(beyond, self.table.columns, strict=True)
         gradients = [0.0, *(excess for excess, column in columns if column.is_gradient)]
         of_columns = float(self.table.excess(raw).max(initial=0.0))
@@ -251,7 +251,7 @@ class Correction:
         regime the variances due to T_board, residual and lack of fit are sums over both sets.
         """
         board, weight, unknown = states[BOARD], states[WEIGHT], states[UNKNOWN]
-        static_weight, beyond_range = 1.0 - weight, raw - held
+        static_weight, beyond_range = 1.0 - weight, self.table.beyond(raw)
         excess, _, relative, by_rate = self.curves.excess(states)
         if not self._has_lags:
             # The rate's distance from its range counts only if no column has a lag.
