@@ -89,7 +89,8 @@ class Correction:
         self._W = weights.reshape(-1, 6).T[:, :, np.newaxis]
         self._is_present = (self._W[:3] != 0.0) | (self._W[3:] != 0.0)
         self._find_columns_of_pairs()
-        slopes = self.curves.slopes(np.linspace(*self._span, _GAP_TEMPERATURES))
+        slopes = self.curves.slopes(settled := np.linspace(*self._span, _GAP_TEMPERATURES))
+        slopes += self._slopes_of_bends(settled)
         of_bias = np.arange(6)[:, np.newaxis] < 3
         bends = slopes.std(axis=2, keepdims=True)
         self._bends = np.concatenate((bends * of_bias, bends * ~of_bias))
@@ -121,6 +122,14 @@ class Correction:
         self._signs = by_board[:, np.newaxis, np.newaxis]
         self._has_lags = any(isinstance(column.source, Lag) for column in self.table.columns)
         self._lagged = [layout.places[lag] for lag in layout.lags if lag.input == BOARD_INPUT]
+
+    def _slopes_of_bends(self, board: Floats) -> Floats:
+        """Differentiate the sums of bends w.r.t. settled board temperatures, shape (6, n)."""
+        states = np.zeros((self.layout.width, len(board)))
+        states[BOARD] = board
+        _, direct = self.table.slopes(states)
+        none = np.zeros((6, len(board)))
+        return none if direct is None else self._weigh(direct, none)
 
     def bias_scale(self, states: Floats) -> Floats:
         """Evaluate bias and scale of the three axes, shape (2, 3, n)."""
