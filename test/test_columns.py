@@ -137,6 +137,18 @@ def test_a_bend_has_slopes_over_board_temperature_and_lag():
     assert flow.slopes(np.zeros((7, 1)))[1] is None
 
 
+def test_a_curve_of_bends_goes_on_along_its_tangent_beyond_the_range():
+    # WHY: bends that ended at different temperatures turned the curve by 200 ug/K beyond them.
+    columns = [Column('bend', 'bend', knee_k=k, range=(-12.0 - k, 8.0 - k)) for k in (2.0, 6.0)]
+    table = ColumnTable(columns, MemorySpec(), 20.0)
+    states = np.zeros((StateLayout(MemorySpec()).width, 3))
+    states[BOARD] = 20.0 + np.array([8.0, 12.0, 15.0])
+    raw = table.raw(states)
+    # The tangent is a quarter of the width of 20 K long; the error grows from the range's end.
+    assert table.held(raw).tolist() == [[6.0, 10.0, 11.0], [2.0, 6.0, 7.0]]
+    assert table.beyond(raw).tolist() == [[0.0, 4.0, 7.0]] * 2
+
+
 def test_a_new_kind_of_column_needs_one_term_only(monkeypatch):
     form = TERMS['square'].form
     new = Term('rate_square', '(dT_s/dt)^2', lambda column: Rate(column.sensor), form, order=2)

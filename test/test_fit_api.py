@@ -55,6 +55,11 @@ def test_a_knee_in_the_curve_of_the_bias_is_found():
     # Two knees, 1 K apart, in place of the true knee between them give an error of at most 20 ug/K
     # times 0.25 K = 5 ug, and only in 1 K of the range of 22 K.
     assert left < 1.5
+    # The bends of a part end at its highest temperature in the bags, whatever their knees.
+    bends = [term for term in unit.response if term.group == 'bend']
+    ends = {(term.tau_s, round(term.range[1] + term.knee_k, 6)) for term in bends}
+    assert len(ends) == len({term.tau_s for term in bends})
+    assert all(term.range[1] + term.knee_k < 32.0 - 20.0 + 0.5 for term in bends)
 
 
 def test_a_curve_without_a_knee_is_fitted_without_a_knee(monkeypatch):

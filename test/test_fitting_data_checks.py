@@ -84,6 +84,18 @@ def test_missing_data_of_a_test_are_reported(good, name, changed, message):
     assert name != 'temperature' or set(findings) == {'positions', 'temperature'}
 
 
+def test_exchanged_thermometers_in_one_bag_of_many_are_reported_with_its_name(good):
+    # WHY: with one exchanged bag of twelve, the fit took the mean of the two temperatures.
+    windows, up = good
+    data = replace(windows.data, bag=windows.data.position // 6)
+    names = [f'{k // 6}.mcap' for k in range(18)]
+    rests = tuple((Parts(source=Parts(name=name)), None) for name in names)
+    sign = np.where(data.bag == 1, -1.0, 1.0)
+    mixed = replace(windows, data=data, gradient=sign * windows.gradient, rests=rests)
+    assert findings_of(mixed, up)['swapped'].message.startswith('1.mcap, unlike in other bags: ')
+    assert 'swapped' not in findings_of(replace(mixed, gradient=windows.gradient), up)
+
+
 def test_the_noise_of_soaks_is_not_taken_for_a_ramp_or_for_exchanged_sensors(good, rng):
     # WHY: bags of soaks were refused, because noise of readings gave rates and gradients as in
     # ramps with exchanged thermometers.

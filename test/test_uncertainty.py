@@ -342,3 +342,11 @@ def test_a_lagged_temperature_outside_the_range_increases_the_claimed_sd():
     assert sd_at(unit, 33.0, behind=-1.0) == pytest.approx(1e-6, rel=1e-6)
     bends = 0.6 / math.sqrt(12.0)
     assert sd_at(unit, 33.0, behind=-8.0) == pytest.approx(bends * 6.0 / 300.0, rel=0.05)
+
+
+def test_a_bend_increases_the_claimed_sd_of_a_part_outside_the_range():
+    # WHY: only the slopes of the curve over the board temperature counted: the bias of a part had
+    # a bump, and at 1.5 K below the range the error was 230 ug, the claimed sd 14 ug.
+    unit = calibration(response=(term('bend', (0.5, 0.0, 0.0), tau_s=600.0),))
+    # The slope is 0 below 20 degC, 0.5 counts/K above: its sd over the range is 0.25 counts/K.
+    assert sd_at(unit, 7.0, behind=5.0) == pytest.approx(0.25 * 3.0 / 300.0, rel=0.1)

@@ -138,12 +138,17 @@ def _valid_columns(
         column = windows.model.columns[k]
         valid = column.range
         if column.term.bounds is None:
-            order = column.term.order
-            valid = ranges.valid_range(windows.raw[:, k], 0.01, order)
+            values, order = windows.raw[:, k], column.term.order
+            if column.term.is_temperature:
+                # All bends of a part end at one temperature, the highest of this part in the bags:
+                # beyond, the sum of bends would else change its slope where each of them ends.
+                coldest = windows.temperature.min() - windows.model.reference_temperature
+                values, order = np.append(values, coldest - column.knee_k), 0
+            valid = ranges.valid_range(values, 0.01, order)
             if k not in weighed:
                 # A column with zero weight contributes only to the covariance, so all values that
                 # the temperature range allows are valid.
-                largest = (upper - lower) ** order
+                largest = (upper - lower) ** column.term.order
                 valid = ranges.union((valid, (-largest, largest)))
         if k in of_parts and column.term.order % 2:
             # A part lags both in cooling and in heating: the range of an odd power of its lag is

@@ -19,7 +19,7 @@ from ..errors import FitError, UndeterminedError
 from ..text import counted
 from ..thermal.settings import ADVISED_SPAN_K, RAMP_K_MIN
 from ..thermal.state import BOARD
-from ..typing import Floats
+from ..typing import Bools, Floats
 from ..unit.calibration import POPULATION, Calibration
 from ..unit.gravity import MICRO_G, ug_text
 from .coverage import LeastKnown, direction_text, distinct_directions, geometry
@@ -99,18 +99,36 @@ def judge_windows(
         )
         yield advice('case', text)
         return
+    yield from _judge_order(windows)
+
+
+def _judge_order(windows: ThermalWindows) -> Iterator[Finding]:
+    """Refuse bags if the board leads the case in ramps of all bags together, or of some bags."""
+    moving, bag = np.abs(_ramp_rates(windows)) > RAMP_K_MIN, windows.data.bag
+    least, where = _correlation(windows, moving), ''
+    numbers, first = np.unique(bag, return_index=True)
+    of_bags = np.array([_correlation(windows, moving & (bag == number)) for number in numbers])
+    if least > -0.3 and of_bags.max() >= 0.3 and of_bags.min() <= -0.3:
+        # One bag of twelve with exchanged thermometers hardly changes the correlation of all bags,
+        # but the fit would take a temperature halfway between board and case for that of a part.
+        bags = (windows.rests[k][0] for k in windows.data.position[first][of_bags <= -0.3])
+        least = float(of_bags.min())
+        where = f'{", ".join(bag.source.name for bag in bags)}, unlike in other bags: '
+    if least <= -0.3:
+        text = (
+            f'{where}the board temperature leads the case in ramps (correlation {least:.2f} of '
+            'T_case - T_board and the rate of T_board): are the two topics exchanged, or is '
+            'the case thermometer loose?'
+        )
+        yield Finding('swapped', 'refusal', text)
+
+
+def _correlation(windows: ThermalWindows, rows: Bools) -> float:
+    """Correlate the gradient with the rate in windows; 0 if they are shorter than 30 windows."""
+    if windows.data.weight[rows].sum() < 30.0 * windows.data.weight.max():
+        return 0.0
     # The case leads the board in a ramp, so the gradient has the sign of the board's rate.
-    moving = np.abs(_ramp_rates(windows)) > RAMP_K_MIN
-    if windows.data.weight[moving].sum() >= 30.0 * windows.data.weight.max():
-        correlation = float(np.corrcoef(windows.gradient[moving], windows.rate[moving])[0, 1])
-        if correlation <= -0.3:
-            yield Finding(
-                'swapped',
-                'refusal',
-                f'the board temperature leads the case in ramps (correlation {correlation:.2f} of '
-                'T_case - T_board and the rate of T_board): are the two topics exchanged, or is '
-                'the case thermometer loose?',
-            )
+    return float(np.corrcoef(windows.gradient[rows], windows.rate[rows])[0, 1])
 
 
 def _judge_span(windows: ThermalWindows) -> Finding:

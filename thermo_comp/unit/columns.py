@@ -26,7 +26,7 @@ from ..quantities import QUANTITIES
 from ..thermal.lags import BOARD_INPUT, Lag, MemorySpec, Play, Quantity
 from ..thermal.state import BOARD, WEIGHT, Gradient, Rate, StateLayout
 from ..typing import Floats
-from .functions import by_element, hold
+from .functions import TANGENT_SPANS, by_element, hold
 from .schema import broken, check_ranges
 from .terms import GROUPS, LINE, TERMS, Term
 
@@ -269,6 +269,11 @@ class ColumnTable:
         self._t_range = lower - reference_temperature, upper - reference_temperature
         ranges = np.array([column.range for column in columns])
         self._range = ranges.reshape(-1, 2).T[:, :, np.newaxis]
+        # Beyond their ranges columns are constant, but curves go on for a part of their width:
+        # a curve over the temperature of a part, which is a sum of bends, does so, too.
+        is_curve = np.array([c.term.is_temperature for c in columns], bool)[:, np.newaxis]
+        reach = np.where(is_curve, TANGENT_SPANS * (self._range[1] - self._range[0]), 0.0)
+        self._limits = self._range[0] - reach, self._range[1] + reach
         self._power = np.array([column.power for column in columns], np.int64)
         self._during = np.array([_DURING.index(column.during) for column in columns], np.int64)
         self._orders = np.array([column.term.order for column in columns], np.int64)
@@ -299,13 +304,17 @@ class ColumnTable:
         return np.asarray((numbers - self._centres) / self._widths)
 
     def held(self, raw: Floats) -> Floats:
-        """Limit the values u of the columns to the columns' ranges."""
-        return hold(raw, *self._range)
+        """Limit the values u of the columns to the values that the correction uses."""
+        return hold(raw, *self._limits)
+
+    def beyond(self, raw: Floats) -> Floats:
+        """Return how far the values u of the columns are beyond the columns' ranges, signed."""
+        return raw - hold(raw, *self._range)
 
     def excess(self, raw: Floats) -> Floats:
         """Return how far each column is outside its range [half ranges], as if linear in T."""
         lower, upper = self._range
-        excess = np.asarray(np.abs(raw - self.held(raw)) / ((upper - lower) / 2.0))
+        excess = np.asarray(np.abs(self.beyond(raw)) / ((upper - lower) / 2.0))
         for order in {*self._orders.tolist()} - {1}:
             rows, root = self._orders == order, partial(pow, exp=1.0 / order)
             excess[rows] = by_element(root, 1.0 + excess[rows]) - 1.0

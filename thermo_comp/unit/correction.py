@@ -89,7 +89,8 @@ class Correction:
         self._W = weights.reshape(-1, 6).T[:, :, np.newaxis]
         self._is_present = (self._W[:3] != 0.0) | (self._W[3:] != 0.0)
         self._find_columns_of_pairs()
-        slopes = self.curves.slopes(np.linspace(*self._span, _GAP_TEMPERATURES))
+        slopes = self.curves.slopes(settled := np.linspace(*self._span, _GAP_TEMPERATURES))
+        slopes += self._slopes_of_bends(settled)
         of_bias = np.arange(6)[:, np.newaxis] < 3
         bends = slopes.std(axis=2, keepdims=True)
         self._bends = np.concatenate((bends * of_bias, bends * ~of_bias))
@@ -121,6 +122,14 @@ class Correction:
         self._signs = by_board[:, np.newaxis, np.newaxis]
         self._has_lags = any(isinstance(column.source, Lag) for column in self.table.columns)
         self._lagged = [layout.places[lag] for lag in layout.lags if lag.input == BOARD_INPUT]
+
+    def _slopes_of_bends(self, board: Floats) -> Floats:
+        """Differentiate the sums of bends w.r.t. settled board temperatures, shape (6, n)."""
+        states = np.zeros((self.layout.width, len(board)))
+        states[BOARD] = board
+        _, direct = self.table.slopes(states)
+        none = np.zeros((6, len(board)))
+        return none if direct is None else self._weigh(direct, none)
 
     def bias_scale(self, states: Floats) -> Floats:
         """Evaluate bias and scale of the three axes, shape (2, 3, n)."""
@@ -160,7 +169,7 @@ class Correction:
         shares = 1.0 - state[WEIGHT], state[WEIGHT]
         curves = sum(w * (a + b) for w, a, b in zip(shares, relative, by_rate, strict=True))
         raw = self.table.raw(states)
-        beyond = (raw - self.table.held(raw))[:, 0].tolist()
+        beyond = self.table.beyond(raw)[:, 0].tolist()
         columns = zip(beyond, self.table.columns, strict=True)
         gradients = [0.0, *(excess for excess, column in columns if column.is_gradient)]
         of_columns = float(self.table.excess(raw).max(initial=0.0))
@@ -251,7 +260,7 @@ class Correction:
         regime the variances due to T_board, residual and lack of fit are sums over both sets.
         """
         board, weight, unknown = states[BOARD], states[WEIGHT], states[UNKNOWN]
-        static_weight, beyond_range = 1.0 - weight, raw - held
+        static_weight, beyond_range = 1.0 - weight, self.table.beyond(raw)
         excess, _, relative, by_rate = self.curves.excess(states)
         if not self._has_lags:
             # Lags contain the effect of the rate: its range counts only if no column has a lag.
