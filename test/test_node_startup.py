@@ -115,17 +115,30 @@ def test_help_that_cannot_be_written_prints_no_traceback(sink, code):
 ABSENT = ('typer', 'rich', 'rosbags', 'mcap', 'zstandard', 'scipy', 'matplotlib')
 
 
-def test_the_node_needs_only_ros_numpy_and_yaml(unit, tmp_path, monkeypatch):
-    # Python imports sitecustomize at its start, in the node and in its child processes.
-    (tmp_path / 'sitecustomize.py').write_text(
+def hide(names, folder, monkeypatch):
+    (folder / 'sitecustomize.py').write_text(
         'import sys\n'
         'class Absent:\n'
         '    def find_spec(self, name, *_):\n'
-        f'        if name.partition(".")[0] in {ABSENT!r}:\n'
+        f'        if name.partition(".")[0] in {names!r}:\n'
         '            raise ModuleNotFoundError(name, name=name)\n'
         'sys.meta_path.insert(0, Absent())\n'
     )
-    monkeypatch.setenv('PYTHONPATH', str(tmp_path))
+    monkeypatch.setenv('PYTHONPATH', str(folder))
+
+
+def test_the_node_without_ros_ends_with_advice(tmp_path, monkeypatch):
+    hide(('rclpy',), tmp_path, monkeypatch)
+    finished = ran(sys.executable, '-c', 'from thermo_comp.__main__ import node; node()')
+    assert finished.returncode == 1
+    assert finished.stdout == ''
+    (line,) = finished.stderr.splitlines()
+    assert line.startswith('thermo_comp_node: error: the node needs rclpy: source the setup file')
+
+
+def test_the_node_needs_only_ros_numpy_and_yaml(unit, tmp_path, monkeypatch):
+    # Python imports sitecustomize at its start, in the node and in its child processes.
+    hide(ABSENT, tmp_path, monkeypatch)
     check = f'from importlib.util import find_spec\nfor name in {ABSENT!r}:\n'
     check += '    try: find_spec(name)\n    except ModuleNotFoundError: print(name)'
     finished = ran(sys.executable, '-c', check)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the entry point of the console script and of ``python -m thermo_comp``."""
+"""Owns the entry points of the console scripts and of ``python -m thermo_comp``."""
 
 import sys
 
@@ -12,6 +12,16 @@ def main() -> None:
     except ModuleNotFoundError as error:
         sys.exit(f'thermo_comp: error: the commands need {error.name}: pip install thermo_comp')
     run()
+
+
+def node() -> int:
+    """Run the node; report a missing library, such as rclpy before ROS 2 is sourced."""
+    try:
+        from .ros.node import main as run
+    except ModuleNotFoundError as error:
+        advice = "source the setup file of ROS 2, or pip install 'thermo_comp[ros]'"
+        sys.exit(f'thermo_comp_node: error: the node needs {error.name}: {advice}')
+    return run()
 
 
 if __name__ == '__main__':
