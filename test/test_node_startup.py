@@ -115,30 +115,34 @@ def test_help_that_cannot_be_written_prints_no_traceback(sink, code):
 ABSENT = ('typer', 'rich', 'rosbags', 'mcap', 'zstandard', 'scipy', 'matplotlib')
 
 
-def hide(names, folder, monkeypatch):
-    (folder / 'sitecustomize.py').write_text(
-        'import sys\n'
-        'class Absent:\n'
-        '    def find_spec(self, name, *_):\n'
-        f'        if name.partition(".")[0] in {names!r}:\n'
-        '            raise ModuleNotFoundError(name, name=name)\n'
-        'sys.meta_path.insert(0, Absent())\n'
-    )
-    monkeypatch.setenv('PYTHONPATH', str(folder))
-
-
-def test_the_node_without_ros_ends_with_advice(tmp_path, monkeypatch):
-    hide(('rclpy',), tmp_path, monkeypatch)
+def test_node_and_commands_without_ros_end_with_advice(tmp_path, monkeypatch):
+    # ROS 2 for another version of Python, such as that of conda.
+    absent = 'rclpy._rclpy_pybind11'
+    (tmp_path / 'rclpy').mkdir()
+    text = f'raise ImportError("No module named {absent}\\nSee another page")\n'
+    (tmp_path / 'rclpy' / '__init__.py').write_text(text)
+    monkeypatch.setenv('PYTHONPATH', str(tmp_path))
     finished = ran(sys.executable, '-c', 'from thermo_comp.__main__ import node; node()')
-    assert finished.returncode == 1
-    assert finished.stdout == ''
-    (line,) = finished.stderr.splitlines()
-    assert line.startswith('thermo_comp_node: error: the node needs rclpy: source the setup file')
+    text = f'thermo_comp_node: error: No module named {absent}: source the setup file of ROS 2'
+    assert (finished.returncode, finished.stdout) == (1, '')
+    assert finished.stderr.startswith(text)
+    assert finished.stderr.count('\n') == 1
+    finished = ran(sys.executable, '-m', 'thermo_comp', 'play', 'bag')
+    assert (finished.returncode, finished.stdout) == (1, '')
+    assert f'cannot import (No module named {absent}): source the setup' in finished.stderr
 
 
 def test_the_node_needs_only_ros_numpy_and_yaml(unit, tmp_path, monkeypatch):
     # Python imports sitecustomize at its start, in the node and in its child processes.
-    hide(ABSENT, tmp_path, monkeypatch)
+    (tmp_path / 'sitecustomize.py').write_text(
+        'import sys\n'
+        'class Absent:\n'
+        '    def find_spec(self, name, *_):\n'
+        f'        if name.partition(".")[0] in {ABSENT!r}:\n'
+        '            raise ModuleNotFoundError(name, name=name)\n'
+        'sys.meta_path.insert(0, Absent())\n'
+    )
+    monkeypatch.setenv('PYTHONPATH', str(tmp_path))
     check = f'from importlib.util import find_spec\nfor name in {ABSENT!r}:\n'
     check += '    try: find_spec(name)\n    except ModuleNotFoundError: print(name)'
     finished = ran(sys.executable, '-c', check)

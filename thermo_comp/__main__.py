@@ -15,12 +15,12 @@ def main() -> None:
 
 
 def node() -> int:
-    """Run the node; report a missing library, such as rclpy before ROS 2 is sourced."""
+    """Run the node; report a library that cannot be imported, such as rclpy."""
     try:
         from .ros.node import main as run
-    except ModuleNotFoundError as error:
+    except ImportError as error:
         advice = "source the setup file of ROS 2, or pip install 'thermo_comp[ros]'"
-        sys.exit(f'thermo_comp_node: error: the node needs {error.name}: {advice}')
+        sys.exit(f'thermo_comp_node: error: {str(error).splitlines()[0]}: {advice}')
     return run()
 
 
