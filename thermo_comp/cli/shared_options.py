@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import wraps
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
@@ -356,7 +357,7 @@ def acceleration(text: str | None, name: str) -> float | None:
 def require_ros() -> None:
     """Raise ThermoCompError, with advice, if ROS cannot be imported by this interpreter."""
     try:
-        import rclpy  # noqa: F401
+        import_module('rclpy')
     except ImportError as error:
         raise ThermoCompError(
             f'this command needs ROS 2, which {sys.executable} cannot import '
