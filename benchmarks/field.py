@@ -87,14 +87,14 @@ def worse(after: list, new: Calibration, kalman: Floats) -> tuple[bool, bool]:
     Return whether the RMS of |f| - g on the rests of a day is larger than with the laboratory's
     calibration, for the updated calibration and for the Kalman filter.
 
-    An RMS counts as larger if it exceeds that with the laboratory's calibration by more than
+    An RMS counts as larger if it exceeds the RMS with the laboratory's calibration by more than
     claimed sd / sqrt(2 n), the standard error of an RMS over n turn-ons.
     """
     old, updated = (series_of(after, given) for given in (LABORATORY, new))
     counts = np.array([rest.mean for _, rest in after]) / K
     warmth = np.array([rest.state[0] for _, rest in after]) - REFERENCE_C
     of_best = np.linalg.norm(corrected(counts, warmth, kalman), axis=1) - G
-    # Average the windows of each rest in one attitude, as `series_of` does.
+    # Average |f| - g over the windows of each rest and attitude, as in the rows of `series_of`.
     group = np.repeat(np.arange(len(old)), old.n_windows)
     of_best = np.bincount(group, of_best) / old.n_windows
 
@@ -156,8 +156,8 @@ def unit(kind: str, seed: int, days: int) -> tuple[dict[str, Floats], list, floa
     kalman = filtered(history, process, days)
     f = corrected(counts, warmth, kalman)
     of_best = np.column_stack((np.linalg.norm(f, axis=1) - G, f - force))
-    # The claimed sd is that of |f| in a window one day after the update and after a further
-    # turn-on: add a turn-on offset, noise and a random walk over a day to the error.
+    # The claimed sd holds for |f| in a window one day after the update, after a further turn-on:
+    # add a turn-on offset, noise and a random walk over a day to the error.
     rng = np.random.default_rng([seed, 9])
     of_bias = np.hypot(process.turn_on, process.bias)
     more = (series.direction * rng.normal(0.0, of_bias, (N_PROBES, 3))).sum(axis=1)

@@ -56,8 +56,10 @@ def rests_of(of: Columns, calibration: Calibration, start_ns: int) -> list[tuple
         correction.memory,
     )
 
-    def state_now() -> tuple[tuple[float, ...], list[float]]:
+    def state_now() -> tuple[tuple[float, ...], list[float]] | None:
         thermal, now_ns = compensator.thermal, compensator.now_ns or 0
+        if now_ns > thermal.fresh_until_ns:
+            return None
         if thermal.is_unmeasured:
             return (*thermal.sample(now_ns), 0.0, 0.0)[:7], []
         return thermal.sample(now_ns), thermal.tracker.memory.remaining_shares(now_ns)

@@ -11,7 +11,7 @@ kind, with the scatter of turn-ons, exceeds a tolerance of 200 ug. The figures o
 the percentage of the drawn times in the forecast's 10 to 90 % interval, and the forecast's median
 divided by the median drawn time. A second part of the benchmark gives a verdict every five days on
 level and on carried units, half of which do not age. The figures are the numbers of verdicts
-"outside" by class of true RMS of |f| - g / (twice the claimed sd).
+"outside" in each class of (true RMS of |f| - g) / (twice the claimed sd).
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from thermo_comp.field.series import RestSeries, series_of
 from thermo_comp.field.update import update
 from thermo_comp.field.watch import LIMIT, watch
 
-#: Edges of the classes of verdicts by the ratio true RMS of |f| - g / limit of the verdict.
+#: Verdicts are counted in classes of (true RMS of |f| - g) / (limit of the verdict): edges.
 CLASSES = (0.0, 0.6, 0.8, 0.9, 1.0, 1.1, 1.2, 1.5, 9.0)
 LABORATORY, TOLERANCE, N_FUTURES = calibration(), 200.0 * UG, 200
 
 
 def leaves(probe: RestSeries, process: Process, bound: float, rng: np.random.Generator) -> Floats:
-    """Return the times [days] at which the RMS of |f| - g exceeds `bound` in 200 futures."""
+    """Return the times [days] at which the RMS of |f| - g exceeds `bound` in 200 random walks."""
     size = np.repeat([process.bias, process.scale * G], 3) / np.sqrt(3.0)
     error, levels = np.full(N_FUTURES, np.inf), np.zeros((N_FUTURES, 6))
     # The norm of `root` @ (1, changes `levels` of bias and scale) is the RMS of |f| - g.

@@ -5,9 +5,9 @@ Computes position errors of an inertial navigator by accelerometer drift, raw an
 
 The unit of the held-out bag stands still in the chamber, so any computed motion is an error. The
 navigator levels for five minutes, then navigates without aiding for half an hour; or it gets a
-zero-velocity update (ZUPT) every minute for 25 minutes, and no aiding in the next five minutes. A
-flight with and one without ZUPT begin in each minute of the bag, with raw samples, with samples
-corrected by a cubic for both regimes ('one set'), and with samples compensated as in the node.
+zero-velocity update (ZUPT) every minute for 25 minutes, and no aiding in the next five minutes. In
+each minute of the bag both flights begin, with raw samples, with samples corrected by a cubic for
+both regimes ('one set'), and with samples compensated as in the node.
 
 The simulated gyroscopes are ideal and the Earth does not rotate, so that the accelerometer causes
 all errors; the height is kept constant, as with a barometer. The filter estimates for each of the
@@ -115,7 +115,7 @@ class Model:
 
 @dataclass(frozen=True)
 class Flights:
-    """Errors of all flights, shape (steps, flights), and the position sd by the filter."""
+    """Errors of all flights, shape (steps, flights); `sigma`: the filter's position sd."""
 
     time_s: Floats
     position: Floats

@@ -188,7 +188,7 @@ def figures(seed: int, k2: float, k3: float) -> dict[str, Floats]:
     of_terms = sd[layout.nonlinear : layout.misalignment].reshape(3, 2, -1)
     result = {'kinds': np.array([term.kind for term in nonlinearity.terms])}
     if not k2:
-        # Repeat the fit with K2 and K3 fixed at 0; return the changes of bias and scale in sd.
+        # Repeat the fit with K2 and K3 fixed at 0; return changes of bias, scale / claimed sd.
         without = fitted(runs, k2_sd=1e-12, k3_sd=1e-13)
         values = [
             np.array([[a.bias / a.scale_factor, np.log(a.scale_factor)] for a in used.axes])
@@ -259,8 +259,8 @@ def main() -> int:
         k: float(np.sqrt(np.mean([result[k] ** 2 for result in results])))
         for k in ('before', 'after')
     }
-    say('RMS error at 5 g in a new mounting, no terms [ug]', rms['before'], 200.0, 700.0)
-    say('RMS error at 5 g in a new mounting, with terms [ug]', rms['after'], 0.0, 3.0)
+    say('RMS error at 5 g in a new mounting, without K2, K3 [ug]', rms['before'], 200.0, 700.0)
+    say('RMS error at 5 g in a new mounting, with K2, K3 [ug]', rms['after'], 0.0, 3.0)
     if plain:
         say(
             'units without nonlinearity: number of terms in all files',

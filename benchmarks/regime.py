@@ -6,7 +6,7 @@ Prints the figures of docs/regime.md: the regime detector in simulated ramps and
 A ramp of a chamber, with control ripple and a drift by self-heating, changes the temperatures of a
 case (first-order lag of the chamber) and of a board (first-order lag of the case). Sensors of
 several noises, quanta and rates read both temperatures. The detector's settings are the defaults
-except for noise, quantum, lags and ripple, which are those of the scene. All runs are seeded, so
+except for noise, quantum, lags and ripple, which the scene determines. All runs are seeded, so
 the command always prints the same figures, except for CPU times.
 
     python benchmarks/regime.py --quick            # seconds
@@ -198,7 +198,7 @@ def part_soak(pool: Pool, arguments: argparse.Namespace) -> Tables:
 
 
 def part_matrix(pool: Pool, arguments: argparse.Namespace) -> Tables:
-    """Yield tables of missed ramps, onset delays and flagged shares over all simulated scenes."""
+    """Yield tables: missed ramps; onset delay and fraction of a ramp flagged dynamic by scene."""
     rates = arguments.rates or ((1.0, 0.1) if arguments.quick else tuple(RAMPS))
     matrix = run_matrix(pool, arguments.quick, arguments.seed, rates, arguments.ramps)
     yield 'Ramps by rate of the readings', rate_table(matrix)

@@ -45,7 +45,7 @@ from thermo_comp.typing import Floats
 def cost(
     node: CompensationNode, relay: Relay, keeper: RestKeeper, seconds: int
 ) -> tuple[list[float], list[float]]:
-    """Return the CPU times per sample [us] in seconds with the rest log, and in those without."""
+    """Return CPU times per sample [us] in each second with the rest log, and in each without."""
     found: tuple[list[float], list[float]] = ([], [])
     time.sleep(2.0 - time.time() % 2.0)
     for _ in range(seconds):
@@ -61,7 +61,7 @@ def cost(
 
 
 def tail_latencies(file: Path) -> tuple[Floats, Floats]:
-    """Return the 99th percentile of the latency [ms] in each even and in each odd second."""
+    """Return 99th percentiles of the latency [ms]: of the even seconds, and of the odd seconds."""
     stamp_ns, latency_ns = np.load(file)
     second = stamp_ns // 1_000_000_000
     # Exclude the first and the last second, which are incomplete.

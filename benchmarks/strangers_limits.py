@@ -73,8 +73,8 @@ class Result:
 @dataclass(frozen=True)
 class Limit:
     """
-    The limits of a row. By default the error may be up to 1.05 times that of the best baseline,
-    and the RMS of error / claimed sd up to 1.5.
+    The limits of a row. By default the error may be up to 1.05 times the error of the best
+    baseline, and the RMS of error / claimed sd up to 1.5.
 
     Parameters
     ----------
@@ -121,8 +121,8 @@ LIMITS = {
     'plain': Limit(norm=1.3, vector=2.0, low=0.7, high=1.4),
     'one-pose: own bag': Limit(vector=2.0, low=0.7, high=1.4),
     'one-pose: other program': Limit(vector=5.0, low=0.7, high=1.4),
-    # `score` subtracts the smallest claimed variance of a bag, which in 'returned' contains the
-    # variance of a slope over temperature: error / claimed sd has no meaning and no limit.
+    # `score` subtracts the smallest claimed variance of a bag, which in case 'returned' contains
+    # the variance of a slope over temperature: error / claimed sd has no meaning and no limit.
     'returned': Limit(high=np.inf),
     'soaks': Limit(low=0.5, high=1.5, claim=3.0),
     'turn-on': _TURN_ON,
@@ -130,7 +130,7 @@ LIMITS = {
     # A single recording does not show how well turn-ons repeat: error / claimed sd has no limit.
     'sessions one': Limit(high=np.inf),
     'sessions two': Limit(low=0.7, high=1.4),
-    # The error after an update may exceed that of the joint fit by 5 %, as the two fits estimate
+    # The error of an update may exceed the error of a joint fit by 5 %, as the two fits estimate
     # the sd of turn-ons from different recordings.
     'sessions update': Limit(than='two', times=1.05),
     'ageing': Limit(),
@@ -228,7 +228,7 @@ def _row(results: Sequence[Result]) -> Row:
 
 
 def limit_of(title: str) -> Limit:
-    """Return the limits of a row: those of the longest key with which its title begins."""
+    """Return the limits of a row: the longest key with which its title begins determines them."""
     return LIMITS[max((key for key in LIMITS if title.startswith(key)), key=len)]
 
 

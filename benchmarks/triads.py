@@ -49,7 +49,7 @@ class LeakageEffect(Effect):
 @dataclass(frozen=True)
 class SlipEffect(Effect):
     """
-    A joint that the temperature of a part strains, and that slips. The joint's stress [K of free
+    A slipping joint, strained by the temperature of a part. The joint's stress [K of free
     strain] depends on the path of the temperature, not on time, and is 0 at the start. The joint
     slips abruptly at a stress of `width` [K] (Jenkins) or gradually up to it (Dahl, Bouc-Wen).
     """

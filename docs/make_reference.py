@@ -56,6 +56,7 @@ format_version: 2
 unit: {serial: EXAMPLE-1, input: counts, full_scale: 32767.0, cycle_time_s: 0.01}
 reference_temperature_c: 20.0
 gravity_m_s2: 9.80665                # local gravity, input of the fit
+gravity_sd_m_s2: 0.0                 # its sd, input of the fit
 axes:                                # at the reference temperature
   x: {scale_factor: 299.1, bias: 4.2}   # counts per m/s^2, counts
 static:                              # the set of the static regime
@@ -153,7 +154,7 @@ coefficients of a calibration are not parameters: parameters arrive one at a tim
 coefficients gives a wrong correction.
 
 If lags, play operators and `detector` of the new calibration equal those of the running calibration, as after `update`, the
-estimates of temperatures and regime go on. With a calibration of a new fit these estimates restart from the last
+estimates of temperatures and regime go on. With a calibration of a new fit the estimation restarts from the last
 temperatures: after a reload in a ramp the output may step, with a larger covariance until `memory settled` in `/diagnostics`
 is True. Load a calibration of a new fit when the temperature has been constant for an hour.
 

@@ -61,7 +61,7 @@ def thermal_calibration():
 
 
 def term(kind, bias=(0.0, 0.0, 0.0), scale=(0.0, 0.0, 0.0), **keys):
-    """Make a response term; by default its group is that of `kind`, and its range is wide."""
+    """Make a response term; defaults: the group of the same name as `kind`, range +-50 K."""
     values = {'group': kind, 'range': (-50.0, 50.0), **keys}
     return ResponseTerm(kind=kind, bias=tuple(bias), scale=tuple(scale), **values)
 

@@ -46,7 +46,7 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 # Examples of hypothesis have no time limit, because their duration depends on the machine.
 settings.register_profile('usual', max_examples=50, deadline=None)
 settings.load_profile('usual')
-# Examples in `make nightly`; a test with a fixed number of examples keeps this number.
+# Number of examples per test in `make nightly`, except for tests that set a number.
 settings.register_profile('nightly', max_examples=10_000, deadline=None)
 
 

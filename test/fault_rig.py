@@ -160,7 +160,7 @@ def bag(rate_hz=RATE_HZ, ramp_s=RAMP_S, duration_s=DURATION_S, start_s=0.0):
 
 
 def corrected(events, compensator=None):
-    """Correct events in this process; return stamps and rows (force, covariance)."""
+    """Apply a `Compensator` to events; return stamps and rows (force, covariance)."""
     compensator = compensator or Compensator(unit(), CONFIG)
     stamps, rows = [], []
     for topic, stamp_ns, message in events:

@@ -159,7 +159,7 @@ def prior_of(truth, names=('curve', 'board'), **changes):
 
 
 def candidates_of(windows, forced=()):
-    """Let a fit keep any column; typical prior sd of slopes: 5 ug/K (bias), 5 ppm/K (scale)."""
+    """Allow all columns, keep the groups `forced`; typical sd of slopes: 5 ug/K, 5 ppm/K."""
     none = np.zeros((2, len(windows.groups)), dtype=bool)
     typical, largest = (
         np.outer(slope, windows.kelvins) * windows.parts

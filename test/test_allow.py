@@ -165,10 +165,10 @@ def test_one_bag_in_kelvins_among_others_is_refused_by_name(rng):
 
 
 def test_the_advice_for_rests_without_noise_names_the_parameter_of_the_node(rng):
-    # WHY: the node takes equal samples for those of a stuck converter: 60 % of all were dropped.
+    # WHY: the node takes equal samples for a stuck converter, and dropped 60 % of all samples.
     rests = rests_of(rng, sd=0.3 * MG)
     for rest in rests[:2]:
-        # The samples have no noise; a drift of 40 mg changes them by steps of 4 mg.
+        # The samples have no noise; with a drift of 40 mg they change by steps of 4 mg.
         drift = 40.0 * MG * np.linspace(0.0, 1.0, len(rest.accel))[:, np.newaxis]
         rest.accel = np.rint((rest.accel + drift) / (4.0 * MG)) * 4.0 * MG
     findings = findings_of(sources_of(rests))

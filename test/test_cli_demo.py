@@ -51,7 +51,7 @@ def test_the_demonstration_prints_the_output_shown_on_the_pages(tmp_path, monkey
         rows = re.findall(rf'^{section} +([a-z ]+?) +\d+ +([\d.]+) ', printed, re.MULTILINE)
         assert len(rows) == 4, printed
         raw, node, two_sets, one_set = (float(rms) for _, rms in rows)
-        # The node's error must be below those of two fits without lags: a common curve of both
+        # The node's error must be smaller than with two fits without lags: a common curve of both
         # regimes, and a curve per regime. Noise is below 10 ug.
         assert raw > 150.0
         assert node < 10.0

@@ -31,7 +31,7 @@ EXAMPLES = [
 ]
 # The example that runs in a separate process; other examples run in the process of the tests.
 OF_ITS_OWN = 'thermo_comp evaluate held_out.mcap -c unit42.yaml --tolerance 100ug'
-# An example of each command that prints figures, except for those that other files test.
+# Examples that other files test; one example of each other command is tested with --json.
 TESTED = re.compile(r'thermo_comp (play|report|record --positions) |bags/unit42/\*')
 WITH_JSON = {line.split()[1]: line for line in EXAMPLES if not TESTED.search(line)}.values()
 QUICK = [line for line in EXAMPLES if line.split()[1] in ('info', 'convert', 'export', 'import')]

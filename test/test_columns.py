@@ -61,7 +61,7 @@ def test_gradient_even_about_rest_is_an_even_function_of_gradient_less_rest():
     assert {(column.sensor, column.rest_k) for column in change} == {('case', -0.5)}
     table = ColumnTable(change, MemorySpec(('case', 'tip')), 20.0)
     states = np.zeros((StateLayout(MemorySpec(('case', 'tip'))).width, 3))
-    # Gradients of the three states: -0.5 K, that of a soak, and 1.5 K above and below -0.5 K.
+    # Gradients: -0.5 K, the value in a soak, and 1.5 K above and below the value in a soak.
     states[GRADIENT] = -0.5, 1.0, -2.0
     values = table.raw(states)
     assert np.all(values[:, 0] == 0.0)
@@ -106,7 +106,7 @@ def test_the_value_of_each_kind_of_column_agrees_with_hand_numbers():
     ]
     spec = memory_of(columns, ('case', 'tip'))
     layout = StateLayout(spec)
-    # Board, its variance, rate, weight, is regime unknown; (gradient or lag, variance) x 4; play.
+    # T_board, its variance, rate; dynamic weight; unknown; 4 x (gradient or lag, variance); play.
     state = [23.0, 0.0, 0.01, 0.25, 0.0, 1.2, 0.0, -0.7, 0.0, 0.5, 0.0, -0.3, 0.0, 0.1]
     state = np.array([state]).T
     assert layout.width == len(state)
@@ -116,7 +116,7 @@ def test_the_value_of_each_kind_of_column_agrees_with_hand_numbers():
         0.25, 0.49 * 3.0, 0.7, 0.5 * 3.0, 1.0, 0.5, 0.0,
     ]  # fmt: skip
     assert values == pytest.approx(expected)
-    # Columns with a factor t limit it to calibrated temperatures; the column `board` has no t.
+    # A factor t of a column is limited to calibrated temperatures; the column `board` has no t.
     at_edge = ColumnTable(columns, spec, 20.0, (-10.0, 22.0)).values(state)[:, 0]
     assert at_edge[4] == pytest.approx(-0.6)
     assert at_edge[2] == 0.5

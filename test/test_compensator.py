@@ -48,7 +48,7 @@ def test_the_offset_is_half_the_sum_of_signed_counts():
 
 
 def test_a_corrected_sample_agrees_with_the_formula_of_the_static_set():
-    # Expected: the formula with the static curves at t = 10 K, for a gradient and a rate of 0.
+    # Expected: the correction formula with the static curves at t = 10 K, gradient 0 and rate 0.
     axis = axis_set((0.0, 0.5, 0.01), (1.0, 1e-4), delta=2.0)
     unit = calibration(
         axes=equal_axes(300.0, 7.0),
@@ -202,8 +202,25 @@ def test_at_most_4096_readings_of_another_clock_are_stored():
     compensator = Compensator(calibration())
     for k in range(10_000):
         compensator.push('board', 10**18 + k, 20.0)
-    assert len(compensator.thermal.queue) == 4096
-    assert compensator.counters.n_board_rejected == 10_000 - 4096
+    assert len(compensator.thermal.queue) <= 4096
+    assert compensator.counters.n_board_rejected == 10_000 - len(compensator.thermal.queue)
+
+
+@pytest.mark.parametrize('ahead_s', [0, 10**6])
+def test_a_full_queue_keeps_the_newest_readings(ahead_s):
+    # WHY: a full queue dropped each new reading, also those of the board if the queue was full of
+    # readings of a case thermometer whose clock is ahead.
+    config = CompensatorConfig(gravity_tolerance_m_s2=0.0)
+    compensator = Compensator(thermal_calibration(), config)
+    for k in range(10_000):
+        compensator.push('case', (k + ahead_s) * SECOND_NS, 20.0)
+        compensator.push('board', k * SECOND_NS, 20.0)
+        if ahead_s and k % 100 == 0:
+            compensator.process(k * SECOND_NS + 1, 1.0 + k % 2, 2.0, 3.0)
+    counters = compensator.counters
+    assert compensator.process(9_999 * SECOND_NS + 2, 7.0, 8.0, 9.0) is not None
+    assert bool(counters.n_board_rejected) == (not ahead_s)
+    assert counters.n_case_rejected > 3_000
 
 
 @pytest.mark.parametrize('n_before', [0, 3])

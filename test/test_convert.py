@@ -172,6 +172,7 @@ def test_every_row_with_a_fault_is_counted(tmp_path):
     block = read_recording(tmp_path / 'bag').columns
     assert report.rows == 400
     assert (report.findings['short_rows'].count, report.findings['non_numeric'].count) == (1, 2)
+    assert report.findings['short_rows'].lines == (401,)
     assert report.findings['non_numeric'].lines == (12, 22)
     assert (report.findings['clipped'].count, report.findings['clipped'].lines) == (1, (32,))
     assert (report.findings['backwards'].count, report.findings['backwards'].lines) == (1, (43,))

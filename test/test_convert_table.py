@@ -44,7 +44,7 @@ def test_every_layout_of_a_table_gives_equal_values(tmp_path, delimiter, newline
     assert table.stamp_ns.tolist() == [1000 * 10**6, 1001 * 10**6, 1003 * 10**6]
     assert table.values['a'].tolist() == [row[1] for row in ROWS]
     assert table.values['b'].tolist() == [row[2] for row in ROWS]
-    assert table.n_short == 0
+    assert len(table.short) == 0
 
 
 def test_headings_of_a_table_are_optional(tmp_path):
@@ -65,7 +65,7 @@ def test_lines_before_the_table_of_a_logger_are_left_out(tmp_path, separator):
     assert np.isnan(table.values['t'][0])
     np.testing.assert_array_equal(table.values['az'][1:], np.arange(60.0))
     assert table.line[1] == 9
-    assert table.n_short == 1
+    assert [*table.short] == [70]
 
 
 def test_a_column_of_a_table_may_begin_late(tmp_path):
@@ -84,7 +84,7 @@ def test_line_numbers_are_those_of_an_editor(tmp_path):
     assert table.line.tolist() == [4, 5, 7]
     np.testing.assert_array_equal(table.values['a'], [1.0, np.nan, 5.0])
     # The row with a single cell is counted and left out.
-    assert table.n_short == 1
+    assert [*table.short] == [6]
 
 
 def test_stamps_of_a_table_are_exact():

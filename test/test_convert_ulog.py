@@ -83,11 +83,11 @@ def test_each_imu_of_a_log_can_become_a_bag(flight, tmp_path, imu):
     recording = read_recording(tmp_path / 'bag.mcap')
     bag = recording.columns
     assert report.messages['accel'] == N
-    # A stamp is the time at which this IMU took the sample, not that of its publication.
+    # A stamp is the time at which this IMU took the sample, not the time of publication.
     expected_ns = (5_000_000 + np.arange(N) * STEP_US + imu) * 1000
     np.testing.assert_array_equal(bag.accel_stamp_ns, expected_ns)
     np.testing.assert_array_equal(bag.accel, truth['force'][imu])
-    # Each accelerometer sample has a board temperature; the barometer measures that of the case.
+    # Each accelerometer sample has a board temperature; the barometer gives T_case.
     np.testing.assert_array_equal(bag.temperatures['board'].celsius, truth['celsius'][imu])
     np.testing.assert_array_equal(bag.temperatures['case'].celsius, 20 + 0.5 * np.arange(12))
     assert recording.info.metadata['serial'] == f'px4-accel-{77 + imu}'
@@ -176,7 +176,7 @@ def write_combined(path, rng, later=None, **parameters):
         now = 7_000_000 + k * STEP_US
         rows = [(-200, vector)]
         if k == 3:
-            # Add a message without accelerometer sample, and one that repeats a sample.
+            # Add a message without accelerometer sample, and a message that repeats a sample.
             rows += [(2**31 - 1, vector), (-200 - 50, vector)]
         for j, (relative, own) in enumerate(rows):
             row = (now + (50 if j == 2 else 0), 0.1, 0.2, 0.3, 5000, relative, *own, 5000)
@@ -202,7 +202,7 @@ def test_sensor_combined_replaces_a_missing_sensor_accel(tmp_path, rng, cli):
     np.testing.assert_array_equal(read.accel, force)
     np.testing.assert_array_equal(read.stamp_ns, (7_000_000 - 200 + np.arange(N) * STEP_US) * 1000)
     np.testing.assert_allclose(read.gyro, np.tile([0.1, 0.2, 0.3], (N, 1)), rtol=1e-6)
-    # The only thermometer in the log is that of the barometer: it is taken as the board's.
+    # The only thermometer in the log, in the barometer, is taken as the board thermometer.
     np.testing.assert_array_equal(read.temperatures['board'].celsius, 40.0 + np.arange(6))
     assert 'case' not in read.temperatures
     printed = cli('convert', path, '-o', tmp_path / 'bag.mcap').stdout
@@ -243,13 +243,10 @@ def test_the_report_on_a_log_at_1_hz_names_fits_for_which_1_hz_is_sufficient(tmp
     assert 'sensor_accel at 10 Hz' in printed
 
 
-def test_a_log_without_an_accelerometer_is_refused(tmp_path):
+def test_a_log_without_an_accelerometer_and_other_files_are_refused(tmp_path):
     log = UlogWriter(BARO)
     log.data(log.subscribe('sensor_baro', 0), struct.pack('<QQIffI', 1, 1, 9, 1e5, 20.0, 0))
     refused(tmp_path, log.body, 'the log holds no IMU')
-
-
-def test_files_that_are_not_a_ulog_are_refused(tmp_path):
     for content in (b'', b'ULog', b'time,x,y,z\n1,2,3,4\n' * 10):
         refused(tmp_path, content, 'not a ULog file')
 

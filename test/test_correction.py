@@ -194,7 +194,7 @@ def test_corrections_with_random_initial_lag_states_scatter_by_the_claimed_sd(rn
 
 
 def test_the_variance_of_initial_lag_states_is_updated_every_ten_seconds():
-    # The variance is that of the initial state of a lag of 60 s, whose sd falls as exp(-t / 60 s).
+    # The initial state of a lag of 60 s is unknown; its sd falls as exp(-t / 60 s).
     unit = builders.calibration(response=(term('board', (30.0, 0.0, 0.0), tau_s=60.0),))
     compensator = Compensator(unit, builders.UNCHECKED)
     noise = compensator.thermal.correction.noise[0]

@@ -141,7 +141,6 @@ def test_every_command_reads_a_bag_with_the_topics_of_the_driver(path, bag, tmp_
     assert 'is taken for board' not in printed
     assert ('no case temperature' in printed) == ('case' not in names)
     assert ('--topic case=TOPIC\n' in printed) == ('case' not in names)
-
     fitted = tmp_path / 'unit.yaml'
     save_calibration(warming_unit(), tmp_path / 'warm.yaml')
     if path.stem in FITTED:
@@ -153,7 +152,6 @@ def test_every_command_reads_a_bag_with_the_topics_of_the_driver(path, bag, tmp_
         assert left < 10.0 if has_board else 500.0 < left < 2500.0
     else:
         fitted = tmp_path / 'warm.yaml'
-
     if has_board or path.stem in FITTED:
         cli('replay', bag, '-c', fitted, '-o', tmp_path / 'out.csv', *topics)
         with (tmp_path / 'out.csv').open() as file:

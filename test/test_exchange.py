@@ -142,7 +142,6 @@ def test_the_bias_of_a_gyroscope_is_exported_and_imported(cubic):
     assert moved != px4.text
     np.testing.assert_allclose(again(moved)[:, 0], shifted.value(celsius - 30.0), atol=1e-9)
     assert 'angular rate' not in ' '.join(px4.notes)
-
     ardupilot = export_calibration(unit, 'ardupilot', number=2).text
     assert 'INS_TCAL2_GYR1_X' in ardupilot
     # ArduPilot stores the bias at CALTEMP as another parameter, so its cubic is 0 at CALTEMP.

@@ -70,7 +70,7 @@ def test_a_node_killed_in_a_ramp_restarts_with_larger_covariance(path):
         assert first.values['memory settled'] == 'False'
         rest = node.play([e for e in events if seconds_of(e[1]) >= 91.0])
     n = len(first.force)
-    # Lag states are unknown after a start, so the covariance exceeds that without a restart.
+    # Unknown lag states after a start make the covariance larger than without a restart.
     at = round(90.0 * RATE_HZ)
     assert (first.covariance[:, 0, 0] > 4.0 * undisturbed[at : at + n, 3].max()).all()
     assert max(sigmas(first), sigmas(rest)) < SIGMAS

@@ -39,7 +39,7 @@ def left_by(pair, **options):
     time_s = held_out.time_s[: 8 * n].reshape(n, 8).mean(axis=1)
     counts = held_out.counts[: 8 * n].reshape(n, 8, 3).mean(axis=1)
     corrected = calibration.correct(time_s, counts, **held_out.temperatures)
-    # A fit to two positions leaves bias, K and M uncertain: in a third one an axis' sd is > 1 mg.
+    # A fit to two positions is uncertain by > 1 mg (sd of an axis) in a third position.
     sd = np.sqrt(np.nanmedian(np.einsum('nii->ni', corrected.covariance), axis=0))
     assert (sd > 1000.0 * MICRO_G).any()
     return np.asarray(minutes(corrected.specific_force).std(axis=0))
@@ -135,7 +135,7 @@ def test_one_position_leaves_the_scale_at_its_prior(one_position):
     for axis in calibration.static.axes():
         # The scale's slope has the prior mean 0 and the prior sd 67 ppm/K, a third of 200 ppm/K.
         assert np.abs(axis.scale_function.value(np.array([-4.0, 15.0])) - 1.0).max() < 5e-4
-    # For a MEMS the prior sd of scale factors is 5 %, that of misalignments 0.01 rad.
+    # For a MEMS the prior sd is 5 % for scale factors, and 0.01 rad for misalignments.
     sd = np.sqrt(np.diag(calibration.posterior.covariance()))
     for block in parameter_layout(calibration).scale:
         assert sd[block.static] == pytest.approx(0.05, rel=0.3)
@@ -267,7 +267,7 @@ def test_the_bias_sd_of_one_recording_contains_the_sd_of_a_turn_on(rng):
     # WHY: the claimed bias sd was 1/6 of the bias error, as if each position had its own turn-on.
     offsets = 5e-3 * rng.standard_normal((8, 3))
     ups = positions(12, 3)
-    # `least` [m/s^2]: turn-on sd, by the prior for a sample noise of 0.02 m/s^2, or as stated.
+    # `least` [m/s^2]: turn-on sd, either of the prior (sample noise 0.02 m/s^2) or as stated.
     stated = fit([turned(rng, ups)], replace(OPTIONS, mounting_sd=5e-3))
     for result, least in ((tumbled(12), 1e-3), (stated, 5e-3)):
         calibration = result.calibration
@@ -325,7 +325,7 @@ def test_two_bags_without_a_pause_between_them_count_as_one_turn_on(rng):
         ]
         return [source_of(*part, name=name) for part, name in zip(arrays, 'ab', strict=True)]
 
-    # The second bag begins in the fifth position, which is two mountings if bags are not joined.
+    # The second bag begins in position 5, which counts as two mountings in bags not joined.
     source = turned(rng, positions(9, 3))
     whole = tumbled(9)
     parts, others = (fit(cut(source, 9400, pause_s), OPTIONS) for pause_s in (0.0, 60.0))
@@ -442,7 +442,7 @@ def test_six_attitudes_that_hardly_determine_the_scale_factors_give_scale_factor
     up /= np.linalg.norm(up, axis=1)[:, None]
     sensed = np.linalg.inv([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.02, 0.0, 1.0]])
     axes = fit([turned(rng, up @ sensed.T)], OPTIONS).calibration.axes
-    # The prior sd of a scale factor is 5 %, that of a bias 1 m/s^2.
+    # The prior sd is 5 % for a scale factor, and 1 m/s^2 for a bias.
     np.testing.assert_allclose([axis.scale_factor for axis in axes], 1.0, atol=0.05)
     np.testing.assert_allclose([axis.bias for axis in axes], (0.1, -0.2, 0.3), atol=0.5)
 

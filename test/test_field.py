@@ -39,7 +39,7 @@ def test_derivatives_of_a_rest_by_all_parameters_agree_with_finite_differences()
     layout = parameter_layout(unit)
     levels = {level for block in layout.scale for level in (block.static, block.dynamic)}
     levels |= {block.static for block in layout.bias}
-    # Test the derivatives by every other parameter. A bias or a scale has an odd number of
+    # Test the derivatives by every second parameter. A bias or a scale has an odd number of
     # parameters, so each kind of parameter is tested either in the bias or in the scale.
     for k in range(0, layout.n_parameters, 2):
         step = 1e-7
@@ -58,7 +58,7 @@ def test_derivatives_of_a_rest_by_all_parameters_agree_with_finite_differences()
         by_level = series.by_level[:, axis + 3] * unit.gravity_m_s2
         assert np.allclose(slope, by_level, atol=1e-4)
         both = series.by_parameter[:, [block.static, block.dynamic]].sum(axis=1)
-        # A relative change of K changes |f| like an equal change of the scale level in both sets.
+        # A relative change of K changes |f| like an equal change of both regimes' scale levels.
         assert np.allclose(slope, both, atol=0.02 * abs(slope).max())
 
 
@@ -90,7 +90,7 @@ def test_an_update_with_the_true_variances_equals_a_kalman_filter():
         bias, scale = layout.bias[axis].static, layout.scale[axis].static
         sd = np.sqrt(solved.posterior[bias, bias]) / field_units.K
         expected = best.state[axis] + best.state[15 + axis]
-        # The update averages the rests of a turn-on to a few rows, which costs less than 0.2 sd.
+        # The update averages the rests of a turn-on to a few rows: results change by < 0.2 sd.
         assert abs(solved.shift[bias] / field_units.K - expected) < 0.2 * sd
         P = best.P[np.ix_([axis, 15 + axis], [axis, 15 + axis])].sum()
         assert sd == pytest.approx(np.sqrt(P), rel=0.1)
@@ -177,12 +177,12 @@ def test_the_sd_of_an_old_calibration_aged_to_the_last_rest_includes_the_random_
     # half and all of the variance of the random walk to the biases of x and y.
     for axis in (x, y):
         assert 0.5 < axis.present_sd / (329.0 * MICRO_G) < 1.5
-    # At the last rest the sd of the z bias must equal its walk within 40 ug (two turn-on sd).
+    # At the last rest the force sd of z must equal |random walk of z| within two turn-on sd.
     assert z.present_sd == pytest.approx(abs(walk[-1, 2]), abs=40.0 * MICRO_G)
 
 
 def stepped(history, size, day):
-    """Scale the means of rests from a day on as if gravity had changed by `size` [m/s^2]."""
+    """Scale the means of rests as if from `day` on gravity were `size` [m/s^2] larger."""
     return [
         (s, replace(r, mean=tuple(np.array(r.mean) * (1.0 + size / field_units.G * (d >= day)))))
         for (s, r), d in zip(history.rests, history.day, strict=True)
@@ -341,10 +341,10 @@ def test_the_command_update_writes_a_better_calibration(tmp_path, unit_file, cli
     written = load_calibration(new)
     assert written.provenance.sources[-1].name == 'rests until 2030-01-20T23:12:40, claim aged 1 d'
     assert 'before: 2029-12-31' in written.provenance.notes[-1]
-    # The date in the new calibration file is that of its last rest, not that of the command.
+    # The new calibration file has the date of its last rest, not of the command.
     assert written.provenance.date == '2030-01-20T23:12:40Z'
     assert 'from 0 bags and 1 rest log, ' in cli('info', new).stdout
-    # The old calibration is judged on the log, as it was made without the rests of the log.
+    # The log judges the old calibration, which was made without the rests of the log.
     assert parsed(cli('evaluate', log, '-c', unit_file, '--json', code=1).stdout)['left']
     history = cli('report', '-c', unit_file, '-c', new, '-o', tmp_path / 'page.html', '--json')
     assert [change['constant'] for change in parsed(history.stdout)['history']][2] == 'bias z'

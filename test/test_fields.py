@@ -148,7 +148,7 @@ def driver_bag(path, store, storage=StoragePlugin.MCAP):
         level = store.types['geometry_msgs/msg/Quaternion'](0, 0, 0, 1)
         for row in range(50):
             stamp_ns = START_NS + row * 10**7
-            # The clock of the recorder is 1000 s ahead of that of the driver.
+            # The recorder's clock is 1000 s ahead of the driver's clock.
             log_ns = stamp_ns + 10**12
             if row % 5 == 0:
                 accel = store.types['px4_msgs/msg/SensorAccel']

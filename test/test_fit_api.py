@@ -20,7 +20,7 @@ UPS = np.array(
 
 
 def recording(up, rng, slope=None):
-    """Simulate times [s], samples [m/s^2] and board [degC]: in two hours from 10 to 32 to 12."""
+    """Simulate two hours from 10 to 32 to 12 degC: times [s], samples [m/s^2], board [degC]."""
     time_s = np.arange(0.0, 7200.0, 2.0)
     board = np.interp(time_s, (0.0, 600.0, 3600.0, 7200.0), (10.0, 10.0, 32.0, 12.0))
     bias = (SLOPE if slope is None else slope) * MICRO_G * np.maximum(board - KNEE_C, 0.0)

@@ -170,18 +170,18 @@ def test_few_norms_that_both_models_predict_do_not_select_the_model():
 
 
 def test_a_larger_model_must_not_explain_the_errors_of_a_coarse_thermometer():
-    # WHY: with readings in steps of 1 K all bags of a temperature program have equal errors. A
-    # curve with knees halved the drift error on left-out bags, but doubled that in other
-    # temperature programs.
+    # WHY: readings in steps of 1 K have equal errors in all bags of one temperature program. A
+    # curve with knees halved the drift error on left-out bags of this program, but doubled the
+    # drift error in other temperature programs.
     by_thermometer = 49.0
     curve, parts, bends = (score(drift, (), by_thermometer) for drift in (120.0, 46.0, 20.0))
     assert is_better(curve, parts)
     assert not is_better(parts, bends)
-    # A curve that reduces errors of |f| from 3000 to 60 ug is chosen, one from 60 to 30 ug is not.
+    # A curve that reduces errors of |f| from 3000 to 60 ug is chosen; from 60 to 30 ug it is not.
     flat, curved = (score(46.0, size * np.ones(9), by_thermometer) for size in (3000.0, 60.0))
     assert is_better(flat, curved)
     assert not is_better(curved, score(20.0, 30.0 * np.ones(9), by_thermometer))
-    # With thermometer errors of only 5 ug, a left-out drift of 20 ug is better than one of 46 ug.
+    # With thermometer errors of only 5 ug, 20 ug of left-out drift are better than 46 ug.
     assert is_better(score(46.0, (), 5.0), score(20.0, (), 5.0))
 
 

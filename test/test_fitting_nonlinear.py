@@ -210,7 +210,7 @@ def test_a_constant_rotation_counts_as_a_rest_and_a_changing_rotation_does_not(r
     summed = accumulator.cells()
     still = still_intervals(without_rotation(summed), 3.0)
     edges = [(summed.time[a], summed.time[b - 1]) for a, b in still]
-    # The 10 s median reaches a new angular rate after 5 s; the 0.5 s next to a motion are no rest.
+    # The 10 s median follows a new angular rate 5 s late; 0.5 s beside a motion are left out.
     assert len(edges) == 3
     for (a, b), (begun, ended) in zip(edges, ((0, 80), (100, 180), (190, 240)), strict=True):
         assert begun <= a < begun + 8.0

@@ -307,9 +307,9 @@ def soak_ramp_soak(quantum, noise, rng):
 def test_thermometer_settings_are_estimated_from_readings(quantum, noise, rng):
     learned = learn_thermometer([soak_ramp_soak(quantum, noise, rng)], ThermometerSettings())
     assert learned.quantum_c == pytest.approx(quantum, rel=1e-6)
-    # Rounded readings show noise only at a rounding edge passed slowly, at the end of the ramp.
+    # Rounded readings show their noise only near a rounding edge, at the slow end of the ramp.
     assert learned.noise_sd_c == pytest.approx(noise, rel=0.4 if quantum else 0.1)
-    # Means over 60 s determine the lag of the thermometer, 300 s, to a third.
+    # Means over 60 s determine the lag of the thermometer, 300 s, to 100 s.
     assert learned.lag_s == pytest.approx(300.0, rel=0.35)
     assert learned.fastest_ramp_k_min >= 1.0
 

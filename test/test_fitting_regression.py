@@ -423,8 +423,8 @@ def test_scores_of_inactive_columns_agree_with_a_fit_in_which_they_are_active(no
 
 
 def test_inactive_and_active_columns_share_initial_lag_states(solved):
-    # WHY: the sparsity factor lacked the prior of the sum of initial lag states: for an inactive
-    # column of the scale whose lag also changes the bias it was 50 times too large.
+    # WHY: the sparsity factor of an inactive scale column whose lag also changes the bias was 50
+    # times too large, because the prior of the sum of initial lag states was left out.
     regression, prior, mode = solved
     of_scale = np.isin(GROUPS, ('board',)) * [[0.0], [1.0]]
     without = replace(prior, column_sd=np.where(of_scale > 0.0, 0.0, prior.column_sd))

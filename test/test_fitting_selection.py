@@ -199,7 +199,7 @@ def test_the_prior_sd_of_a_slope_stays_below_the_steepest_plausible_slope():
 
 
 def test_bends_have_one_prior_sd_of_the_change_of_slope():
-    # WHY: with a prior sd for each bend, rounding errors decided which bends a fit kept.
+    # WHY: with a separate prior sd for each knee, rounding errors decided which knees were kept.
     truth = Truth()
     windows, up = table_of(truth, 12, np.random.default_rng(2), n_windows=20)
     windows = replace(windows, groups=('curve', 'curve', *['bend'] * 4))
@@ -385,7 +385,7 @@ def test_thermal_tilts_of_supports_are_separated_from_the_drift_of_the_unit():
     chosen, left = drift_left(windows)
     # 12 positions with 2 angles and 2 columns each determine the sd of tilts to 10 %.
     assert 0.7 < chosen.posterior.prior.tilt_sd / truth.tilt_sd < 1.3
-    # A tilt of 5 urad changes a level axis' force by 5 ug; 720 windows show a drift of 0.1 ug.
+    # A tilt of 5 urad changes a level axis' force by 5 ug; 720 windows determine drifts to 0.1 ug.
     assert left < 0.5 * MICRO
     assert drift_left(stiff)[1] > 1.0 * MICRO
 

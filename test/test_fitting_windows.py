@@ -179,8 +179,8 @@ def test_windows_with_a_silent_or_stuck_thermometer_are_left_out(bags, name, is_
         readings = Readings(readings.stamp_ns[~lost], readings.value[~lost])
     message = replace(bag, temperatures={**bag.temperatures, name: readings})
     windows = windows_of([message])
-    # A thermometer counts as missing within 120 s if silent (time-out of 60 s, 5 intervals between
-    # readings, and a window), within 600 s if stuck.
+    # Windows are left out from 120 s after the last reading of a silent thermometer (time-out of
+    # 60 s, 5 reading intervals, a window) or 600 s after the last change of a stuck thermometer.
     seen_s = 600.0 if is_stuck else 120.0
     assert not ((windows.data.time > start + seen_s) & (windows.data.time < stop)).any()
     whole = windows_of([bag])
@@ -238,7 +238,7 @@ def test_curve_columns_of_a_fit_are_powers_of_temperature(
     assert all(column[0] == 0.0 for column in columns[sets.static.n_free :])
 
 
-#: Models that are fitted; the sets of `golovach` are polynomials like that of `linear`.
+#: Models that are fitted; the curves of both `golovach` and `linear` are polynomials.
 MODELS = 'golovach', pytest.param('linear', marks=pytest.mark.slow), 'exponential', 'spline'
 
 
@@ -258,6 +258,7 @@ def fitted(request, all_bags):
         patch.setattr(import_module('thermo_comp.fitting.fit'), 'claim_of', keep)
         result = fit_bags(all_bags, options)
     (claim,) = claims
+    assert result.calibration.gravity_sd_m_s2 == options.gravity_sd
     return result, claim
 
 

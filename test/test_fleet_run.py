@@ -79,27 +79,23 @@ def test_all_units_are_fitted_despite_a_killed_worker_and_only_once(client, flee
     assert rows['A/torn']['n_left_out'] == 1
     assert load_calibration(out / 'units/A/torn/calibration.yaml').unit.serial == 'mems-0002'
     assert not (out / 'units/B/exchanged/calibration.yaml').exists()
-
     assert [row['name'] for row in read_parquet(result.parquet)] == list(rows)
     assert read_parquet(result.parquet)[0] == rows['A/good']
     with result.csv.open(newline='') as file:
         table = list(csv.DictReader(file))
     assert list(table[0]) == [column.name for column in COLUMNS]
     assert float(table[0]['bias_x_ug']) == rows['A/good']['bias_x_ug']
-
     before = contents(out / 'units')
     again = fit_fleet(str(fleet), out, OPTIONS, scheduler='tcp://nobody:1')
     assert again.n_done == 0
     assert again.rows == result.rows
     assert contents(out / 'units') == before
-
     # A unit is fitted again if the modification time of a bag has changed.
     os.utime(fleet / 'A/good/01.mcap', ns=(0, 0))
     touched = fit_fleet(str(fleet), out, OPTIONS, scheduler=scheduler)
     assert touched.n_done == 1
     after = contents(out / 'units')
     assert {Path(name).parts[1] for name in before if before[name] != after[name]} == {'good'}
-
     # A result whose calibration file was edited counts as missing.
     (out / 'units/B/exchanged').rename(out / 'units/B/other')
     (out / 'units/A/torn/calibration.yaml').write_text('edited')
@@ -304,7 +300,6 @@ def test_the_prior_of_siblings_reduces_the_scale_error_of_a_unit_with_one_bag(sc
     of_type = load_calibration(alone.prior).provenance
     assert [source.name for source in of_type.sources] == ['s1', 's2', 's3']
     before = contents(tmp_path / 'out' / 'units')
-
     helped = fit_fleet(*arguments, scheduler=scheduler, with_prior=True)
     assert helped.n_done == 1
     assert contents(tmp_path / 'out' / 'units') == before
@@ -330,7 +325,7 @@ def test_the_prior_of_siblings_reduces_the_scale_error_of_a_unit_with_one_bag(sc
         *(('valid', 1, False), ('valid', 0, True), ('valid, but it only claims 5 mg', 0, True)),
         *(('recalibrate', 1, False), ('recalibrate', 0, False), ('no better than raw', 0, False)),
         *(('thermometers exchanged or loose: not judged', whole, False) for whole in (1, 0)),
-        # Of refused units `is_whole` is None if data are contradictory, 0 if data are missing.
+        # A refused unit has `is_whole` None if its data are contradictory, 0 if data are missing.
         *(('refused', None, False), ('refused', 0, True), ('failed', None, False)),
     ],
 )

@@ -20,7 +20,7 @@ MONDAY = datetime(2026, 1, 5)
 
 
 def fleet_of(n, rng, *, lots=('',), day=0.0, like=()):
-    """Draw table rows of n units (log-normal if compared by logarithms) or add noise to `like`."""
+    """Draw table rows of n units or, with the rows `like`, of a second test of these units."""
     rows = []
     for i in range(n):
         cells = {}

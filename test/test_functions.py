@@ -38,12 +38,9 @@ def test_in_order_adds_the_values_along_an_array_axis_one_by_one(seed, size, bef
             assert total[i, k] == sum(values[i, :, k].tolist())
 
 
-def test_a_polynomial_agrees_with_hand_numbers():
+def test_a_polynomial_and_an_exponential_agree_with_hand_numbers():
     # Eq. (10): the term with a4 is a4 t^4; Golovach's paper prints a4 t.
     assert functions.Polynomial((1.0, 2.0, 0.5, 0.25, 1.0)).value(3.0) == 1 + 6 + 4.5 + 6.75 + 81
-
-
-def test_an_exponential_agrees_with_hand_numbers():
     function = functions.Exponential(-2.0, (2.0,), (10.0,))
     assert function.value(0.0) == 0.0
     assert function.value(10.0) == pytest.approx(2.0 * (np.e - 1.0), rel=1e-15)
@@ -215,22 +212,19 @@ def test_ramp_states_equal_those_of_the_memory_of_the_fit(rate):
             assert state[place] == pytest.approx(lived[place - first])
 
 
-def test_statistics_of_numbers_agree_with_hand_numbers():
+def test_statistics_of_numbers_agree_with_hand_numbers_and_of_none_are_nan():
     # For 3 and -4 the mean is -0.5, the mean square 12.5.
     statistics = residual_statistics(np.array([3.0, -4.0]))
     assert (statistics.n, statistics.mean, statistics.peak) == (2, -0.5, 4.0)
     assert statistics.rms == pytest.approx(12.5**0.5, rel=1e-15)
+    statistics = residual_statistics(np.zeros(0))
+    assert statistics.n == 0
+    assert np.isnan([statistics.mean, statistics.rms, statistics.peak]).all()
 
 
 @pytest.mark.parametrize('bad', [np.nan, np.inf])
 def test_values_that_are_not_finite_are_left_out(bad):
     assert residual_statistics(np.array([1.0, bad, 1.0])) == residual_statistics(np.ones(2))
-
-
-def test_statistics_of_no_values_are_nan():
-    statistics = residual_statistics(np.zeros(0))
-    assert statistics.n == 0
-    assert np.isnan([statistics.mean, statistics.rms, statistics.peak]).all()
 
 
 def test_the_residual_of_the_norm_does_not_depend_on_a_rotation(rng):

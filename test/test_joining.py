@@ -105,7 +105,7 @@ def test_recordings_that_are_not_parts_of_one_are_not_joined(rng):
     # Recordings of 2 s that begin at equal times are not parts of one recording.
     short = recorded(rng, 2.0)
     assert len(joined(reduced([short, short]))) == 2
-    # Of two recordings with equal stamps each is joined only with its own second part.
+    # Two recordings have equal stamps: each is joined only with its own second part.
     other = replace(whole, accel=-whole.accel)
     parts = [*cut(whole, (200.0,)), *cut(other, (200.0,))[::-1]]
     first, second = joined(reduced(parts))
@@ -132,8 +132,8 @@ def test_a_part_in_which_the_unit_never_rests_is_joined(rng):
 
 def test_a_split_recording_gives_the_calibration_of_the_whole_recording():
     # WHY: each part of a split recording was fitted with a separate turn-on and separate initial
-    # lag states. For 18 recordings of 9 h, split every hour, the fit took 30 times as long as that
-    # of the whole recordings, and its claimed sd was 6 times as large.
+    # lag states. For 18 recordings of 9 h, split every hour, the fit took 30 times as long as a
+    # fit of the whole recordings, and had 6 times its claimed sd.
     bag = thermo_comp.read(ROOT / 'bags/fit/01.mcap')
     parts = []
     for begin_s in np.arange(0.0, bag.time_s[-1], 1800.0):

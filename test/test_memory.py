@@ -39,7 +39,7 @@ def test_a_value_with_the_last_stamp_replaces_the_last_value():
 def test_the_variance_of_a_lag_after_a_gap_agrees_with_the_formula():
     bank = LagBank((100.0, 1000.0))
     bank.step(0, 0.0)
-    # A gap above tau / 10 adds variance to a lag: 50 s do so for tau = 100 s, not for 1000 s.
+    # A gap above tau / 10 adds variance to a lag: a gap of 50 s if tau = 100 s, not if 1000 s.
     bank.step(50 * SECOND_NS, 2.0)
     lost = 2.0 * (1.0 - math.exp(-0.5))
     assert bank.extra == pytest.approx([lost**2, 0.0])
@@ -117,7 +117,7 @@ def test_the_lag_of_a_part_coupled_to_board_and_case_agrees_with_a_solver(rng):
     # The lag of a part contains the lagged gradient with a minus sign: their covariance is < 0.
     P = start_covariance(spec.lags)
     assert P[0, 1] < 0.0 < P[0, 0] + 2.0 * P[0, 1] + P[1, 1]
-    # The age of a lag with two inputs counts from the first value of the input that begins later.
+    # A lag with two inputs begins with the first value of the input that begins later.
     late = ThermalMemory(spec)
     late.board_step(0, 20.0)
     late.banks['case'].step(600 * SECOND_NS, 1.0)

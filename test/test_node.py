@@ -163,7 +163,7 @@ def test_diagnostics_name_faults_of_samples(peer, saved):
         wait(lambda s, _: 'no samples are coming in' in s.message and 'sat' not in s.message)
         driver.temperatures(stamp_ns, 40.0, 40.0)
         driver.counts(stamp_ns + ros.CYCLE_NS, 1.0, 2.0, 3.0)
-        # A stamp that falls by over 1 s is a jump of time; one that falls by less is out of order.
+        # A stamp that falls by less than 1 s is out of order, by more than 1 s a jump of time.
         driver.counts(stamp_ns - 5, 1.0, 2.0, 3.0)
         _, status, _ = wait(lambda s, _: 'out of order' in s.message)
         driver.counts(ros.START_NS - 10 * ros.SECOND_NS, 1.0, 2.0, 3.0)

@@ -64,7 +64,9 @@ def thermal_test(path, imu=False, has_case=True):
         if imu:
             rest = imu_columns(rng, n)
             rest.angular_velocity_covariance[::10, 0] = -1.0
+            rest.angular_velocity[3::50, 1] = np.nan
             covariance = rest.linear_acceleration_covariance
+            covariance[5::50, 0] = -1.0
             force = accel / [300.0, -295.0, 310.0]
             writer.write_imu(TOPICS.imu, stamps, force, covariance, 'imu_link', imu=rest)
         else:
@@ -145,9 +147,16 @@ def test_node_and_replay_give_equal_output_for_imu_messages(tmp_path):
     published, _, _ = output_of(tmp_path / 'live.mcap')
     given = given.imu.take(np.flatnonzero(np.isin(given.accel_stamp_ns, published.accel_stamp_ns)))
     is_rate = given.angular_velocity_covariance[:, 0] != -1.0
-    # The node corrects a measured angular rate, and publishes one marked as missing unchanged.
+    # The node corrects measured angular rates, and does not change rates marked as missing.
     moved = np.abs(published.imu.angular_velocity - given.angular_velocity)
     assert moved[~is_rate].max() == 0.0
+    # WHY: an acceleration marked as absent was published corrected, and an angular rate that is
+    # NaN was published with the variances of a corrected rate.
+    assert (given.linear_acceleration_covariance[:, 0] != -1.0).all()
+    is_nan = np.isnan(published.imu.angular_velocity).any(axis=1)
+    assert 0 < np.count_nonzero(is_nan) < len(is_nan) / 10
+    assert {*published.imu.angular_velocity_covariance[is_nan, 0]} == {-1.0}
+    is_rate &= ~is_nan
     # The biases of `rich_gyroscope` at the reference temperature are 10 mrad/s and more.
     assert moved[is_rate].min() > 1e-3
     claimed = published.imu.angular_velocity_covariance[is_rate].reshape(-1, 3, 3)

@@ -144,7 +144,7 @@ def numbered(begin, period_s, until_s, start_s=0.0):
 @pytest.mark.parametrize('period_s', [0.01, 0.0101, 0.02, 0.05, 0.9])
 def test_two_publishers_that_send_are_never_mixed(offset, period_s):
     first = [(*message, 'own') for message in numbered(500, 0.01, 12.0)]
-    begins = 500 + 200 + offset  # first number of driver 2, near that of driver 1 at 2 s
+    begins = 500 + 200 + offset  # first sample number of driver 2; driver 1 is at 700
     other = [(*message, 'other') for message in numbered(begins, period_s, 8.0, start_s=2.003)]
     sources, used = Sources(), []
     for at_s, number, name in sorted(first + other):
@@ -211,7 +211,7 @@ def test_a_driver_with_incompatible_qos_or_type_is_named(peer, unit):
 def test_reports_more_frequent_than_samples_report_no_missing_samples(peer, tmp_path):
     # WHY: with a diagnostics_period below the sample interval, reports between samples were ERROR.
     slow = tmp_path / 'slow.yaml'
-    # An error is reported after 5 cycles without a sample, 1.5 s, which no busy machine causes.
+    # An error needs 5 cycles (1.5 s) without a sample: no busy machine pauses for so long.
     save_calibration(calibration(unit=Unit('T-1', 'counts', 32767.0, 0.3)), slow)
     with ros.node_in_thread(*ros.node_arguments(slow, 'diagnostics_period:=0.01')) as node:
         heard = peer.listen(DiagnosticArray, '/diagnostics')

@@ -42,8 +42,6 @@ def arguments(*overrides):
         (['calibration_file:={tmp}/imu.yaml'],
          "/imu.yaml: unit.input: must be 'counts' (parameter `input` is counts), got 'm/s^2'"),
         (['calibration_file:={unit}', 'input:=gyro'], '`input` must be one of counts, imu'),
-        (['calibration_file:={unit}', 'transition_time:=-1'],
-         '`transition_time` must be between 0 and 3600, got -1'),
         (['calibration_file:={unit}',
          'qos_overrides./accel/counts.subscription.reliability:=good'],
          'the topic accel/counts cannot be opened: '),

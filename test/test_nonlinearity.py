@@ -103,7 +103,7 @@ def test_a_nonlinearity_without_terms_does_not_change_a_bit(rng):
 
 
 def test_the_variance_of_a_nonlinear_axis_includes_all_parameters(rng):
-    # The claimed variance of a term |f| f exceeds the exact one, so the unit has no such term.
+    # For a term |f| f the claimed variance exceeds the exact variance: the unit has no such term.
     unit = calibration(nonlinearity=replace(BENT, terms=(SQUARE, CUBE)))
     unit = with_covariance(unit, rng)
     layout, correction = parameter_layout(unit), Correction(unit)

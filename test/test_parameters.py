@@ -54,6 +54,7 @@ def test_overrides_are_applied_and_integers_are_accepted_for_floats():
         ('transition_time:=fast', "parameter `transition_time` must be a number, got 'fast'"),
         ('transition_time:=true', 'parameter `transition_time` must be a number, got True'),
         ('transition_time:=.nan', 'parameter `transition_time` must be between 0 and 3600'),
+        ('transition_time:=-1', '`transition_time` must be between 0 and 3600, got -1'),
         ('temperature_timeout:=0', 'parameter `temperature_timeout` must be between 0.1'),
         # ROS takes 0042 for a number, without its zeros; the message asks for quotation marks.
         ('serial:=0042', 'parameter `serial` must be a string, got .*quote it'),

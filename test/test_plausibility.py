@@ -111,8 +111,8 @@ def test_a_frozen_sensor_is_detected_by_changes_of_the_second_sensor(sensor, fro
     other = tracker.checks['case'] if frozen == 'board' else tracker.checks['board']
     assert other.fault == Fault.NONE
     seen = getattr(tracker, frozen)
-    # Until a frozen board thermometer is detected its error is up to 4 quanta + 2 K, that of a
-    # frozen case thermometer up to 4 quanta + 12 K.
+    # Until detected, a frozen board thermometer has an error of up to 4 quanta + 2 K, and a frozen
+    # case thermometer has an error of up to 4 quanta + 12 K.
     lead = 10.0 if frozen == 'case' else 0.0
     off = (board if frozen == 'board' else case) - seen.temperature
     assert abs(off) < 4.0 * quantum + 2.0 + lead
@@ -194,7 +194,7 @@ def test_no_fault_is_reported_of_a_working_unit_in_a_chamber(preset, sensor):
         assert tracker.checks['case'].fault == Fault.NONE
 
 
-# The preset 'mems' is left out: its board lags the case by seconds, so they differ by < 1 K.
+# The preset 'mems' is left out: its board lags the case by seconds, so T_case - T_board < 1 K.
 @pytest.mark.parametrize(
     ('preset', 'sensor'),
     [
@@ -260,7 +260,7 @@ def test_one_topic_given_for_both_thermometers_is_named_and_claimed(order):
     # In a ramp of 1 K/min the case of a unit with a board lag of 900 s is 15 K above the board.
     assert abs(state[GRADIENT]) < 0.1
     assert state[VAR_GRADIENT] ** 0.5 == pytest.approx(15.0, rel=0.2)
-    # A case reading that differs from the board reading ends the fault.
+    # Once a case reading differs from the board reading, the topics count as two thermometers.
     tracker.read('board', 300 * SECOND_NS, 25.0)
     tracker.read('case', 300 * SECOND_NS, 25.1)
     assert not tracker.copies['case'].is_copy

@@ -70,9 +70,6 @@ def test_exactly_known_parameters_have_zero_variance():
 def test_a_matrix_that_is_no_covariance_in_single_precision_is_refused(matrix, message):
     with pytest.raises(ValueError, match=message):
         posterior_of(np.array(matrix))
-
-
-def test_a_negative_variance_is_refused():
     with pytest.raises(ValueError, match='`diagonal` must not have a negative variance'):
         Posterior.of(np.ones((1, 1)), np.array([-1.0]))
 

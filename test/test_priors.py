@@ -136,8 +136,8 @@ def test_chance_correlations_between_parameters_of_twelve_units_are_reduced(rng)
 
 @pytest.mark.slow
 def test_equal_curves_of_both_sets_stay_equal_in_a_population():
-    # WHY: in the prior the correlations between equal curves of both regimes were reduced: the
-    # error of a fit to nine positions was 3.1 ug with this prior, and 0.7 ug without a prior.
+    # WHY: in the prior from siblings equal curves of both regimes were not fully correlated: a
+    # fit to nine positions had an error of 3.1 ug with this prior, and of 0.7 ug without a prior.
     prior = population(siblings())
     covariance, layout = prior.posterior.covariance(), parameter_layout(prior)
     for block in (*layout.bias, *layout.scale):
@@ -145,7 +145,7 @@ def test_equal_curves_of_both_sets_stay_equal_in_a_population():
         for static, dynamic in zip(*curves, strict=True):
             contrast = np.zeros(layout.n_parameters)
             contrast[[static, dynamic]] = 1.0, -1.0
-            # 1e-24: variance of unused coefficients, by rounding to single precision.
+            # 1e-24: largest variance that rounding to single precision leaves unused coefficients.
             limit = 1e-5 * covariance[static, static] + 1e-24
             assert float(contrast @ covariance @ contrast) <= limit
 
@@ -244,7 +244,7 @@ def after(change, ups):
 
 @pytest.mark.parametrize('n_faces', [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_one_to_three_faces_of_an_unchanged_unit_keep_the_calibration(n_faces):
-    # WHY: one unchanged face had increased the claimed sd of bias and scale from 0.2 to 424 ug.
+    # WHY: a rest on one face increased the claimed sd of bias and scale from 0.2 to 424 ug.
     bias, bias_sd, scale, scale_sd = after(lambda counts, _: counts, np.eye(3)[:n_faces])
     # Limit of the claimed sd: 30 ug, a tenth of the usual repeatability of turn-ons, 300 ug.
     assert max(bias_sd.max(), scale_sd.max() * STANDARD_GRAVITY) < 30e-6 * STANDARD_GRAVITY

@@ -155,8 +155,8 @@ def test_the_gyroscope_error_of_the_freezer_run_in_215_s_held_out(real_data, wor
     assert section.raw_rms > 1.7 * floor
     assert section.rms < 1.3 * floor
     assert 0.3 < section.ratio < 2.0
-    # The data sheet of the MPU-6050 states 5 mdeg/s/sqrt(Hz); the density of samples at 12.7 Hz
-    # without an anti-aliasing filter is larger than that.
+    # The data sheet of the MPU-6050 states 5 mdeg/s/sqrt(Hz); samples at 12.7 Hz without an
+    # anti-aliasing filter have a larger noise density.
     assert 30.0 < np.degrees(density) * 1e3 < 45.0
 
 

@@ -161,6 +161,13 @@ def test_faults_of_a_recording_are_reported(tmp_path, temperature, options, text
     assert [part for part in text if not any(part in found for found in findings)] == []
 
 
+def test_the_duration_of_a_recording_of_exchanged_halves_is_the_span_of_the_stamps(tmp_path):
+    # WHY: the duration was the last stamp less the first: -0.2 s.
+    result = survey(tmp_path / 'bag', up_and_down(5.0, 35.0), gap_s=-3600.0)
+    assert result.duration_s == pytest.approx(3600.0, abs=1.0)
+    assert result.still_s <= result.duration_s
+
+
 def test_a_missing_cooling_ramp_is_reported(tmp_path):
     heating = np.interp(np.arange(3600.0), [0, 600, 3000, 3600], [5.0, 5.0, 35.0, 35.0])
     (finding,) = survey(tmp_path / 'bag', heating).findings

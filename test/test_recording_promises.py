@@ -161,7 +161,7 @@ def test_a_chunk_of_a_ros1_bag_expands_within_limits(tmp_path, packing, monkeypa
 def test_a_fifo_or_a_device_is_never_waited_for(tmp_path):
     for name in ('bag.mcap', 'bag.db3', 'bag.bag'):
         os.mkfifo(tmp_path / name)
-        with pytest.raises(RecordingError, match=r'neither a file nor a directory'):
+        with pytest.raises(RecordingError, match=r'not a bag: neither a file nor a directory'):
             inspect_recording(tmp_path / name)
     folder = tmp_path / 'folder'
     folder.mkdir()
@@ -190,7 +190,7 @@ def other(content):
 
 
 def one_by_one(data):
-    """Return (place, size, channel, log time) of each message, other records, and the end."""
+    """Return (place, size, channel, log time) of each message, other records, last end."""
     at, messages, others = 0, [], []
     while at + 9 <= len(data):
         opcode, length = struct.unpack_from('<BQ', data, at)

@@ -12,6 +12,7 @@ import recording_helpers as rec
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import IndexType
+from test_recording_damage import read
 
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording.reader import open_recording, read_recording
@@ -40,10 +41,6 @@ def bags(draw, accel=rec.ACCEL, lowest=-3):
 
 def in_reading_order(messages):
     return sorted(messages, key=lambda message: message.log_ns)
-
-
-def read(path):
-    return read_recording(path, require=())
 
 
 @settings(max_examples=80, deadline=None)
@@ -208,7 +205,6 @@ def test_the_files_of_a_split_bag_are_read_in_order(tmp_path):
     rec.assert_columns(recording.columns, messages)
     assert recording.info.truncated is None
     assert recording.info.n_messages == len(messages)
-
     # Without metadata.yaml, as after a killed recorder, numbers in the file names give the order.
     (tmp_path / 'bag' / 'bag.mcap').rename(tmp_path / 'bag' / 'bag_0.mcap')
     (tmp_path / 'bag' / 'bag_1.mcap').rename(tmp_path / 'bag' / 'bag_2.mcap')
@@ -299,7 +295,7 @@ def test_the_only_topic_of_a_type_is_used_in_place_of_the_default_topic(tmp_path
             '/imu/die, its only Temperature, is taken for board'
         )
     # No board topic is chosen by its type if the user names a topic, if there are two topics of
-    # this type, or if the only topic is that of the case.
+    # this type, or if its only topic belongs to the case.
     with pytest.raises(RecordingError, match='my/die: no such topic'):
         open_recording(path, Topics(board='my/die'), require=('board',))
     for topics in (('imu/die', 'baro/air'), ('temperature/case',), ('x/temperature/case',)):

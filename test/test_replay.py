@@ -160,7 +160,7 @@ def test_memory_does_not_grow_with_the_bag(tmp_path, monkeypatch):
         parts, held_bytes = zip(*held, strict=True)
         assert list(parts) == sorted(parts)
         assert parts[-1] == 1.0
-    # The long bag has three times the messages; only its list of regime flags needs more memory.
+    # A bag with three times the messages needs more memory only for its list of regime flags.
     assert peaks[1] < 1.1 * peaks[0]
     third = len(parts) // 3
     assert max(held_bytes[-third:]) < 1.15 * max(held_bytes[:third])

@@ -26,7 +26,7 @@ from thermo_comp.report.certificate import (
 from thermo_comp.report.page import render_report
 from thermo_comp.report.statements import CertificateInfo, load_certificate_info
 from thermo_comp.report.style import rounded
-from thermo_comp.unit.calibration_file import save_calibration
+from thermo_comp.unit.calibration_file import dump_calibration, parse_calibration, save_calibration
 from thermo_comp.unit.gravity import MICRO_G
 from thermo_comp.unit.prediction import in_a_soak
 
@@ -190,11 +190,14 @@ def test_without_a_stated_uncertainty_of_gravity_that_of_scale_factors_is_withhe
     assert 'combined, without gravity' in page
     info = load_certificate_info(lab(tmp_path))
     assert 'withheld' not in render_report(evidence(), info)
-    # If the fit was given an sd of gravity, the covariance contains it, and no U is withheld.
-    stated = replace(evidence(), gravity_sd=2e-5)
+    # With an sd of gravity given to the fit, no expanded uncertainty U is withheld.
+    # WHY: the file of the calibration did not store this sd, so `report` after `fit` withheld U.
+    unit = replace(evidence().calibration, gravity_sd_m_s2=2e-5)
+    read = parse_calibration(dump_calibration(unit).encode())
+    stated = replace(evidence(), calibration=read)
     page = render_report(stated)
     assert 'withheld' not in page
-    # WHY: the sd given to the fit was in every U, and its line in the certificate was blank.
+    # WHY: gravity's sd was in all expanded uncertainties, but its line in the page was blank.
     assert re.search(r'Standard uncertainty of gravity<[^0-9]*2e-05 m/s²', page)
     assert {source.name: source.standard for source in budget(stated, info)}['gravity'] == 0.0
 
@@ -275,7 +278,7 @@ def test_the_uncertainty_of_gravity_is_part_of_that_of_the_scale_factors(tmp_pat
     info = load_certificate_info(lab(tmp_path, 'gravity: {standard_uncertainty_m_s2: 9.80665e-3}'))
     rows = {result.quantity: result for result in results(evidence(), info, ())}
     scale = fitted().calibration.axes.x.scale_factor
-    # The relative uncertainty of gravity, 1e-3, is far above that of the fit; U is twice 1e-3.
+    # Gravity, with a relative uncertainty of 1e-3, dominates the scale's uncertainty U = 2e-3.
     assert float(rows['scale factor x'].expanded) == pytest.approx(2e-3 * scale, rel=0.05)
     assert rows['bias x'] in results(evidence(), CertificateInfo(), ())
 

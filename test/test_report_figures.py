@@ -73,7 +73,7 @@ def test_position_errors_of_a_navigator_agree_with_hand_numbers():
 def test_the_map_of_the_sphere_preserves_areas():
     assert figures.equal_area((0.0, 0.0, 1.0), 1) == (0.0, 0.0)
     assert figures.equal_area((0.0, 1.0, 0.0), -1) == (0.0, 1.0)
-    # The cap above 45 degrees has 1 - sin 45 of the hemisphere's area, its map of the disc's area.
+    # The cap above 45 deg is 1 - sin 45 of the hemisphere; its map is this share of the disc.
     x, y = figures.equal_area((np.sqrt(0.5), 0.0, np.sqrt(0.5)), 1)
     assert x**2 + y**2 == pytest.approx(1.0 - np.sqrt(0.5))
 

@@ -57,7 +57,7 @@ def test_few_equal_samples_are_accepted_at_any_sample_rate(rng):
     assert compensator.counters.n_stuck == 0
 
 
-#: Numbers of equal samples, also near the limit of a stuck axis.
+#: Numbers of samples in a part of the series, also near the limit of a stuck axis.
 LENGTHS = [1, 1, 1, 2, 3, 24, 48, 49, 50, 51, 52, 120]
 
 
@@ -356,12 +356,12 @@ def test_a_smooth_coordinated_turn_is_an_acceleration_and_not_a_wrong_calibratio
         monitor.add(round(seconds * 1e9), tuple(force), COVARIANCE, 3 * NOISE_SD**2)
         if monitor.is_refuted:
             break
-    # A force that has turned by 5 deg could be that of a wrong axis at rest in another attitude.
+    # After a turn by 5 deg the unit may rest in a new attitude, where |f| shows a wrong axis.
     assert monitor.is_refuted == (tilt_deg > math.degrees(SAME_DIRECTION))
 
 
 def test_a_vibration_of_whole_periods_between_readings_is_no_rest(rng):
-    # WHY: the check uses few samples, at the stamps of the readings, 1 s apart. In a
+    # WHY: the check of |f| uses only the samples at the stamps of readings, 1 s apart. In a
     # vibration of 20 Hz these samples had equal phases, and looked like a rest with a wrong |f|.
     sway = np.sin(2.0 * np.pi * 0.2 * np.arange(5) + 1.0)
 

@@ -110,7 +110,7 @@ def test_a_saturated_effect_of_heat_flow_has_two_values():
 
 
 def test_a_switched_load_warms_its_part_by_the_steady_heat_balance():
-    """A load that is off warms nothing; a load that stays on warms as in the heat balance."""
+    """A load that is off warms nothing; a lasting load warms by power * thermal resistance."""
     unit = triad('own-lags', 1)
     spell, rates = 30_000.0, {'rate_hz': 0.1, 'temperature_rate_hz': 0.01}
     loaded = replace(unit, load=SwitchedLoad('board', 0.5, (spell, 1.0001 * spell)))

@@ -100,7 +100,7 @@ def test_simulated_white_noise_has_the_stated_density(unit):
     run = simulate(still, parse_cyclogram('soak'), UP, rate_hz=50.0, seed=3)
     accel = run.counts / np.array(unit.scale_factor) / MICRO_G
     frequency, power = welch(accel, fs=50.0, nperseg=16384, axis=0)
-    # With a carried remainder, rounding noise rises with f^2, to 1 (ug)^2/Hz at f = 0.4 Hz.
+    # A sample contains the last rounding remainder: noise rises with f^2, 1 (ug)^2/Hz at 0.4 Hz.
     band = (frequency > 0.01) & (frequency < 0.4)
     # The mean of 128 spectral lines, each from 86 half-overlapping segments, is uncertain by 1 %.
     density = np.array(unit.noise_density)
@@ -178,7 +178,6 @@ def test_two_parts_follow_a_ramp_like_the_closed_solution():
     time = np.linspace(0.0, 5400.0, 91)
     decaying = np.exp(np.outer(time, modes)) * amplitude
     expected = rate * (time[:, None] - lag + decaying @ shapes.T)
-
     response = response_of(network, [0.0, 5400.0], [0.0, rate * 5400.0])
     np.testing.assert_allclose(response.temperatures(time), expected, atol=ROUNDING)
 

@@ -174,10 +174,10 @@ def test_time_and_size_of_a_jump_along_gravity_are_found(rng, with_gyro):
     # The jump is between two samples, and `find_jumps` returns the interval between these samples.
     assert event.time == pytest.approx(301.0, abs=1.5 / rest.rate_hz)
     assert event.duration_s == pytest.approx(1.0 / rest.rate_hz, rel=1e-6)
-    # Step of trends through 250 samples of 3 mg per side: sd 2 * 3 mg * sqrt(2 / 250); limit 4 sd.
+    # Step between lines fitted to 250 samples of 3 mg: sd 2 * 3 mg * sqrt(2 / 250); limit: 4 sd.
     np.testing.assert_allclose(np.array(event.step) / MG, (2.0, 0.0, 20.0), atol=2.2)
     assert event.along / MG == pytest.approx(20.0, abs=2.2)
-    # Step of trends through 20 readings (noise 20 mK) per side: sd 2 * 0.02 K * sqrt(2 / 20).
+    # Step between lines fitted to 20 readings of 20 mK noise: sd 2 * 0.02 K * sqrt(2 / 20).
     assert event.temperature_change_sd == pytest.approx(0.0126, rel=0.4)
     assert abs(event.temperature_change) < 4.0 * event.temperature_change_sd
 
@@ -274,7 +274,7 @@ def test_low_pass_filtered_noise_gives_one_rest_without_a_jump(rng, tau_s):
     bag = reduce_source(rest.source(), full_scale=None)
     assert len(bag.intervals) == 1
     assert find_jumps(bag) == ()
-    # At most 2 % of the means, those at the ends of the rest, may count as motion.
+    # At most 2 % of the means, at the ends of the rest, may count as motion.
     assert bag.n_still_cells > 0.98 * bag.n_cells
 
 

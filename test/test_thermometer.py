@@ -160,7 +160,7 @@ def drawn(rng):
     return rng.normal(size=3), root @ root.T
 
 
-def test_the_prediction_step_equals_matrix_algebra():
+def test_the_prediction_and_the_correction_step_equal_matrix_algebra():
     mean, covariance = drawn(np.random.default_rng(0))
     dt, lag, power = 1.7, 50.0, 0.3
     forward = np.array([[1.0, dt, dt**2 / 2.0], [0.0, 1.0, dt], [0.0, 0.0, 1 / (1.0 + dt / lag)]])
@@ -171,9 +171,6 @@ def test_the_prediction_step_equals_matrix_algebra():
     np.testing.assert_allclose(out[:3], forward @ mean, rtol=1e-13)
     expected = forward @ covariance @ forward.T + wander
     np.testing.assert_allclose(out[3:], expected[UPPER], rtol=1e-12)
-
-
-def test_the_correction_step_equals_matrix_algebra():
     mean, covariance = drawn(np.random.default_rng(1))
     out, innovation, spread = correct((*mean, *covariance[UPPER]), 5.0, 0.2)
     gain = covariance[:, 0] / (covariance[0, 0] + 0.2)
@@ -279,7 +276,7 @@ def test_the_extrapolation_is_linear_for_5_s_and_then_constant():
         assert wider > variance
     held, _, wide = thermometer.at(last_ns + 60 * SECOND_NS)
     assert held == pytest.approx(temperature + 0.05, abs=1e-5)
-    # After 5 s the extrapolation is constant; its sd is 0.01 K/s times 55 s, the rest of 60 s.
+    # After 5 s the extrapolation is constant; its sd after 60 s is 0.01 K/s times 55 s.
     assert math.sqrt(wide) == pytest.approx(0.55, rel=0.05)
     assert thermometer.at(last_ns - SECOND_NS)[0] == pytest.approx(temperature - 0.01, abs=1e-5)
 

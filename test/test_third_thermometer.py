@@ -78,7 +78,6 @@ def test_a_third_thermometer_reduces_the_error_to_the_noise(runs, tmp_path):
     calibration = load_calibration(tmp_path / 'unit.yaml')
     assert calibration.sensors == ('case', 'lid')
     assert any(term.sensor == 'lid' for term in calibration.response)
-
     errors, spreads = {}, {}
     blind = tuple(
         replace(term, bias=(0.0,) * 3, scale=(0.0,) * 3) if term.sensor == 'lid' else term

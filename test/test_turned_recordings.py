@@ -70,8 +70,8 @@ def test_a_lag_is_corrected_at_twice_the_rates_of_the_fit():
     is_used = at_rest & np.isfinite(out.specific_force).all(axis=1)
     error = (out.specific_force - force)[is_used]
     error = error[: len(error) // 60 * 60].reshape(-1, 60, 3).mean(axis=1)
-    # The fit must correct three quarters of the effect of the lag; a fit with products of the lag,
-    # but without the lag itself, has an error above the whole effect of the lag.
+    # The error must be below a quarter of the effect of the lag. A fit with products of the lag,
+    # but without the lag itself, has an error larger than the effect of the lag.
     assert rms(of_lag) > 0.5e-3 * GRAVITY
     assert rms(error) < 0.25 * rms(of_lag)
 
@@ -89,8 +89,8 @@ def test_the_claimed_sd_of_a_mems_with_a_single_turn_on_is_0_3_to_1_5_mg():
 
 @pytest.mark.slow
 def test_an_update_after_a_new_turn_on_gives_the_mean_of_both_turn_ons():
-    # WHY: an update took the difference of the turn-ons for ageing, and replaced the bias by that
-    # of the latest turn-on: the error after a third turn-on was larger than without the update.
+    # WHY: an update took the difference of two turn-ons for ageing, and took the bias of the later
+    # turn-on alone: the error after a third turn-on was larger than without the update.
     rng = np.random.default_rng(5)
     change = 1e-3 * GRAVITY * np.array([1.0, -0.8, 0.6])
     bags = [turned(rng, ((0.0, 20.0), (5400.0, 20.0)), name)[0] for name in ('one', 'two')]

@@ -54,7 +54,7 @@ def test_the_claimed_sd_covers_a_start_in_a_ramp():
 
 def test_the_claimed_sd_covers_a_lagged_gradient_after_a_start_in_a_ramp():
     # WHY: after a start in a ramp the error of a lag of the gradient was five claimed sds. The
-    # case leads the board by 5 K; at the start the lagged gradient may still be that of a soak.
+    # case leads the board by 5 K; at the start the lagged gradient may have its value in a soak.
     # A ramp that begins over a lag (600 s) after the start does not increase the sd.
     response = (term('gradient_lag', (30.0, 0.0, 0.0), tau_s=600.0),)
     unit = replace(calibration(response=response), board_lag_s=300.0)
@@ -68,7 +68,7 @@ def test_the_claimed_sd_covers_a_lagged_gradient_after_a_start_in_a_ramp():
             compensator.push('case', stamp, 15.0 + risen - flicker)
             row = compensator.process(stamp, 0.0, 0.0, 1.0)
         sd[begin] = math.sqrt(row[3] - compensator.thermal.correction.noise[0])
-    # Sensitivity 30 counts per K, scale factor 300 counts per m/s^2; 760 s of a lag of 600 s.
+    # Sensitivity 30 counts/K, scale factor 300 counts per m/s^2; decay with tau = 600 s for 760 s.
     left = 30.0 / 300.0 * math.exp(-760.0 / 600.0)
     assert sd[0] == pytest.approx(math.hypot(5.0, 0.41) * left, rel=0.2)
     assert sd[700] < 0.2 * sd[0]
@@ -194,7 +194,7 @@ def sd_at(unit, board, behind=0.0, force=0.0):
 
 def test_beyond_the_range_curve_and_lag_do_not_cancel_in_the_claimed_sd():
     # Inside the range the slopes of curve and lag over board temperature cancel. Outside of the
-    # range the sum of these slopes is unknown, and the claimed sd is that of the curve alone.
+    # range the claimed sd is that of the curve's slope alone, as if the lag did not cancel it.
     parts = regime_set(axis_set((0.0, 0.5), residual_sd_m_s2=1e-6))
     lag = term('board', (-0.5, 0.0, 0.0), tau_s=600.0)
     unit = calibration(static=parts, dynamic=parts, response=(lag,))
@@ -323,8 +323,8 @@ def test_with_lags_the_sd_in_a_ramp_does_not_depend_on_the_calibrated_rates():
 
 
 def test_the_distance_of_a_squared_column_from_its_range_is_that_of_its_quantity():
-    # WHY: a lag of 10 K is 100 times the largest lag in the bags, 0.1 K. The distance from
-    # the range was that of the squares, 10000 times the range, and the claimed sd was 0.1 g.
+    # WHY: a lag of 10 K is 100 times the largest lag in the bags, 0.1 K. The squares of
+    # both lags, with a ratio of 10000, were compared, and the claimed sd was 0.1 g.
     unit = calibration(response=(term('square', (1.0, 0.0, 0.0), tau_s=600.0, range=(0.0, 0.01)),))
     correction = Correction(unit)
     state = np.zeros(StateLayout(correction.memory).width)

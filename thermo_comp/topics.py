@@ -67,7 +67,8 @@ IMU_IN = NodeTopic(
     'imu/uncompensated',
     IMU,
     'm/s^2, with `input:=imu`; orientation and its covariance pass through, '
-    'and so do angular rate and its covariance unless the calibration has a `gyroscope`',
+    'and so do angular rate and its covariance unless the calibration has a `gyroscope`; '
+    'a message with `linear_acceleration_covariance[0]` = -1 (no acceleration) is not published',
     2000,
     is_reliable=False,
 )

@@ -29,8 +29,8 @@ _CELL_S, _SAMPLES_TO_BEGIN = 0.5, 30
 _LOOKED_BACK = 200
 # Sd of a position's mean force due to hysteresis, mounting and drift, even in a long rest [g].
 _FLOOR_SD = 2e-5
-# A position is 'restless' if its noise is above `_RESTLESS` times the median of all positions. A
-# still interval after found rests is a rest if its noise is below `_LOUDEST` times their noise.
+# A position is 'restless' if its noise is above `_RESTLESS` times the median of all positions.
+# After the first rests, a still interval is a rest up to `_LOUDEST` times the noise of the rests.
 _RESTLESS, _LOUDEST = 3.0, 10.0
 # Smallest backward step of the stamps that shows a restart of the driver [ns].
 _STEP_BACK_NS = 10**9

@@ -22,7 +22,10 @@ if TYPE_CHECKING:
 _BAG = argument('Recording: rosbag2 directory, .mcap, .db3 or ROS 1 .bag.', metavar='BAG')
 #: Texts for the compensator's counters of samples that are left out of the output.
 _LEFT_OUT = {
-    'n_not_finite': 'samples that are not finite',
+    'n_not_finite': (
+        'samples that are not finite, or marked as without an acceleration '
+        '(linear_acceleration_covariance[0] = -1)'
+    ),
     'n_saturated': 'samples at the full scale of the calibration',
     'n_out_of_order': 'samples with a stamp not later than an earlier stamp, or far ahead',
     'n_no_temperature': 'samples before the first board temperature',
@@ -266,8 +269,8 @@ def play(
     context: typer.Context,
     bag: Path = _BAG,
     rate: float = option(
-        'Speed relative to real time; 0: as fast as reliable subscribers receive. A subscriber '
-        'that processes fewer messages per second then loses messages.',
+        'Speed relative to real time; 0: as fast as reliable subscribers receive, so that a '
+        'subscriber that processes messages more slowly loses some.',
         1.0,
         min=0.0,
     ),

@@ -149,7 +149,7 @@ def fit(
         from ..report.evidence import evidence_of_fit
         from ..report.page import write_report
 
-        evidence = evidence_of_fit(result, wanted.gravity_sd)
+        evidence = evidence_of_fit(result)
         write_report(evidence, report, info=info, overwrite=force)
     _print_fit(out, result, output, report, verbose)
 

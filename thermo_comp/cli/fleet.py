@@ -18,7 +18,7 @@ def fleet_fit(
     folder: str = argument(
         'Folder of the bags DIR/[LOT/]UNIT/BAG, as a path or a URL.', metavar='DIR'
     ),
-    output: Path = option('Folder of the results; an earlier run is continued.', ..., '-o'),
+    output: Path = option('Folder of the results; an earlier run in it is continued.', ..., '-o'),
     settings: dict[str, Any] = options.fitting,
     scheduler: str | None = option(
         'Address of a running Dask scheduler, as tcp://host:8786; default: fit on this machine.',

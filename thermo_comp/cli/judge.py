@@ -342,7 +342,7 @@ def _show_axis_changes(result: 'Update', out: Output) -> None:
             for axis in result.axis_changes
         ],
         title=f'changes shown by {len(result.series)} rests in {result.series.start.max() + 1} '
-        'starts of the node (at rest: change at the mean force; sds: that change / its sd)',
+        'starts of the node (at rest: change at the mean force; sds: this change / its sd)',
     )
 
 

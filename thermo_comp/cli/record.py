@@ -92,7 +92,7 @@ def record(
                 lines = [*problems(), _now(account), *_lines(account)]
                 show(_COLUMNS, _rows(account.positions), lines)
     if bag is None and live.n_lost:
-        out.note(f'messages from the drivers that were lost: {live.n_lost}')
+        out.note(f'lost messages of the drivers: {live.n_lost}')
     _end(out, test.account(), output, [*known, *bags.written], offset, over.is_set())
 
 
@@ -199,7 +199,7 @@ def _duration(text: str) -> float:
 def _print_account(
     out: Output, account: 'Account', problems: Sequence[str], last: dict[str, str]
 ) -> None:
-    """Print the texts on the test that have changed; `last`: texts printed last, by name."""
+    """Print those texts about the test that have changed; `last`: texts printed last, by name."""
     news = {'problem': ', '.join(problems)} if problems else {}
     if not problems:
         last.pop('problem', None)

@@ -230,7 +230,7 @@ def _dataflash(path: Path) -> _Held:
         for name in sorted(reader.name_to_id):
             if not re.fullmatch(r'IMU\d?|BARO|BAR\d|PARM', name):
                 continue
-            table, n_short = _messages(reader, name)
+            table, short = _messages(reader, name)
             stamp_us = table.get('TimeUS', table.get('TimeMS', np.empty(0)) * 1000.0)
             if name == 'PARM' and table.keys() >= {'Name', 'Value'}:
                 for at, label, value in zip(stamp_us, table['Name'], table['Value'], strict=False):
@@ -252,7 +252,7 @@ def _dataflash(path: Path) -> _Held:
                         _vectors(columns, _VECTORS[:3]),
                         _vectors(columns, _VECTORS[3:]),
                         {'imu': readings},
-                        n_short=n_short,
+                        short=short,
                         metadata=metadata,
                     )
     finally:
@@ -265,8 +265,8 @@ def _dataflash(path: Path) -> _Held:
     return held, baros
 
 
-def _messages(reader: Any, name: str) -> tuple[_Columns, int]:
-    """Return the columns of a message type, and the number of its truncated messages."""
+def _messages(reader: Any, name: str) -> tuple[_Columns, list[int]]:
+    """Return the columns of a message type, and the numbers, from 1, of truncated messages."""
     number = reader.name_to_id[name]
     layout = reader.formats[number]
     codes = re.findall(r'(\d*)([a-zA-Z])', layout.msg_struct)  # type codes of module `struct`
@@ -277,14 +277,15 @@ def _messages(reader: Any, name: str) -> tuple[_Columns, int]:
     if _HEADER_BYTES + kind.itemsize > layout.len:
         raise RecordingError(f'damaged: the format of {name} is longer than its stated length')
     offsets = reader.offsets[number]
-    begins = [at + _HEADER_BYTES for at in offsets if at + layout.len <= reader.data_len]
+    is_short = np.array(offsets, np.int64) + layout.len > reader.data_len
+    begins = [at + _HEADER_BYTES for at, short in zip(offsets, is_short, strict=True) if not short]
     content = b''.join(reader.data_map[at : at + kind.itemsize] for at in begins)
     rows = np.frombuffer(content, kind)
     columns = {
         title: rows[title] if factor is None else rows[title] * factor
         for title, factor in zip(layout.columns, layout.msg_mults, strict=False)
     }
-    return columns, len(offsets) - len(begins)
+    return columns, (np.flatnonzero(is_short) + 1).tolist()
 
 
 def _read(module: str, name: str, extra: str, what: str, *arguments: Any) -> Any:

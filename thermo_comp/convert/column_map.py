@@ -32,8 +32,8 @@ from .table import STAMP_EXPONENTS, Format, Stamp, Table, TimeUnit, read_parquet
 _CELSIUS = {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}
 #: Range of plausible intervals between samples [s], which decides the unit of the times.
 _STEPS_S = (5e-5, 0.5)
-#: Intervals up to `_SLOW_S` [s] are plausible if the unit turns by over `_TURN` [rad] between two
-#: still blocks (`_BLOCK` samples, sd below `_QUIET` [g]): in ms the turn is too fast for a hand.
+#: If the unit turns by over `_TURN` [rad] between two still blocks (`_BLOCK` samples, sd below
+#: `_QUIET` [g]), intervals in ms would be too short for a hand: up to `_SLOW_S` [s] are plausible.
 _SLOW_S, _BLOCK, _TURN, _QUIET = 2.0, 12, 0.5, 0.02
 _FASTEST_RAD_S = 20.0  # largest angular rate of a unit that is turned by hand [rad/s]
 #: Stamps of the years 2000 to 2038, and their largest interval [s]. A time since power-up in us,
@@ -191,7 +191,7 @@ def table_log(path: Path, columns: ColumnMap) -> ForeignLog:
         clip=accel.clip and (accel.clip[0] - accel.offset, accel.clip[1] - accel.offset),
         frame_id=columns.frame_id,
         serial=columns.serial or '',
-        n_short=table.n_short,
+        short=table.short,
         not_used=table.not_used,
         continued=continued,
     )
@@ -269,7 +269,7 @@ def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
 
 
 def _unnamed(width: int) -> Headings:
-    """Return the columns ``[t] ax ay az [wx wy wz]``, by their numbers."""
+    """Return the numbers of columns ``[t] ax ay az [wx wy wz]`` without headings."""
     if width not in (3, 4, 6, 7):
         raise RecordingError(
             f'{width} columns without headings cannot be identified, only 3, 4, 6 or 7 columns '

@@ -114,7 +114,7 @@ def _thermometers(
 ) -> dict[str, tuple[str, str]]:
     """
     Return each thermometer's column and unit. A column whose heading is a place, like `board`, is
-    used only if its thermometer has no other column. `names`: all headings, by `_plain`.
+    used only if its thermometer has no other column. `names`: `_plain` of all headings.
     """
     units = {heading: _stated(heading, _DEGREES) or 'degC' for heading in headings}
     warm, places = [], []

@@ -7,7 +7,7 @@ At rest the norm of the specific force is gravity in any attitude. A log whose s
 contradicts gravity is refused: otherwise a factor of 9.8 would remain in the calibration.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from importlib import import_module
@@ -71,7 +71,7 @@ class ForeignLog:
     clip: tuple[float, float] | None = None  # readings at which the sensor is saturated
     frame_id: str = 'imu_link'
     serial: str = ''
-    n_short: int = 0  # number of rows dropped for missing cells
+    short: Sequence[int] = ()  # lines, or numbers of messages, dropped for missing cells
     not_used: tuple[str, ...] = ()  # columns of a table that are not written to the bag
     continued: tuple[int, ...] = ()  # numbers of the lines after an overflow of a 32-bit time
     metadata: Mapping[str, str] = field(default_factory=dict)
@@ -178,12 +178,12 @@ def write_log(
     counts = {name: len(part.celsius) for name, part in log.temperatures.items()}
     return ConversionReport(
         log,
-        rows=len(usable) + log.n_short,
+        rows=len(usable) + len(log.short),
         messages={'accel': len(stamp_ns), 'board': 0, 'case': 0, **counts},
         rate_hz=1e9 / float(np.median(steps[steps > 0])) if steps.any() else float('nan'),
         duration_s=float(newest[-1] - stamp_ns[0]) * 1e-9,
         findings={
-            'short_rows': Finding(log.n_short),
+            'short_rows': Finding(len(log.short), tuple(log.short[:_EXAMPLES])),
             'non_numeric': not_numeric,
             'out_of_range': out_of_range,
             'clipped': _finding(is_clipped, line),
@@ -231,7 +231,7 @@ def _refuse_wrong_units(log: ForeignLog, stillness: Stillness) -> None:
 def _log_times(stamp_ns: Ints, shifts: Ints | None = None) -> tuple[Ints, Ints]:
     """
     Return log times that never decrease, and the shift added after each restart of the clock [ns].
-    `shifts`: for stamps of temperature readings, the shifts that the samples' stamps got.
+    `shifts`: the shifts of the samples' stamps, if `stamp_ns` are stamps of temperature readings.
     """
     is_restart = np.diff(stamp_ns, prepend=stamp_ns[:1]) < -_RESTART_NS
     if shifts is None or len(shifts) != is_restart.sum():

@@ -86,7 +86,7 @@ class Table:
     line: Ints  # line of each row in the file, from 1; in Parquet the number of the row
     values: dict[Column, Floats]  # NaN if a cell is not a number
     stamp_ns: Ints  # `NO_STAMP` if a cell is not a number
-    n_short: int = 0  # number of dropped rows with too few cells, such as a cut row
+    short: Sequence[int] = ()  # lines of dropped rows with too few cells, such as a cut row
     not_used: tuple[str, ...] = ()  # headings, or else numbers, of the columns that were not read
     headings: tuple[str, ...] = ()
 
@@ -223,12 +223,12 @@ def _collect(
         if re.fullmatch(r'\s*[+-]?[0-9]+,[0-9]+\s*', first[1][place]):
             why = f'column {name!r} has decimal commas, it begins with {first[1][place].strip()}: '
             raise RecordingError(why + 'write decimal points')
-    line, stamps, n_short = array('q'), array('q'), 0
+    line, stamps, short = array('q'), array('q'), array('q')
     values = {name: array('d') for name in places}
     rows = chain([first], rows)
     while part := list(islice(rows, _ROWS_AT_ONCE)):
         whole = [(number, row) for number, row in part if len(row) >= needed]
-        n_short += len(part) - len(whole)
+        short.extend(number for number, row in part if len(row) < needed)
         line.extend(number for number, _ in whole)
         for name, place in places.items():
             values[name].extend(_numbers([row[place] for _, row in whole]))
@@ -243,7 +243,7 @@ def _collect(
         line=np.array(line),
         values={name: np.array(column) for name, column in values.items()},
         stamp_ns=stamp.ticks(len(line)) if at is None else np.array(stamps),
-        n_short=n_short,
+        short=short,
         not_used=_not_used(headings, width, {*places.values(), at}),
         headings=tuple(headings),
     )

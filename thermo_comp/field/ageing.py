@@ -163,7 +163,7 @@ def rows_of(series: RestSeries, scatter: float) -> Rows:
     searched = rows.start[rows.rank < _SEARCH_ROWS]
     if len(searched) <= _MOST_ROWS:
         return rows
-    # The oldest node starts are left out: they tell little about the present bias and scale.
+    # The oldest starts are left out: they have little information about present bias and scale.
     return rows.at(rows.start > searched[-_MOST_ROWS])
 
 

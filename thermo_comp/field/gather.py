@@ -46,7 +46,7 @@ class _Cell:
     total: Floats
     squares: Floats = field(default_factory=lambda: np.zeros(3))
     n: int = 0
-    state: _State = ((), ())  # thermal state at the end of the cell
+    state: _State | None = None  # thermal state after the cell's last samples; None: unknown
 
     @property
     def mean(self) -> Floats:
@@ -90,14 +90,13 @@ class RestFinder:
             cell.n += len(part)
             cell.total += deviation.sum(axis=0)
             cell.squares += (deviation[:, :3] ** 2).sum(axis=0)
+            cell.state = self._state_now()
         return rests
 
     def _close(self, cell: _Cell, *, is_followed: bool) -> list[Rest]:
-        state = self._state_now() if self._is_still(cell) else None
-        if state is None:
+        if cell.state is None or not self._is_still(cell):
             self._forget()
             return []
-        cell.state = state
         self._run.append(cell)
         rests = []
         if cell.last + 1 - self._run[0].begin >= SECONDS:
@@ -134,7 +133,8 @@ class RestFinder:
         mean = weights @ np.array([cell.mean for cell in self._run])
         within = sum(cell.squares - cell.total[:3] ** 2 / cell.n for cell in self._run)
         sd = np.sqrt(within / (n - len(self._run)))
-        states, shares = zip(*(cell.state for cell in self._run), strict=True)
-        parts = mean[:3], sd, weights @ np.array(states), weights @ np.array(shares), mean[3:]
+        states, shares = zip(*(cell.state for cell in self._run if cell.state), strict=True)
+        rate = mean[3:] if np.isfinite(mean).all() else mean[:0]
+        parts = mean[:3], sd, weights @ np.array(states), weights @ np.array(shares), rate
         stamp_ns = (self._run[0].begin + self._run[-1].last + 1) * _SECOND_NS // 2
         return Rest(stamp_ns, n, *(tuple(part.tolist()) for part in parts))

@@ -21,7 +21,7 @@ from ..thermal.state import StateLayout
 #: Suffix of the files of a rest log; the name of a file is the day, as in 2026-11-25.rests.
 SUFFIX = '.rests'
 
-#: First two bytes after the checksum, in the line of a start and in the line of a rest.
+#: First two bytes after the checksum, in the line of a node start and in the line of a rest.
 _OF_START, _OF_REST = b' {', b' ['
 
 
@@ -154,8 +154,9 @@ def _whole(value: int) -> int:
 
 
 def counted_rests(content: bytes) -> int:
-    """Count the rests of a file without decoding them."""
-    return content.count(_OF_REST)
+    """Count the undamaged lines of rests in a file."""
+    lines = (line for line in content.splitlines() if line[8:10] == _OF_REST)
+    return sum(line[:9] == b'%08x ' % zlib.crc32(line[9:]) for line in lines)
 
 
 def thinned(content: bytes) -> bytes:

@@ -167,7 +167,7 @@ def read_rests(
 
 
 def source_of(rests: Sequence[tuple[Start, Rest]], sha256: str, ahead: float = 0.0) -> Source:
-    """Return an update's `Source`; its name: time of the last rest, days of ageing claimed."""
+    """Return an update's `Source`, named by the time of the last rest and days of ageing."""
     end = np.datetime64(max(rest.stamp_ns for _, rest in rests), 'ns').astype('datetime64[s]')
     n_samples = sum(rest.n for _, rest in rests)
     return Source(f'{_UNTIL}{end}{_AGED}{ahead:g} d', sha256, n_samples)
@@ -298,7 +298,7 @@ def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
 
 
 class _Geometry(NamedTuple):
-    """Thermal states, shares left of initial lag states, u = f / |f|, v = M^T u, forces x."""
+    """Thermal states, remaining shares of initial lag states, u = f / |f|, v = M^T u, forces x."""
 
     states: Floats
     shares: Floats
@@ -321,8 +321,8 @@ def _uncertainty(
     weight, unknown = at.states[:, WEIGHT], at.states[:, UNKNOWN]
     regimes = np.array([1.0 - weight, weight])
     unexplained = correction.curves.unexplained(at.states[:, BOARD])
-    # The ageing model has terms for the residual sd and the lack of fit: subtract both variances
-    # from `slow`, of the present regime's set or, if the regime is unknown, of both sets.
+    # The ageing model has terms for the residual sd and the lack of fit: subtract the variances of
+    # both from `slow`, for the set of the present regime or, in an unknown regime, for both sets.
     of_sets = regimes + unknown * regimes[::-1]
     slow -= (at.v.T**2 * (of_sets[:, np.newaxis] * unexplained).sum(axis=0)).sum(axis=0)
     residual = [[a.residual_sd_m_s2**2 for a in part.axes()] for part in calibration.regime_sets()]

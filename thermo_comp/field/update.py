@@ -242,7 +242,7 @@ def _axis_changes(
 
 
 def _judged(series: RestSeries, model: Model, solution: Solution, determined: Bools) -> Judged:
-    """Score on each day (under 5 days: each node start) an update by rests of earlier starts."""
+    """Score, on each day (under 5 days: start), an update by the rests of earlier starts."""
     over, labels = 'days', series.day
     if len(np.unique(labels)) < 5:
         over, labels = 'starts', series.start

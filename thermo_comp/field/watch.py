@@ -143,8 +143,8 @@ def watch(series: RestSeries, calibration: Calibration, tolerance: float | None 
         forecast, interval = _forecasts(updated, tolerance)
     is_out, is_row_out = recent > 1.0, np.array([not row.is_within for row in days])
     # The RMS of |f| - g over a week responds late to a change. If the error by the ageing model is
-    # above the limit, a last day above the limit suffices for 'outside its claim'; if the model's
-    # error is within the limit, two last days within the limit suffice for 'within its claim'.
+    # above the limit, the unit is outside its claim if the last day is above the limit; if that
+    # error is within the limit, the unit is within its claim if the last two days are.
     is_error_out = bool(forecast) and forecast[1] == 0.0
     is_out[-1] &= is_error_out or is_row_out[-2:].any()
     is_out[-1] |= is_error_out and is_row_out[-1]
@@ -156,8 +156,7 @@ def watch(series: RestSeries, calibration: Calibration, tolerance: float | None 
         outside_since = next((row.name for row in window if not row.is_within), window[-1].name)
         forecast = ()
     elif (recent > 1.0).any():
-        # The last day above the limit is followed by another day, because either a later week or
-        # the last two days are within the limit.
+        # The index exists: a later week, or each of the last two days, is within the limit.
         until = int(np.flatnonzero(recent > 1.0)[-1])
         inside_since = days[int(np.flatnonzero(is_row_out[: until + 1])[-1]) + 1].name
     periods = _rows(series, firsts, ordered[::together].tolist(), tolerance)

@@ -43,7 +43,7 @@ def model_of(
         {name for name, readings in bag.temperatures.items() if len(readings.value)}
         for bag in bags
     )
-    # Columns may use the case's thermometer, even if not recorded, and others that all bags have.
+    # Columns may use the case thermometer, even if not recorded, and thermometers of all bags.
     sensors = 'case', *sorted(set.intersection(*recorded) - {'board', 'case'})
     detector = options.detector or learn_detector(bags)
     columns: tuple[Column, ...] = ()
@@ -69,7 +69,7 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     fit = _with_lags(windows, problem)
     has_case = all(len(bag.case.value) for bag in bags)
     has_choice = has_case and options.prior is None and options.detector is None
-    # Compare detectors if the chosen model has a curve for each regime, or if one of almost equal
+    # Compare detectors if the chosen model has a curve for each regime, or a model of almost equal
     # score (`is_near`) has such curves and under 80 % of the chosen model's noise on each axis.
     trials = fit.selected.trials
     chosen = next(trial for trial in trials if trial.is_chosen)

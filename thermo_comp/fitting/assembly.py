@@ -50,7 +50,7 @@ def build_calibration(
     earlier: Calibration | None = None,
     nonlinearity: Nonlinearity | None = None,
 ) -> Calibration:
-    """Make a fit's calibration, valid also where the prior calibration `earlier` is."""
+    """Make a fit's calibration; its valid ranges include those of the prior `earlier`."""
     (windows, regression, *_), posterior = fit, fit.posterior
     model, prior, state, layout = windows.model, posterior.prior, posterior.state, claim.layout
     # The response columns that have rows in the covariance; their weights may be 0.
@@ -149,7 +149,7 @@ def _valid_columns(
             # A part lags both in cooling and in heating: the range of an odd power of its lag is
             # extended to the same values of opposite sign.
             valid = ranges.union((valid, (-valid[1], -valid[0])))
-        # A response column that only curves over part temperatures use is of group `part`.
+        # A column with weight only in curves over the temperatures of parts is of group `part`.
         group = PART if k in weighed and not alone[k] else column.group
         valid = valid if earlier is None else ranges.union((valid, column.range))
         result.append(replace(column, group=group, range=valid))

@@ -63,8 +63,8 @@ def claim_of(fit: Fit, gravity_sd: float = 0.0, known_offset_sd: float = 0.0) ->
     offsets by a prior calibration, or 0 [m/s^2]
     """
     regression, chosen = fit.regression, fit.posterior
-    # The rests of a mounting share an offset, but the regression has an offset for each rest: with
-    # its variance times `n_rests`, the mean over a mounting's rests has the right variance.
+    # The rests of a mounting share an offset, but the regression has an offset for each rest: its
+    # variance is multiplied by `n_rests`, so that the mean over the rests has the right variance.
     mounting = regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
     prior = replace(chosen.prior, offset_sd=chosen.prior.offset_sd * n_rests**0.5)
@@ -117,8 +117,8 @@ def _over_offsets(
     n_mountings = int(windows.mounting[-1]) + 1
     is_single = windows.n_turn_ons == 1 < n_mountings
     if scale <= 0.0:
-        # An sd stated by the user is that of mounting plus turn-on offset. In the regression the
-        # bias shared by m mountings has the variance sd^2 / m: add (1 - 1 / m) sd^2, in all sd^2.
+        # An sd stated by the user includes mounting and turn-on offsets. The regression averages m
+        # mountings to a variance of sd^2 / m: (1 - 1 / m) sd^2 is missing if they share an offset.
         variance = offset_sd**2 * (1.0 - 1.0 / n_mountings) if is_single else 0.0
         return posterior.covariance, offset_sd, variance
     kind = 'mounting' if is_single or windows.has_turn_ons else 'both'
@@ -159,8 +159,8 @@ def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Fl
     # `largest`: largest usual offset sd / `scale`, for mountings within a turn-on, for a single
     # turn-on, and ('both') for several turn-ons or mountings that each begin with a turn-on. By
     # data sheets, the bias repeats to 0.3 .. 1 mg over turn-ons of tactical triads and to some mg
-    # over turn-ons of MEMS, 10 to 20 times `scale`. `largest` for turn-ons is between these
-    # 10 to 20 and 0, the ratio of a unit whose bias repeats perfectly.
+    # over turn-ons of MEMS: a ratio of 10 to 20. A bias that repeats perfectly has the ratio 0, so
+    # `largest` for turn-ons is between 0 and these ratios.
     largest = {'mounting': 1.0, 'turn-on': 2.0, 'both': 5.0}[kind]
     # The log evidence is smooth over the grid's step, a third of a decade of the sd.
     ratio = 10.0 ** np.linspace(-3.45, 2.25, 19)
@@ -207,10 +207,10 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
     Add to the prior the columns that the data do not determine, so that their variance is not 0.
 
     The weight of an inactive column is consistent with 0, but the data bound it only to ``1 /
-    sqrt(S)``, S being the information about the weight given the active columns. The column gets
-    weight 0 and, as sd, the smaller of ``1 / sqrt(S)`` and the prior sd, if it exceeds two sd of a
-    window's noise. For the comparison with the noise, the sd of a nearly constant column is scaled
-    to the RMS of the board temperature t [K].
+    sqrt(S)``, S being the information about the weight given the active columns. A column gets the
+    weight 0 and the sd ``min(1 / sqrt(S), prior sd)``, if this sd exceeds two sd of a window's
+    noise. For the comparison with the noise, the sd of a nearly constant column is scaled to the
+    RMS of the board temperature t [K].
     """
     groups, prior = np.array(regression.windows.groups), posterior.prior
     kelvins = regression.windows.kelvins
@@ -267,7 +267,7 @@ def _over_mountings(
 
     fits = fits_with(tried)
     # A large sd of mounting offsets lets attitudes absorb errors of the model, so the log evidence
-    # of a fit rises: limit this rise to that of the log evidence of |f|, plus `CLEAR_GAIN`.
+    # of a fit rises: limit it to the rise of the log evidence of |f|, plus `CLEAR_GAIN`.
     of_data = np.array([fit.log_evidence for fit in fits])
     of_norms = _norm_evidence(regression, posterior, tried, fits[-1].root)
     nearest = int(np.argmin(np.abs(np.log(tried * n_rests**0.5 / prior.offset_sd))))
@@ -324,7 +324,7 @@ def _norm_evidence(
     weight = np.add.reduceat(regression.weight, first)
     residual = regression.weight[:, None] * regression.residual(state, layout)
     residual = np.add.reduceat(residual, first) / weight[:, None]
-    # Average derivatives and errors of |f| over each mounting; the errors include its offset.
+    # Average derivatives and errors (with offset) of |f| over the rests of each mounting.
     errors = np.sum(point.norm_by_axes * (residual + state.offset), axis=1)
     first = np.flatnonzero(np.diff(regression.windows.mounting, prepend=-1))
     rows = np.column_stack((along, errors, np.ones(len(along))))
@@ -383,7 +383,7 @@ def _ratios_to_noise(change: Floats, remaining: Floats) -> Floats:
     covariance of the fit of all windows is the unit matrix
     """
     shares, directions = np.linalg.eigh(remaining.T @ remaining)
-    # Use combinations of unknowns for which left-out windows have over 1e-6 of all information.
+    # Leave out combinations of unknowns of which all but 1e-6 of the information remains.
     is_measured = shares < 1.0 - 1e-6
     shares = np.maximum(shares[is_measured], 1e-12)
     return np.asarray((change @ directions[:, is_measured]) ** 2 * shares / (1.0 - shares))

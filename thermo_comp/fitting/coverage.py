@@ -62,7 +62,7 @@ def next_direction(covariance: Floats, sd: float, positions: Floats) -> Floats:
     force, averaged over all attitudes.
 
     The direction to a face of a cube, which is easiest to hold, is returned if it reduces the
-    variance at least half as much as the best direction; else that to an edge, else to a corner.
+    variance at least half as much as the best direction; else to an edge, else to a corner.
     Directions within 20 degrees of a direction in `positions`, shape (n, 3), are not proposed.
     """
     columns = force_columns(_SPHERE)
@@ -127,7 +127,7 @@ def rough_centre(means: Floats) -> Floats:
     # sphere, because they are almost in a plane.
     if values[0] < 0.02 * values[2]:
         return zero
-    # Readings m on a sphere about c satisfy |m|^2 = 2 c m + const; m, c: less the mean reading.
+    # A reading m on a sphere about c, both less the mean reading, satisfies |m|^2 = 2 c m + const.
     columns = np.column_stack((2.0 * arms, np.ones(len(arms))))
     centre = np.linalg.lstsq(columns, np.sum(arms**2, axis=1), rcond=None)[0][:3]
     radii = np.linalg.norm(arms - centre, axis=1)

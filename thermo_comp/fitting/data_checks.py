@@ -125,7 +125,7 @@ def _judge_span(windows: ThermalWindows) -> Finding:
 
 
 def _judge_beyond(windows: ThermalWindows, prior: Calibration) -> Finding:
-    # A fit with a prior omits windows beyond the prior's temperatures; the tracks have them.
+    # A fit with a prior omits windows beyond the prior's temperatures; `tracks` has all states.
     tracks = (track.states[track.is_known, BOARD] for track in windows.tracks)
     temperature = np.concatenate((windows.temperature, *tracks))
     edges = [edge for part in prior.regime_sets() for edge in part.temperature_range_c]
@@ -135,9 +135,9 @@ def _judge_beyond(windows: ThermalWindows, prior: Calibration) -> Finding:
         return Finding('span', 'good', text)
     return advice(
         'span',
-        f'{text}; the bags reach {coldest:.0f} to {hottest:.0f} degC, and of each rest the fit '
-        'uses only the part in this range, if there is one: fit the bags together with the bags '
-        'of the prior',
+        f'{text}; the bags reach {coldest:.0f} to {hottest:.0f} degC, and the fit leaves out the '
+        'part of a rest beyond this range, unless the whole rest is beyond it: fit the bags '
+        'together with the bags of the prior',
     )
 
 
@@ -359,8 +359,8 @@ def judge_result(
     else:
         yield Finding('residual', 'good', text)
     alone = overall.two_sets.rms
-    # A residual by bias shifts of up to 2 sd (2 `slow`) does not contradict the prior, nor one by
-    # initial lag states, which the fit estimates, so that its noise `sigma` stays small.
+    # Two causes of a large residual do not contradict the prior: bias shifts up to 2 `slow`; and
+    # initial lag states, which the fit estimates, so that they do not increase its noise `sigma`.
     contradiction, sigma = '', float(np.mean(prior.sigma))
     is_above = overall.fitted.rms > np.hypot(1.5 * alone, 2.0 * slow) and sigma > 1.5 * alone
     if options.prior is not None and is_above:

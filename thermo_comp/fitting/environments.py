@@ -86,9 +86,9 @@ def contradiction(
     """
     Return the indices of the bags whose drift the calibration `earlier` of their unit does not
     explain with any initial lag states; all bags if these are more than half of the bags. Also
-    return whether the bags can update `earlier`: ``|f| - g`` shows a change of bias or scale (it
-    far exceeds the drift and the published sd of |f|), or the bags have the six attitudes that
-    determine bias and scale.
+    return whether the bags can update `earlier`: ``|f| - g`` far exceeds the drift and the
+    published sd of |f|, which shows a change of bias or scale, or the bags have the six attitudes
+    that determine bias and scale.
     """
     data = replace(windows.data, tilt=windows.data.tilt[:, :0])
     regression, state = _at_calibration(earlier, data, options.gravity)

@@ -174,7 +174,7 @@ def without_code_offset(bag: ReducedBag, offset: Floats) -> ReducedBag:
 
 
 def with_code_offset(calibration: Calibration, offset: Floats) -> Calibration:
-    """Convert a calibration of codes without their offset into a calibration of raw codes."""
+    """Convert a calibration of codes less the code at zero force into one of raw codes."""
     unit = calibration.unit
     full_scale = unit.full_scale
     if full_scale == COUNTS_FULL_SCALE and offset.max() > 0.0:
@@ -299,6 +299,7 @@ def _fit(
         calibration = build_calibration(
             fit, claim, bags, _unit(bags, options), residuals, earlier, nonlinearity
         )
+        calibration = replace(calibration, gravity_sd_m_s2=options.gravity_sd)
         rates: tuple[RateRow, ...] = ()
         if earlier is not None or not is_beyond(fit.windows):
             calibration, rates = add_gyroscope(calibration, fit.windows, bags, options)

@@ -20,7 +20,7 @@ import numpy as np
 
 from ..typing import Bools, Floats, Ints
 
-# Squares of factors to try on the prior sd of new columns; that with the largest gain is used.
+# Squares of factors to try on the prior sd of new columns; the factor of largest gain is used.
 _SQUARED_FACTORS = (10.0 ** np.arange(-4.0, 1.01, 0.25))[:, None] ** 2
 
 
@@ -58,7 +58,7 @@ class Inactive:
     Q: Floats
 
     def _in_prior_sd(self, column_sd: Floats, wanted: Bools) -> tuple[Floats, Floats, Ints]:
-        """Return S and Q for `wanted` columns' weights over prior sds, and their columns."""
+        """Return S, Q of the weights (in prior sds) of `wanted` columns; column of each weight."""
         sd = np.repeat(column_sd[self.part, self.column] * wanted[self.column], 3)
         at = np.flatnonzero(sd > 0.0)
         S = self.S[np.ix_(at, at)] * np.outer(sd[at], sd[at])

@@ -357,7 +357,7 @@ def undisturbed(residual: Floats, weight: Floats, position: Ints) -> Floats:
     size = residual * np.sqrt(weight)[:, None]
     for part in np.split(size, np.flatnonzero(np.diff(position)) + 1):
         if len(part) > 6:
-            # Subtract from each window's residual the median residual of the seven about it.
+            # Subtract a running median over seven windows.
             np.subtract(part, median_filter(part, (7, 1), mode='mirror'), out=part)
     size = np.abs(size)
     # The 80 % quantile of |x| is 1.2816 sd of a normal x. The median of |x| can be 0: the window

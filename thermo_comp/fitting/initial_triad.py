@@ -25,7 +25,7 @@ from .unknowns import BIAS_SD, SCALE_SD, Windows
 
 @dataclass(frozen=True)
 class ConstantCalibration:
-    """Bias [input units], scale [input units per m/s^2] and M, without effects of temperature."""
+    """Constant bias [input units], scale [input units per m/s^2] and misalignment matrix M."""
 
     bias: Floats
     scale: Floats
@@ -70,12 +70,12 @@ def constant_calibration(
             f'an axis ({axes}) reads the same in all positions: the axis is dead, or the unit was '
             'never turned about another axis'
         )
-    # If no axis was held up and down, half range / g is below the scale: try 1.3 times it, too.
+    # Half the readings' range is below 1 g if no axis was held up and down: try 1.3 times it, too.
     scales = (float(np.max(half)) * spread / gravity for spread in (1.0, 1.3))
     starts = (np.where(half * 4.0 > np.max(half), scale, half / gravity) for scale in scales)
     tried = (_refine(means, gravity, bias, scale, misalignment_sd) for scale in starts)
     calibration, rms = min(tried, key=lambda fitted: fitted[1])
-    # Readings on no ellipsoid may fit a very large one with a far centre: refuse such a fit.
+    # Readings that lie on no ellipsoid may fit a large ellipsoid with a far centre: refuse it.
     is_around = np.all(np.abs(calibration.bias - bias) < 2.0 * np.max(half))
     if not (is_around and rms < largest_rms):
         raise FitError(
@@ -139,7 +139,7 @@ def white_noise_of(windows: Windows, scale: Floats) -> Floats:
     which do not depend on a linear drift; 0 if no position has three windows.
 
     In fast ramps second differences contain a part of the drift. If the noise from fourth or sixth
-    differences is below 70 % of the noise from second ones, the smallest of these noises is used.
+    differences is below 70 % of the noise from second differences, the smallest noise is used.
     """
     position, noises = windows.position, []
     for order in (2, 4, 6):

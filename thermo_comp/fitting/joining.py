@@ -28,7 +28,7 @@ def joined(bags: Sequence[ReducedBag]) -> list[ReducedBag]:
     for bag in sorted(bags, key=lambda bag: bag.start_ns):
         before = [recording for recording in recordings if _continues(recording[-1], bag)]
         if before:
-            # Simulated recordings may end at equal stamps: extend the one with nearest readings.
+            # Simulated recordings may end at one stamp: choose by the change of the readings.
             min(before, key=lambda recording: _step(recording[-1], bag)).append(bag)
         else:
             recordings.append([bag])
@@ -132,7 +132,7 @@ def _is_one_rest(before: StillInterval, after: StillInterval, window_s: float) -
     Whether a rest continues in the next part: the gap between the parts is at most three windows
     long, and on each axis the step over the gap is at most five times the RMS, or twice the
     largest (most may be 0 by rounding), of the steps between successive windows, up to 20 windows
-    on each side of the gap. With fewer than 10 such steps the result is False.
+    on each side of the gap. With fewer than 10 steps between windows the result is False.
     """
     gap_s = 1e-9 * (after.start_ns - before.end_ns)
     means = before.mean[: before.n_whole][-20:], after.mean[:20]

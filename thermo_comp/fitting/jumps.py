@@ -33,8 +33,8 @@ from .sources import angular_velocity
 _MARGIN_S = 10.0
 # Smallest number of samples before a step, and after it, for a test of the step.
 _FEWEST_SAMPLES = 8
-# Smallest significant ratio of a step to its sd. In noise without a step, the largest ratio over
-# all possible times of a step is about 5.
+# Smallest significant ratio of a step to its sd. Steps fitted to noise alone, at all possible
+# times, reach a ratio of about 5.
 _STEP_SDS = 8.0
 
 
@@ -136,7 +136,7 @@ def _examine(
     if r:
         is_step = np.abs(step) > _STEP_SDS * step_sd
         # The change of the mean level must be at least half of the step within one sample, and
-        # exceed four of its standard deviations.
+        # exceed 4 sd of this change.
         is_step &= lasting * np.sign(step) > 0.5 * np.abs(step)
         is_step &= np.abs(lasting) > 4.0 * lasting_sd
     else:
@@ -189,7 +189,7 @@ def _is_gradual(
 
 
 def _correlation(residual: Floats, sd: Floats) -> Floats:
-    """Return the sd of a mean residual over its sd for white noise `sd`, at least 1, (3,)."""
+    """Return sd of the mean of `residual` / its sd for white noise of sd `sd`, >= 1, (3,)."""
     # A lag-1 correlation r of the means of 40 pieces multiplies the variance of the mean of all
     # pieces by (1 + r) / (1 - r).
     size = max(len(residual) // 40, 1)
@@ -246,8 +246,8 @@ def _place_of_step(time: Floats, accel: Floats, quiet_sd: Floats, r: float) -> i
     residual = residual - trend @ (trend.T @ residual)
     candidates = np.arange(_FEWEST_SAMPLES, n - _FEWEST_SAMPLES + 1)
     # A unit step at sample k, whitened for the lag-1 correlation r, is 1 at k and 1 - r after k:
-    # its product with a residual is a sum over the residuals from sample k on. Without its
-    # trend, the unit step has a sum of squares smaller by its squared products with the trend.
+    # its product with a residual is a sum over the residuals from sample k on. Subtraction of
+    # the trend reduces the step's sum of squares by its squared products with `trend`.
     tail = _sums_behind(residual, r)[candidates]
     trend_tail = _sums_behind(trend, r)[candidates]
     square = 1.0 + (1.0 - r) ** 2 * (n - candidates - 1) - (trend_tail**2).sum(axis=1)

@@ -12,8 +12,8 @@ support. The errors are the drift (the force along each axis less its mean over 
 does not depend on the attitude) and, if the other positions determine |f|, ``|f| - g``.
 
 Model A is better than B if the error of A is smaller by more than the standard error over folds,
-both for positions and for sections of the program; `gain` lists exceptions. A model that describes
-only one recording fails on left-out positions; one of a single program fails on left-out sections.
+both for positions and for sections of the program; `gain` lists exceptions. Left-out positions
+detect columns that fit only one recording, left-out sections columns that fit only one program.
 
 References
 ----------
@@ -212,9 +212,9 @@ def is_worse_by_norms(before: Score, after: Score) -> bool:
 
 def is_undecided(before: Score, after: Score) -> bool:
     """
-    Whether left-out data do not decide between two models, given that `after` is not better: the
-    drifts agree to 5 %, and errors of |f| are smaller in `after` by more than one standard error
-    or cannot be compared (no fold has both, or a coarse thermometer explains them).
+    Whether left-out data do not decide between two models, of which `after` is not better. The
+    drifts agree to 5 %; errors of |f| are smaller in `after` by more than one standard error, or
+    cannot be compared (no fold is scored for both, or a coarse thermometer explains the errors).
     """
     *drift, norms = _beyond_thermometer(before, after)
     is_equal = all(abs(gain[0]) < _NEGLIGIBLE_LOG_RATIO for gain in drift if gain)
@@ -229,9 +229,10 @@ def is_near(chosen: Score, other: Score) -> bool:
 
 def _beyond_thermometer(before: Score, after: Score) -> list[tuple[float, float] | None]:
     """
-    Return for each kind of folds the log ratio of mean square errors (`Folds.gain_of`), None if a
-    coarse thermometer explains the errors. Thermometer errors repeat in all bags of one chamber
-    program: a model that fits them is better on left-out bags, but fails in another program.
+    Return the log ratio of mean square errors, `before` / `after` (`Folds.gain_of`), for each kind
+    of folds, None if a coarse thermometer explains the errors. Thermometer errors repeat in all
+    bags of one chamber program: a model that fits them is better on left-out bags, but fails in
+    another program.
     """
     is_known = before.norms.rms > _NOISE_RATIO * before.by_thermometer
     keep = (not before.is_by_thermometer, not before.is_by_thermometer, is_known)
@@ -330,7 +331,7 @@ def _is_drift_determined(
 ) -> bool:
     """
     Whether the fit without a position, of covariance ``root @ root.T``, determines the drift in
-    `rows`: the drift's variance is below 10 times (its variance by all positions + noise).
+    `rows`: its variance is below 10 times (variance by the fit of all positions + noise).
     """
     regression, sigma = point.regression, point.prior.sigma
     if not point.layout.used[0].any():
@@ -351,7 +352,7 @@ def _is_drift_determined(
 def _is_norm_determined(point: Point, posterior: PosteriorMode, root: Floats, p: int) -> bool:
     """
     Whether the fit without position `p`, of covariance ``root @ root.T``, determines |f| in `p`:
-    the variance of |f| is below 10 times (its variance by all positions + that of offsets).
+    the variance of |f| is below 10 times (variance by the fit of all positions + offset variance).
     """
     if not point.regression.gravity:
         return False
@@ -371,8 +372,8 @@ def _by_sections(
     is_within: bool = False,
 ) -> tuple[Folds, Floats]:
     """
-    Score left-out sections by their drift about the mean of the position's remaining windows. Each
-    fit without sections is `n_steps` Gauss-Newton steps from the fit of all data.
+    Score left-out sections by their drift about the mean of the position's remaining windows. The
+    fit without the sections of a fold is `n_steps` Gauss-Newton steps from the fit of all data.
 
     `folds`: sections of each fold; `is_within`: score only temperatures that occur in the fit
     """

@@ -58,8 +58,8 @@ class _Shape(NamedTuple):
 
 # Ratio of the RMS residual to white noise up to which no other shape or lag is tried.
 _EXPLAINED_RATIO = 1.1
-# Shapes of the curves, in the order of the trials. A spline of 4 nodes determines a lag best, but
-# cannot describe a kink of the bias, so its limit `most_noise` is low.
+# Shapes of curves over part temperature, in the order of trials. A spline of 4 nodes determines a
+# lag best, but cannot describe a kink of the bias, so its limit `most_noise` is low.
 _SHAPES = (
     _Shape(4, _EXPLAINED_RATIO),
     _Shape(4, _EXPLAINED_RATIO, has_gradient=True),
@@ -268,8 +268,8 @@ class _PartCurves:
         Return the lag of the smallest RMS residual by the simplex method, from the lag `first`.
 
         The search is over the logarithms of both time constants, the share of the gradient, and
-        lead / first time constant. `steps`: first steps in these four numbers, 0 keeps a number
-        constant; `accuracy`: half of the largest extent of the final simplex.
+        lead / first time constant. `steps`: first step in each of these variables, 0 to keep the
+        variable constant; `accuracy`: half of the largest extent of the final simplex.
         """
         tau, second, share, lead = first
         start = np.array([np.log(tau), np.log(second or 1.0), share, lead / tau])
@@ -311,7 +311,7 @@ class _PartCurves:
 
     def _is_determined(self, lag: Part, axis: int) -> bool:
         """
-        Whether time constants `_TAU_RATIO` times as long or short (21 s for a lag of 0 s) increase
+        Whether time constants longer and shorter by `_TAU_RATIO` (for a lag of 0 s: 21 s) increase
         the RMS residual by over 5 %, and the longest bag lasts at least ln(10) time constants.
         """
         tau, second, share, lead = lag

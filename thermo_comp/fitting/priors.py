@@ -5,7 +5,7 @@ Owns the informative prior of a fit, from a calibration of the unit or its type 
 
 The mean and the covariance of the Gaussian prior of the regression are the parameters of the
 calibration and their covariance, increased by the ageing of the unit since the calibration. The
-regression has this calibration's columns, without a selection.
+regression has the columns of the calibration, without a selection.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def prior_model(calibration: Calibration) -> Model:
     Return the model of a calibration, with one curve for each regime.
 
     Windows more than 1 K beyond the temperature range of a calibration of the same unit are not
-    used: they would change its effects of temperature by extrapolated columns.
+    used: extrapolated columns would change the calibration's effects of temperature.
     """
     regimes = calibration.regime_sets()
     static, dynamic = (regime.x.bias_function for regime in regimes)
@@ -83,7 +83,7 @@ def offset_sd_of(calibration: Calibration) -> float:
 
 
 def with_calibration(calibration: Calibration, regression: Regression, state: State) -> State:
-    """Set a state to the bias and weights of a calibration of scale factors `nominal_scale`."""
+    """Return a state with the bias and weights of a calibration whose K is `nominal_scale`."""
     layout, values = parameter_layout(calibration), parameters_of(calibration)
     if len({(b - a, d - a) for a, b, _, d in (*layout.bias, *layout.scale)}) > 1:
         raise FitError(
@@ -127,10 +127,10 @@ def informative_priors(
         # The sds of bias and scale are equal, as data sheets state similar numbers for both, and
         # few rests do not separate bias and scale.
         tried += [(ageing, 0.0) for ageing in (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)]
-        # Priors for a unit whose effects of temperature have changed, too: `share` multiplies the
-        # sd of the prior by 1.4, 30 and 1000, because the sd of an effect of temperature may be a
-        # thousandth of the effect. The added sd is limited to the size of the effect: with a
-        # larger sd, effects at temperatures without rests would be unknown.
+        # Priors for a unit whose effects of temperature have changed, too. A `share` of 1, 1e3 and
+        # 1e6 increases the prior sd 1.4, 30 and 1000 times, as the sd may be a thousandth of the
+        # effect. The added sd is limited to the size of the effect: with a larger sd, effects at
+        # temperatures without rests would be unknown.
         tried += [(ageing, share) for share in (1.0, 1e3, 1e6) for ageing in (3e-5, 3e-4, 3e-3)]
     K, places = constants_of(calibration).scale, parameter_layout(calibration)
     layout = regression.layout(regression.windows.parts)

@@ -125,7 +125,7 @@ def in_kelvins(bag: ReducedBag) -> str:
     """Describe the thermometer of a bag whose readings look like kelvins; '' if none does."""
     for name in sorted(bag.temperatures):
         celsius = bag.readings(name).value
-        # 233 K is -40 degC, the lower limit of industrial electronics; none works at 233 degC.
+        # 233 K is -40 degC, the lower limit of industrial electronics, which fail at 233 degC.
         if len(celsius) and 233.0 < (median := float(np.median(celsius))) < KELVINS[1]:
             reads = f'temperature/{name} reads {median:.4g} degC in the median'
             return f'{reads}: that looks like kelvins; record degC'

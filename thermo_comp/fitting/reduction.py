@@ -7,7 +7,7 @@ The blocks of a bag are read once, in bounded memory. Samples are averaged to ce
 second (see `stillness`), and the cells of a still interval to windows of ten seconds. A short
 interval, and the end of an interval, may have shorter windows. Within a window the deviation of
 every thermal regressor from a straight line is far below the noise, so the mean of a window is a
-sufficient statistic. The regression estimates the noise of these means, which for a
+sufficient statistic. The regression estimates the noise of window means, which for a
 charge-balancing converter is less than the scatter of the samples implies.
 """
 
@@ -320,8 +320,8 @@ def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
 @np.errstate(invalid='ignore')
 def is_spike(value: Floats) -> Bools:
     """Return which readings are over 10 K from the median of five readings about them, (n,)."""
-    # A thermometer with a loose contact reads -127 or 85 degC for a moment. Estimates of its noise
-    # leave out these spikes, so that the tracker rejects the spikes as outliers.
+    # A thermometer with a loose contact reads -127 or 85 degC for a moment. Noise estimates leave
+    # out such readings, so that the tracker rejects them as outliers.
     far = np.zeros(len(value), dtype=bool)
     if len(value) > 4:
         middle = np.median(sliding_window_view(value, 5), axis=1)

@@ -118,7 +118,7 @@ def of_whole_rests(
     for bag in bags:
         for rest in bag.intervals:
             parts = [next(left) for _ in _pieces(rest, bag.window_s)]
-            # Weight of a piece: its duration, or a window's length if longer (one sample: 0 s).
+            # Weight: duration of a piece, at least a window's length (one sample lasts 0 s).
             share = np.array([max(part.duration_s, bag.window_s) for part in parts])
             up = share @ np.array([part.up for part in parts])
             x, y, z = (up / np.linalg.norm(up)).tolist()

@@ -189,7 +189,7 @@ class Point:
             precision = self.precision[:n]
             factor = factored_with_prior(information, precision)
             return solved(factor, gradient - precision * deviation), factor
-        # Unknowns times the root of the prior precision have well conditioned equations.
+        # The equations of (root of the prior precision) times (unknowns) are well conditioned.
         root = self.prior.informative.root
         scaled = solve_triangular(root, information, trans='T')
         scaled = solve_triangular(root, scaled.T, trans='T')

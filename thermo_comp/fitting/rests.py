@@ -39,7 +39,7 @@ def _is_heated(windows: ThermalWindows) -> Bools:
     """
     Return which positions were heated or cooled, shape (n_positions,), or all if none was. A
     position is heated if its temperature changes, or its mean differs from the median, by over a
-    tenth of the span of all. Drifts of short rests in a room hardly separate bias and scale.
+    tenth of the whole range. Drifts of short rests in a room hardly separate bias and scale.
     """
     t, edges, weight = windows.temperature, windows.data.edges[:-1], windows.data.weight
     mean = block_means(t[:, None], weight, edges)[:, 0]

@@ -159,7 +159,7 @@ class Growth:
                 # mean squares to the mean square of the residual.
                 by_attitude = regression.gravity * state.from_pose
                 square += float(np.mean(state.offset**2) + np.mean(by_attitude**2))
-            # The typical weight of a new column is that with which it alone explains the residual.
+            # Typical sd of a new column: the weight with which it alone explains the residual.
             slope = np.sqrt(square) / (float(kelvins[0]) or 1.0)
             units = np.array([[1.0], [1.0 / (regression.gravity or 1.0)]])
             new = np.minimum(slope * units * kelvins, largest_sd)
@@ -205,7 +205,7 @@ class Growth:
         return chosen
 
     def trials(self, chosen: Trial, groups: Sequence[str]) -> list[Trial]:
-        """Fit the chosen model plus groups of columns, for up to 4 choices with large gains."""
+        """Fit the chosen model plus groups of columns: up to 4 choices with large gains."""
         absent = [group for group in groups if group in self.free and group not in chosen.groups]
         if not absent:
             return []

@@ -137,7 +137,7 @@ def _flicker(recorded: Sequence[Readings]) -> float:
         first = np.flatnonzero(np.diff(edges, prepend=np.nan))
         count = np.diff(np.append(first, len(edges)))
         edge, at_s = edges[first], time[changed[first]]
-        # Leave out an edge (between two rounded values) where the temperature turns back.
+        # Leave out an edge between two rounded values at which the temperature reverses.
         step, apart_s = edge[2:] - edge[:-2], at_s[2:] - at_s[:-2]
         passes = np.abs(step) > 1e-9
         moves += float(np.sum(count[1:-1][passes] ** 2 - 1)) * float(np.median(np.diff(time))) ** 2
@@ -263,7 +263,7 @@ def averaged(
     """
     Average readings over steps of time if there are at least two per step, as from IMU drivers.
 
-    Returned are the bag with these means as readings, and the settings with the noise of a mean.
+    Return the bag with the means as readings, and the settings with the noise of a mean.
     `inputs`: the thermometers, the board's first; all others have the settings of the case's.
     """
     temperatures = {**bag.temperatures}
@@ -284,7 +284,7 @@ def averaged(
 
 
 def _means(readings: Readings, step: Ints, has_cells: bool) -> Readings:
-    """Average readings of equal `step`; if a reading is a cell, keep the changed readings."""
+    """Average readings in each `step`; with `has_cells` keep first and changed readings only."""
     stamp_ns, value = readings
     is_first = np.diff(step, prepend=-1) != 0
     if has_cells:
@@ -296,7 +296,7 @@ def _means(readings: Readings, step: Ints, has_cells: bool) -> Readings:
     is_first |= np.repeat(most - least > LARGEST_STEP, np.diff(first, append=len(step)))
     first = np.flatnonzero(is_first)
     n = np.diff(first, append=len(step))
-    # Means of equal readings are equal: rounding must not hide that a sensor stands still.
+    # Means of equal readings must be equal, or rounding would hide that readings are constant.
     after_ns, after = (values - np.repeat(values[first], n) for values in readings)
     mean_ns = stamp_ns[first] + np.add.reduceat(after_ns, first) // n
     return Readings(mean_ns, value[first] + np.add.reduceat(after, first) / n)

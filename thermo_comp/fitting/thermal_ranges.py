@@ -81,9 +81,9 @@ def rest_gradient_range(
     """
     Return the valid range of the first sensor's gradient at rate 0, ``gradient - lag_s * rate``.
 
-    The range of a prior calibration, `earlier`, is included. The windows have no range without the
-    sensor, without ramps (which determine the lag), or if the range exceeds +-100 K, as in bags
-    that are too short for a rate. The result is None if neither prior nor windows have a range.
+    The range of a prior calibration, `earlier`, is included. The windows give no range without the
+    sensor, without ramps (which determine the lag), or if it would exceed +-100 K, as in bags that
+    are too short for a rate. The result is None if neither prior nor windows give a range.
     """
     lower, upper = valid_range(windows.gradient - lag_s * windows.rate, 0.01)
     is_small = max(-lower, upper) < 100.0

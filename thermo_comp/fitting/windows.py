@@ -68,7 +68,7 @@ class Sets:
 
     @property
     def families(self) -> tuple[TemperatureFunction, TemperatureFunction]:
-        """Families of static and dynamic curve; a shared dynamic curve has the higher order."""
+        """Families of static and dynamic curve; if `is_shared`, dynamic order >= static order."""
         is_higher = self.is_shared and self.static.n_free > self.dynamic.n_free
         return self.static, self.static if is_higher else self.dynamic
 
@@ -91,7 +91,7 @@ class Model:
     name: name of the model in the provenance
     parts: the lag of the part of each axis, or None in a model without one lag per axis
     sensors: thermometers other than the board's; the first is that of the case
-    range_c: board temperatures of the windows that are used, unless a rest has no others [degC]
+    range_c: board temperatures [degC]; of a rest with windows in this range only these are used
     """
 
     name: str
@@ -207,7 +207,7 @@ class ThermalWindows:
 
     @property
     def has_soaks(self) -> bool:
-        """Whether 5 % of the windows are static, and span half of the temperatures of all."""
+        """Whether >= 5 % of the windows are static, and span half of the temperature range."""
         is_short = self.static_span < 0.5 * float(np.ptp(self.temperature))
         return bool(np.mean(self.is_dynamic) <= 0.95) and not is_short
 
@@ -422,7 +422,7 @@ def _kelvins(model: Model, values: Floats, raw: Floats, t: Floats, gradient: Flo
 
 
 def _part_kelvins(values: Floats) -> Floats:
-    """Return the RMS of each power x^p in `Model.part_sums` over its largest slope [K], (9,)."""
+    """Return RMS / largest slope [K] of each power x^p in `Model.part_sums`, shape (9,)."""
     power = np.tile((1, 2, 3), values.shape[1] // 3)
     # The largest slope of x^p is p |x|^(p - 1) at the largest |x|.
     largest = np.repeat(np.abs(values[:, ::3]).max(axis=0, initial=0.0), 3)
@@ -442,7 +442,8 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
     lengths_s = (float(np.median(np.diff(i.time))) for i in bag.intervals if len(i.time) > 1)
     step_s = max(min(lengths_s, default=1.0) / 5.0, 0.1)
     inputs = spec.inputs
-    bag, detector = averaged(bag, model.detector, inputs, step_s)
+    # The filter of a thermometer needs more time for a reading than the tracker for a state.
+    bag, detector = averaged(bag, model.detector, inputs, 2.0 * step_s)
     config = ThermalConfig()
     tracker = ThermalTracker(detector, spec, config)
     board, *others = tracker.thermometers.values()
@@ -452,7 +453,7 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
     reading = next(readings, None)
     for stamp_ns in range(begin_ns, max(bag.end_ns, begin_ns) + step_ns, step_ns):
         # As in the node, a state depends on all readings with a stamp up to that of the state. A
-        # mean of readings has the mean of their stamps: some may be later, by up to half a step.
+        # mean has the mean stamp of its readings, so single readings may be half a step later.
         while reading is not None and reading[1] <= stamp_ns:
             tracker.read(*reading)
             reading = next(readings, None)

@@ -39,8 +39,8 @@ class Spread(NamedTuple):
     Spread of a quantity over the units about its median, and the distance `z` of each unit.
 
     Only units whose data determine the quantity (`is_counted`) are used for `middle`, `sd` and
-    `limit`. A distance `z` is the deviation from the median divided by the root of the sum of two
-    squares: of `sd`, and of the sd that the unit's fit gives to the value.
+    `limit`. A distance `z` is the deviation from the median divided by ``sqrt(sd^2 + s^2)``, s the
+    sd of the value by the unit's fit.
     """
 
     quantity: TableColumn
@@ -156,8 +156,8 @@ def spread_of(quantity: TableColumn, rows: Sequence[Row]) -> Spread | None:
 
 def _determined(quantity: TableColumn, values: Floats, own_sd: Floats) -> Bools:
     """
-    Choose the units whose data determine a quantity: units are added in the order of the sd by
-    their fits, until this sd exceeds five times the spread of the units chosen so far.
+    Choose the units whose data determine a quantity: units are added in the order of their sd by
+    the fit, until the sd of a unit exceeds five times the spread of the units up to this one.
     """
     order = np.argsort(own_sd, kind='stable')
     n = len(values)

@@ -148,7 +148,7 @@ def _fitted(
     lost = [f'{bag.source.name}: {bag.info.truncated}' for bag in bags if bag.info.truncated]
     if row['n_left_out']:
         lost.append(f'{row["n_left_out"]} of {row["n_bags"]} bags are left out: {row["left_out"]}')
-    evidence = evidence_of_fit(result, how.gravity_sd)
+    evidence = evidence_of_fit(result)
     evidence = replace(evidence, findings=(*evidence.findings, *lost))
     known = {
         **fitted_cells(result, evidence.judgement, has_prior=how.prior is not None),

@@ -207,8 +207,8 @@ class Drift:
 
 def history_of(calibrations: Sequence[Calibration]) -> tuple[Epoch, ...]:
     """
-    Sort by date the calibrations with the serial number of the first given calibration. Of several
-    calibrations from the same bags only the first is kept: their difference is no change in time.
+    Sort by date the calibrations with the serial number of the first given calibration. Only the
+    first of several calibrations from the same bags is kept: they show no change in time.
     """
     known: set[tuple[Source, ...]] = set()
     ordered: list[Calibration] = []

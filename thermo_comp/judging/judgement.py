@@ -255,7 +255,7 @@ def axis_shifts(
     )
     residuals = np.concatenate(((sizes - 1.0) / sd, np.zeros(3)))
     shift = np.linalg.lstsq(rows, residuals, rcond=None)[0]
-    # If the residuals exceed the claimed errors, increase the sd of the shifts.
+    # If residuals exceed the claimed errors, increase the sds of the bias and scale shifts.
     freedom, left = len(sd) - 6, float(np.sum((residuals - rows @ shift) ** 2))
     excess = max(1.0, left / freedom) if freedom > 0 else 1.0
     spread = np.sqrt(np.diag(np.linalg.pinv(rows.T @ rows)) * excess)

@@ -46,12 +46,12 @@ class JudgedWindows:
     window's middle [s]; `count`, `mean`: number and mean of the window's raw samples. A position
     is a still interval, numbered through all bags. `rate`: rate of the board temperature [K/s].
     `is_dynamic`: the dynamic set has more than half the weight; `is_inside`: the window is
-    entirely inside the calibrated ranges; `is_swapped`: the board temperature leads that of the
-    case. `raw` is the specific force with the constants at the reference temperature, `force` with
-    the calibration, shapes (n, 3). `size`: the known |f|, which is gravity unless the bag states
-    another value. `claimed_sd`: sd of ``|force| - size`` due to the calibration, `size` and white
-    noise of the mean; `noise_sd`: sd due to the white noise alone. Rows of `gyro`: angular rate
-    raw and corrected, its claimed variances, the thermal state; empty without a gyroscope.
+    entirely inside the calibrated ranges; `is_swapped`: the board temperature leads the case
+    temperature. `raw` is the specific force with the constants at the reference temperature,
+    `force` with the calibration, shapes (n, 3). `size`: the known |f|, which is gravity unless the
+    bag states another value. `claimed_sd`: sd of ``|force| - size`` due to the calibration, `size`
+    and white noise of the mean; `noise_sd`: sd due to the white noise alone. Rows of `gyro`: raw
+    and corrected angular rate, claimed variances, thermal state; empty without a gyroscope.
     """
 
     window_s: float
@@ -133,7 +133,7 @@ def corrected_windows(
         noise = along**2 @ np.array(Correction(calibration).noise)
         # A mean has no rounding noise: the converter adds the remainder to the next sample.
         white = along**2 @ np.square(calibration.noise_density_m_s2_sqrt_hz)
-        # Samples at more than the calibrated rate have more noise each: their mean has no less.
+        # A higher sample rate increases the noise of a sample: the mean's noise does not decrease.
         covered_s = np.minimum(calibration.unit.cycle_time_s * table['count'], window_s)
         mean_white = white / covered_s
         variance = np.maximum(table['variance'] - noise, 0.0) + mean_white
@@ -181,7 +181,7 @@ def columns_of(windows: JudgedWindows, bags: Sequence[str]) -> dict[str, npt.NDA
 
 # A structured array of partial sums of samples, or of windows.
 _Table: TypeAlias = npt.NDArray[Any]
-# Integer fields of a window: `count` is the total of its partial sums, the others are those of its
+# Integer fields of a window: `count` is the total of the partial sums, the rest is copied from the
 # first partial sum. Fields in `_AVERAGED` and `_TRIPLES` are means over a window's partial sums.
 _ONCE = ('bag', 'position', 'start_ns', 'count')
 _AVERAGED = ('time', 'board', 'rate', 'weight', 'variance', 'swapped', 'size', 'size_sd')

@@ -19,7 +19,7 @@ from ..recording.blocks import Block
 from ..thermal.reading_queue import DISORDER_NS, NEVER_NS, PENDING_LIMIT
 from ..typing import Bools, Floats, Ints, Stamps
 from .checks import roughness
-from .compensator import TIME_JUMP_NS, Compensator, corrected_rate
+from .compensator import NO_RATE, TIME_JUMP_NS, Compensator, corrected_rate
 from .segments import EVER_NS, SEGMENT_NS, Model, Segment
 from .status import DROPPED
 
@@ -50,7 +50,7 @@ class CompensatedBlock:
     specific_force: Floats  # corrected specific force [m/s^2], shape (n, 3)
     covariance: Floats  # covariance of the force, row-major 3x3 [m^2/s^4], shape (n, 9)
     #: Corrected angular rate [rad/s] and its variances [rad^2/s^2], shape (n, 3), or None without
-    #: an angular rate or a gyroscope in the calibration.
+    #: an angular rate or a gyroscope in the calibration; variances of a missing rate: `NO_RATE`.
     angular_rate: Floats | None = None
     angular_rate_variance: Floats | None = None
 
@@ -126,8 +126,8 @@ def _push(
     while arrivals and arrivals[-1][0] <= place:
         _, _, name, stamp_ns, celsius = arrivals.pop()
         if len(thermal.queue) >= PENDING_LIMIT:
-            # As in the node while no samples come, a full queue is applied up to `DISORDER_NS`
-            # before the new reading, but once a sample has been processed, only up to `due_ns`.
+            # As in the node without samples, a full queue is applied up to `DISORDER_NS` before
+            # the new reading; after a first sample it is applied up to `due_ns` at most.
             limit_ns = NEVER_NS if compensator.now_ns is None else due_ns
             thermal.flush(min(limit_ns, stamp_ns - DISORDER_NS))
         thermal.push(name, stamp_ns, celsius)
@@ -204,9 +204,9 @@ def _apply(
         force = _corrected(force_of, line, segments, stamps, samples)
         is_kept = _judge(compensator, segments, stamps, samples, force)
         if angular_rate is not None:
-            rate = _corrected(corrected_rate, rate_line, segments, stamps, angular_rate)[
-                :, is_kept
-            ]
+            rate = _corrected(corrected_rate, rate_line, segments, stamps, angular_rate)
+            rate[3:, ~np.isfinite(angular_rate.sum(axis=1))] = np.reshape(NO_RATE, (3, 1))
+            rate = rate[:, is_kept]
         if not is_kept.all():
             index, stamps, force = index[is_kept], stamps[is_kept], force[:, is_kept]
     rates = () if angular_rate is None else (rate[:3].T, rate[3:6].T)

@@ -5,11 +5,11 @@ Owns the plausibility checks of samples: a stuck converter, more samples than th
 make, and |f| at rest, which must be gravity.
 
 A converter with noise does not repeat its numbers for seconds; three exact zeros indicate a dead
-wire. A converter counts charge per cycle, so the scale factor changes with the sample rate. With
-an aged calibration, or that of another unit, |f| at rest may differ from gravity by more than the
-stated uncertainty. |f| is averaged over windows of a second or longer. A window is still if its
-scatter is within the sensor's noise and its mean agrees with the mean of the previous window. A
-step of |f| from a rest to another rest is judged within 3 s.
+wire. A converter counts charge per cycle, so the scale factor changes with the sample rate. If a
+calibration is aged or of another unit, |f| at rest may differ from gravity by more than the stated
+uncertainty. |f| is averaged over windows of a second or longer. A window is still if its scatter
+is within the sensor's noise and its mean agrees with the mean of the previous window. A step of
+|f| from a rest to another rest is judged within 3 s.
 """
 
 import math
@@ -61,9 +61,9 @@ REFUTING_WINDOWS: Final = 3
 RESTORING_WINDOWS: Final = 2
 #: Time at rest after a step of |f|, after which the step is judged [ns].
 STEP_NS: Final = 300_000_000
-#: The platform, not the calibration, changes |f| if the force keeps its direction within this
-#: angle [rad] after motion, as in a coordinated turn, and if this time [ns] is not exceeded since
-#: a window agreed: a wrong axis changes |f| with the direction of the force.
+#: An error of |f| after motion is due to the platform's acceleration, as in a coordinated turn, if
+#: the force has turned by less than this angle [rad] and at most this time [ns] has passed since
+#: |f| agreed with gravity: an error of the calibration depends on the direction of the force.
 SAME_DIRECTION: Final = 0.05
 LONGEST_MANOEUVRE_NS: Final = 60_000_000_000
 #: A residual of |f| above the tolerance plus this number of its sd refutes the calibration.
@@ -270,7 +270,7 @@ class GravityCheck:
         self._n_agreeing = 0
         self._is_against = False
         self._forces: list[Sequence[float]] = []
-        #: Forces since |f| stepped from one rest to another, and the stamp of the first of them.
+        #: Forces of the samples after a step of |f|, and the stamp of the first such sample [ns].
         self._off: list[Sequence[float]] = []
         self._off_ns = 0
         self._is_resting = False  # whether the last sample agreed with the last still window
@@ -321,7 +321,7 @@ class GravityCheck:
         noise: float,
         rough: float,
     ) -> None:
-        """Refute the calibration if |f| at rest, after a step, misses gravity for `STEP_NS`."""
+        """Refute the calibration if, after a step, |f| at rest differs from g for `STEP_NS`."""
         rests = self.result and self.result.is_still and self._last_mean
         if self.is_refuted or not (self._off or rests):
             self._off, self._is_resting = [], False
@@ -392,7 +392,7 @@ class GravityCheck:
         self.result = GravityResidual(residual, sd, n + 1, is_still=True)
 
     def _is_accelerated(self, mean: Sequence[float], size: float) -> bool:
-        """Whether the platform's acceleration may explain a wrong |f| of constant force."""
+        """Whether an acceleration of the platform along the force may explain a wrong |f|."""
         if self.is_refuted or self._agreed is None or not self._has_moved:
             return False
         agreed, agreed_ns = self._agreed

@@ -51,6 +51,9 @@ CONTINUED: Final = (
     f'{TANGENT_SPANS:g} of the range, then constant'
 )
 
+#: Variances of a rate that is not finite: sensor_msgs/Imu marks a missing rate by a first -1.
+NO_RATE: Final = (-1.0, 0.0, 0.0)
+
 #: Specific force x, y, z [m/s^2] and the covariance xx, xy, xz, yy, yz, zz [m^2/s^4].
 Corrected = tuple[float, float, float, float, float, float, float, float, float]
 
@@ -132,7 +135,12 @@ class Compensator:
         return gravity, self.config.gravity_tolerance_m_s2
 
     def push(self, name: str, stamp_ns: int, celsius: float) -> None:
-        """Queue a reading [degC]; a thermometer that the calibration lacks has no effect."""
+        """
+        Queue a reading [degC]; a thermometer that the calibration lacks has no effect.
+
+        At most 4096 readings wait for a sample with an equal or later stamp. If more wait, the
+        older half is dropped and counted as rejected.
+        """
         self.thermal.push(name, stamp_ns, celsius)
         self.event_ns = min(self.event_ns, stamp_ns)
         self.reading_ns = max(self.reading_ns, stamp_ns)
@@ -176,8 +184,14 @@ class Compensator:
     def correct_rate(
         self, stamp_ns: int, x: float, y: float, z: float
     ) -> tuple[float, float, float, float, float, float]:
-        """Return the corrected angular rate [rad/s] of the last sample, then its variances."""
-        return corrected_rate(self.rate_line, (stamp_ns - self._segment[0]) * 1e-9, x, y, z)
+        """
+        Return the corrected angular rate [rad/s] of the last sample, then its variances.
+
+        A rate that is not finite has the variances -1, 0, 0, as a missing rate in sensor_msgs/Imu.
+        """
+        dt = (stamp_ns - self._segment[0]) * 1e-9
+        row = corrected_rate(self.rate_line, dt, x, y, z)
+        return row if math.isfinite(x + y + z) else (*row[:3], *NO_RATE)
 
     def _count_bad(self, x: float, y: float, z: float) -> None:
         if self.is_refusing and self.thermal.rate.is_too_fast:
@@ -291,7 +305,7 @@ class Compensator:
 
         The states of thermometers, regime and memory are kept if `model` has the detector
         settings, lags and play operators of the present model; otherwise only the last
-        temperatures are kept. Of the present and the new compensator, use only one from now on.
+        temperatures are kept. Both compensators share objects: use only one of them afterwards.
         """
         new = copy(self)
         new.take_over(model, config)

@@ -171,13 +171,14 @@ class ThermalSide:
     def push(self, name: str, stamp_ns: int, celsius: float) -> None:
         """Queue a reading, if the calibration has a thermometer of this name."""
         if name in self.inputs:
-            self._count_rejected(name, self.queue.push(name, stamp_ns, celsius))
+            for dropped in self.queue.push(name, stamp_ns, celsius):
+                self._count_rejected(dropped)
 
     def _apply(self, name: str, stamp_ns: int, celsius: float) -> None:
         self._n_applied += 1
         tracker = self.tracker
         if not tracker.read(name, stamp_ns, celsius):
-            self._count_rejected(name, 1)
+            self._count_rejected(name)
             return
         if name == BOARD_INPUT:
             self.counters.n_board += 1
@@ -189,11 +190,11 @@ class ThermalSide:
         if decides and regime is not Regime.UNKNOWN:
             self.flags.append((stamp_ns, regime is Regime.DYNAMIC))
 
-    def _count_rejected(self, name: str, n_readings: int) -> None:
+    def _count_rejected(self, name: str) -> None:
         if name == BOARD_INPUT:
-            self.counters.n_board_rejected += n_readings
+            self.counters.n_board_rejected += 1
         else:
-            self.counters.n_case_rejected += n_readings
+            self.counters.n_case_rejected += 1
 
     def flush(self, stamp_ns: int) -> None:
         """Apply the waiting temperature readings up to a stamp."""
@@ -206,7 +207,7 @@ class ThermalSide:
         return not self.model.needs_temperature and self.tracker.board.stamp_ns is None
 
     def sample(self, stamp_ns: int) -> tuple[float, ...]:
-        """Return the thermal state at a stamp, or if `is_unmeasured`, that of a soak at T_ref."""
+        """Return the thermal state at a stamp; if `is_unmeasured`, a soak at T_ref."""
         if self.is_unmeasured:
             gradients = (0.0, 0.0) * len(self.calibration.sensors)
             reference = self.calibration.reference_temperature_c

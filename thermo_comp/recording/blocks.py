@@ -303,7 +303,7 @@ def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
     n_jumps = n_messages = span_ns = 0
     for block in blocks:
         thermometers = block.temperatures.values()
-        # Sort readings and samples in reading order: by the number of samples before them.
+        # Sort readings and samples in the bag's order: by the number of samples before them.
         places = [*(thermometer.after for thermometer in thermometers), np.arange(len(block))]
         stamps = np.concatenate([*(part.stamp_ns for part in thermometers), block.accel_stamp_ns])
         order = np.argsort(np.concatenate(places), kind='stable')

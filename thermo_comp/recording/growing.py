@@ -91,7 +91,7 @@ def leftovers(folder: Path) -> dict[Path, int]:
 def finish(path: Path, number: int) -> Path | None:
     """
     Copy an unfinished bag to the bag `number`, or if it exists, to the largest number plus 1;
-    delete the unfinished bag. None for a bag without messages, RecordingError if it is unreadable.
+    delete the unfinished bag. Return None if it has no messages; RecordingError if unreadable.
     """
     with open_recording(path, require=()) as reader:
         numbers = {int(bag.stem) for bag in numbered_bags(path.parent)}

@@ -106,6 +106,6 @@ def roughest_at_rest(cells: Cells, quiet: Bools, is_coloured: Bools, ratio: floa
 
 
 def _quantile(n_free: float, sigmas: float) -> float:
-    """Return the chi-square / `n_free` quantile at a normal quantile (Wilson and Hilferty)."""
+    """Return the quantile of chi-square / `n_free` at a normal quantile (Wilson and Hilferty)."""
     width = 2.0 / (9.0 * n_free)
     return float((1.0 - width + sigmas * np.sqrt(width)) ** 3)

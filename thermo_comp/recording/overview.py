@@ -158,7 +158,7 @@ def survey_recording(
     findings += [_NO_SAMPLES] * (not n) + thermal_findings(thermometers, candidates)
     findings += [cause] * bool(cause) + clock.findings()
     rate_hz = 1e9 / clock.step_ns if clock.step_ns else float('nan')
-    duration_s = (clock.last_ns - clock.first_ns) * 1e-9
+    duration_s = (clock.latest_ns - clock.earliest_ns) * 1e-9
     # The last cell may extend beyond the samples: limit the time at rest to the duration.
     still_s = min(sum((upper - lower) * reduced.cell_s for lower, upper in still), duration_s)
     return Survey(info, n, duration_s, rate_hz, len(still), still_s, thermometers, findings)
@@ -169,7 +169,8 @@ class _Clock:
     """Statistics of the stamps so far: first block's median interval, gaps, stamps not rising."""
 
     n: int = 0
-    first_ns: int = 0
+    earliest_ns: int = 0
+    latest_ns: int = 0
     last_ns: int = 0
     newest_ns: int = 0  # newest stamp since the last restart of the clock
     step_ns: float = 0.0
@@ -181,10 +182,12 @@ class _Clock:
     def add(self, stamp_ns: Ints) -> None:
         """Add the next stamps; `stamp_ns` must not be empty."""
         if not self.n:
-            self.first_ns = self.last_ns = self.newest_ns = int(stamp_ns[0])
+            self.earliest_ns = self.latest_ns = self.last_ns = self.newest_ns = int(stamp_ns[0])
         later = stamp_ns[not self.n :]
         steps = np.diff(later, prepend=self.last_ns)
         self.n, self.last_ns = self.n + len(stamp_ns), int(stamp_ns[-1])
+        self.earliest_ns = min(self.earliest_ns, int(stamp_ns.min()))
+        self.latest_ns = max(self.latest_ns, int(stamp_ns.max()))
         # After a backward step by an hour or less, samples up to the newest stamp are left out.
         restarts = np.flatnonzero(steps < -LONGEST_PAUSE_NS)
         self.n_restarts += len(restarts)

@@ -7,8 +7,8 @@ Two tests are relative to the noise of the bag's quiet cells: the variance insid
 (vibration, handling) and the step of the mean between adjacent cells (a turn, a knock). A step
 starts a new interval, because a tilt by a microradian changes a sample by a micro-g. Temperature
 tilts a unit at rest, too: a steady change of the mean by at most 50 micro-g/s in several cells is
-a drift, no step. Two tests have absolute limits, as the quietest tenth of a flight is not a rest:
-at rest the sd of samples is below `still_sd`, the angular rate within 1 deg/s of its median.
+a drift, no step. Two tests have absolute limits, because even a flight has quiet cells: at rest
+the sd of samples is below `still_sd`, and the angular rate within 1 deg/s of its median.
 """
 
 from collections.abc import Sequence
@@ -89,8 +89,8 @@ class Cells:
 
 class CellAccumulator:
     """
-    Reduces streamed samples to cells of `cell_s`, or of `least` samples if these last longer. A
-    whole number of cells fills a window of `window_s` or, if a cell is longer, 2 to 60 windows.
+    Reduces streamed samples to cells of `cell_s`, or of `least` samples if these last longer.
+    Whole cells fill a window of `window_s` or, if a cell is longer than a window, 2 to 60 windows.
     """
 
     def __init__(
@@ -164,7 +164,7 @@ class CellAccumulator:
     def cells(self) -> Cells:
         """Return all cells so far, including the unfinished last cell."""
         sums = np.concatenate(self._sums)
-        self._sums = [sums]  # later calls then only add the rows of new cells
+        self._sums = [sums]  # the next call of `cells` appends rows of new cells only
         index, count = sums[:, 0].astype(np.int64), sums[:, 1]
         total, square = np.split(sums[:, 3:-6], 2, axis=1)
         n_free = np.maximum(count[:, None] - 1.0, 1.0)
@@ -250,7 +250,7 @@ def widened(full_scale: float, samples: Floats) -> float:
 
 
 def _part_of(window_s: float, least_ns: float) -> float:
-    """Return a length of `least_ns` or more that divides 1 to 60 windows, else `least_ns` [ns]."""
+    """Raise a cell length [ns] so that whole cells fill 1 to 60 windows, unless it is longer."""
     for stretch in STRETCHES:
         n_cells = int(stretch * window_s * 1e9 / least_ns * (1.0 + 1e-6))
         if n_cells:
@@ -271,8 +271,8 @@ def _quantum_of(samples: Floats, few: list[Floats]) -> Floats:
         few[axis] = changes[: 3 * (len(changes) < 3)]
         if len(changes) < 3:
             continue
-        # Changes by the same multiple of the quantum differ by rounding only. The smallest change
-        # is the quantum if all changes are its whole multiples, or take only a few values.
+        # Changes by an equal number of quanta differ by rounding only. The smallest change is the
+        # quantum if all changes are whole multiples of it, or have only a few distinct values.
         n_levels = 1 + int(np.sum(np.diff(changes) > 0.1 * changes[0]))
         steps = changes / changes[0]
         is_whole = len(changes) >= _STEPS_NEEDED and (np.abs(steps - np.rint(steps)) < 0.1).all()
@@ -311,9 +311,9 @@ def still_runs(
     level = np.quantile(cells.variance[plausible], 0.1, axis=0)
     colour = spread_of_variances(cells, plausible, level)
     # A sensor that repeats one number does not show its noise; samples that toggle between two
-    # adjacent numbers have a variance of a quarter quantum squared. For white noise 1.3 times the
-    # tenth percentile of the variances is the mean variance with 60 samples per cell, and 0.9 of
-    # the mean variance with 32 samples per cell.
+    # adjacent numbers have a variance of a quarter quantum squared. For white noise and cells of
+    # 60 samples, 1.3 times the tenth percentile of the variances equals the mean variance; for
+    # cells of 32 samples, 0.9 times the mean variance.
     noise = np.maximum(1.3 * level * colour, 0.25 * cells.quantum**2)
     # A drift of d within a cell has a variance of d^2 / 12; twice this variance allows for noise.
     within = np.concatenate((drift[:1], (drift[1:] + drift[:-1]) / 2.0, drift[-1:]))
@@ -400,7 +400,7 @@ def _is_turning(cells: Cells) -> Bools:
 
 
 def _drift(cells: Cells, plausible: Bools) -> Floats:
-    """Return the drift from cell to cell: the median of nine steps of the mean, up to 50 ug/s."""
+    """Return the drift from cell to cell: the median of nine steps, at most 50 ug per second."""
     both = plausible[1:] & plausible[:-1] & (np.diff(cells.index) == 1)
     step = np.where(both[:, None], np.diff(cells.mean, axis=0), 0.0)
     half = _DRIFT_STEPS // 2

@@ -68,7 +68,7 @@ class BagPart:
         return max(self.begin or 0.0, self.end or 0.0) >= _FIRST_STAMP_S
 
     def limits_ns(self, first_ns: float) -> tuple[float, float]:
-        """Return begin and end as stamps; `first_ns`: stamp of the first sample, or infinity."""
+        """Return begin and end as stamps; `first_ns`: first stamp, infinity if not known."""
         origin = 0 if self.is_stamped else first_ns
         begin = -inf if self.begin is None else origin + round(self.begin * 1e9)
         return begin, inf if self.end is None else origin + round(self.end * 1e9)
@@ -99,7 +99,7 @@ class Topics:
     case: str = CASE.name
     further: Mapping[str, str] = field(default_factory=dict)
     part: BagPart = WHOLE
-    input: Input = 'auto'  # 'auto': counts if a topic has their name, else Imu, else counts
+    input: Input = 'auto'  # 'auto': counts by the topic's name, else Imu, else counts by type
 
     @classmethod
     def named(cls, names: Mapping[str, str], **others: Any) -> 'Topics':

@@ -95,7 +95,10 @@ def decode_blocks(
         if keep_raw and len(taken):
             raw[role] = taken.packed()
     imu = ImuColumns(*(samples[:, c] for c in _IMU_COLUMNS)) if is_imu else None
-    samples = np.ascontiguousarray(samples[:, _IMU_ACCELERATION]) if is_imu else samples
+    if imu is not None:
+        # A covariance with the first element -1 marks an acceleration that was not measured.
+        is_absent = imu.linear_acceleration_covariance[:, :1] == -1.0
+        samples = np.where(is_absent, np.nan, samples[:, _IMU_ACCELERATION])
     frame_id = frames[0].decode('utf-8', 'replace') if len(frames) else ''
     return [Block(samples_ns, samples, frame_id, imu, temperatures, log_ns, raw)]
 

@@ -206,8 +206,8 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
         value, sd = evaluate(calibration, program, at)[2:]
         off = value - np.outer(at - calibration.reference_temperature_c, slope)
         value[:, :3] += bias_0 / MICRO_G
-        # Bias, scale and deviations are rounded by the uncertainty without gravity if gravity has
-        # no stated sd; if the calibration states no uncertainty, the largest have 4 digits.
+        # If gravity has no stated sd, the digits of bias, scale and deviations follow from the
+        # other uncertainties; without any uncertainty, the largest value of a column has 4 digits.
         largest = np.maximum(np.abs(value).max(axis=0), 1e-3)
         four_digits = 10.0 ** (np.floor(np.log10(largest)) - 2.0)
         digits = np.where(known * sd > 0.0, known * sd, four_digits)

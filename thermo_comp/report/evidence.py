@@ -98,7 +98,7 @@ class Evidence:
     `windows`: windows at rest of all bags; `judgement`: judgement of `windows`; `steps`: residuals
     after each step of the model; `left_out`: for each position of `windows` its RMS of ``|f| - g``
     by a fit to the other positions [m/s^2]; `findings`: reservations about calibration or bags;
-    `checks`: passed checks; `gravity_sd`: sd of gravity included in the covariance [m/s^2].
+    `checks`: passed checks.
     """
 
     serial: str
@@ -112,7 +112,11 @@ class Evidence:
     findings: tuple[str, ...] = ()
     checks: tuple[str, ...] = ()
     history: tuple[Epoch, ...] = ()
-    gravity_sd: float = 0.0
+
+    @property
+    def gravity_sd(self) -> float:
+        """Sd of gravity that the covariance of the calibration includes [m/s^2]."""
+        return 0.0 if self.calibration is None else self.calibration.gravity_sd_m_s2
 
     @property
     def sources(self) -> tuple[Source, ...]:
@@ -281,8 +285,8 @@ def evidence_of_bags(
     )
 
 
-def evidence_of_fit(result: FitResult, gravity_sd: float = 0.0) -> Evidence:
-    """Return the evidence of a fit on its bags; `gravity_sd`: the fit's sd of gravity [m/s^2]."""
+def evidence_of_fit(result: FitResult) -> Evidence:
+    """Return the evidence of a fit on its bags."""
     rests = [(bag.source.name, rest.start_ns) for bag in result.bags for rest in bag.intervals]
     left_out = {(place.source, place.start_ns): place.left_out_rms for place in result.positions}
     window_s = usual_window(result.bags)
@@ -290,7 +294,6 @@ def evidence_of_fit(result: FitResult, gravity_sd: float = 0.0) -> Evidence:
     return replace(
         judged,
         steps=result.residuals,
-        gravity_sd=gravity_sd,
         left_out={k: left_out[at] for k, at in enumerate(rests) if left_out.get(at, 0.0) > 0.0},
         checks=tuple(note.message for note in result.findings if not _is_reservation(note)),
     )

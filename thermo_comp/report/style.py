@@ -229,7 +229,7 @@ def rounded(value: float, expanded: float) -> tuple[str, str]:
     if not 0.0 < expanded < math.inf:
         return number(value, 6), '–'
     place = 1 - math.floor(math.log10(expanded))
-    if round(expanded, place) >= 10.0 ** (2 - place):  # 0.0996 gives 0.100: print 0.10
+    if round(expanded, place) >= 10.0 ** (2 - place):  # 0.0996 rounds to 0.100: print 0.10
         place -= 1
     texts = (f'{round(x, place) + 0.0:.{max(place, 0)}f}' for x in (value, expanded))
     return minus(next(texts)), next(texts)

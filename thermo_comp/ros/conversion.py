@@ -9,6 +9,7 @@ final NUL, the string, and, at the next multiple of 8 from the end of the encaps
 values. A message in another form, such as big-endian, is first rewritten by rclpy.
 """
 
+import math
 import struct
 from collections.abc import Callable
 from contextlib import suppress
@@ -49,6 +50,7 @@ class Traffic:
     n_flags: int = 0  # regime flags published, one for each reading from which the regime follows
     n_fallback: int = 0  # samples that rclpy had to convert to plain CDR
     n_contested: int = 0  # messages dropped because more than one publisher may have sent them
+    n_absent: int = 0  # samples whose covariance marks the acceleration as not measured
 
 
 class SampleConverter:
@@ -70,7 +72,7 @@ class SampleConverter:
     ) -> bytes | None:
         """Compensate a sample; None for a sample that is unreadable or that `process` drops."""
         try:
-            encapsulation, sec, nanosec, name, x, y, z = self._unpack(data)
+            encapsulation, sec, nanosec, name, x, y, z, *claimed = self._unpack(data)
             is_known = name == self._name and encapsulation == _ENCAPSULATION
         except (struct.error, ValueError):
             is_known = False
@@ -79,7 +81,10 @@ class SampleConverter:
             if not data:
                 self.traffic.n_malformed += 1
                 return None
-            _, sec, nanosec, _, x, y, z = self._unpack(data)
+            _, sec, nanosec, _, x, y, z, *claimed = self._unpack(data)
+        if claimed and claimed[0] == -1.0:
+            x = y = z = math.nan
+            self.traffic.n_absent += 1
         result = process(sec * 1_000_000_000 + nanosec, x, y, z)
         if result is None:
             return None
@@ -102,8 +107,9 @@ class SampleConverter:
     def _learn(self, data: bytes) -> bytes:
         """Store a message's layout; return the message as plain CDR, b'' if it is unreadable."""
         is_imu = self._kind is Imu
-        skip, n_after = (_PASSED, 72) if is_imu else (0, 0)
-        size = skip + 24 + n_after
+        # An Imu ends with the covariance of its acceleration, of which the first element is read.
+        skip, n_read, n_after = (_PASSED, 4, 64) if is_imu else (0, 3, 0)
+        size = skip + 8 * n_read + n_after
         given, (data, start) = data, _plain(data, size, self._kind)
         if not start:
             return b''
@@ -112,7 +118,7 @@ class SampleConverter:
         end = 16 + int.from_bytes(data[12:16], 'little')
         # The padding after the frame name may hold any bytes.
         self._name, gap = data[12:end], start - end + skip
-        self._unpack = struct.Struct(f'<4siI{len(self._name)}s{gap}x3d{n_after}x').unpack
+        self._unpack = struct.Struct(f'<4siI{len(self._name)}s{gap}x{n_read}d{n_after}x').unpack
         frame = self._frame_id.encode() + b'\0' if self._frame_id else self._name[4:]
         self._frame = len(frame).to_bytes(4, 'little') + frame + bytes(-(12 + len(frame)) % 8)
         self._pack = struct.Struct(f'<4siI{len(self._frame)}s{_PASSED}s12d').pack

@@ -37,8 +37,8 @@ IDLE_S = 5.0
 AHEAD_S = 5.0
 #: Samples have stopped if none arrives for this number of conversion cycles and this time [s].
 SILENT_CYCLES, SILENT_S = 5.0, 0.5
-#: Time for which the level must be lower before this is logged [s], so that a fault that comes and
-#: goes does not fill the log.
+#: Time for which the level must be lower before a lower level is logged [s], so that a fault that
+#: comes and goes does not fill the log.
 RELIEF_S = 5.0
 #: Largest error of |f| at rest without a warning, in standard deviations of the error.
 GRAVITY_SIGMAS = 5.0
@@ -46,10 +46,15 @@ GRAVITY_SIGMAS = 5.0
 _ERROR, _WARN = DiagnosticStatus.ERROR[0], DiagnosticStatus.WARN[0]
 _DIRECTIONS = {-1: 'cooling', 0: 'none', 1: 'heating'}
 
-#: Level and text of a counter that has risen; the number follows the text.
+#: Level and text of a counter that has risen; the number follows the text. `topic`: the samples.
 _RISEN = {
     'n_contested': (_ERROR, 'messages of more than one publisher, dropped'),
     'n_failures': (_ERROR, 'callbacks failed, see the log of the node'),
+    'n_absent': (
+        _ERROR,
+        'messages of {topic} without an acceleration (linear_acceleration_covariance[0] = -1), '
+        'taken as not finite',
+    ),
     'n_stuck': (_ERROR, 'samples stuck or all zero, dropped'),
     'n_too_fast': (_ERROR, 'samples too fast for their conversion cycle, dropped'),
     'n_unsound': (_ERROR, 'samples without a finite correction, dropped'),
@@ -110,7 +115,9 @@ class Reporter:
             if passed_s > 0.0 and new['n_in'] and self._before['n_in']:
                 rate = new['n_in'] / passed_s
         self._before, self._before_ns = counts, status.stamp_ns
-        findings = [*self._findings(), *findings_of(loaded, status, new, rate, silence_s)]
+        topic = self._relay.samples.subscription.topic_name
+        findings = list(self._findings())
+        findings += findings_of(loaded, status, new, rate, silence_s, topic)
         # Vehicle accelerations give no warning: without nonlinearity in the calibration, warnings
         # begin at 2.01 g, where the unknown square term has an sd of 0.1 mg.
         allowance = 0.0 if loaded.calibration.nonlinearity else STANDARD_GRAVITY
@@ -297,6 +304,7 @@ def findings_of(
     new: dict[str, int],
     rate: float | None,
     silence_s: float,
+    topic: str = '',
 ) -> Iterator[Finding]:
     """Yield the problems of the inputs and of the correction."""
     unit, needs_board = loaded.calibration.unit, loaded.calibration.needs_temperature
@@ -311,7 +319,7 @@ def findings_of(
         yield _WARN, f'board temperature {status.board_age_s:.1f} s old, but still used'
     for name, (level, text) in _RISEN.items():
         if new[name]:
-            yield level, f'{text.format(full_scale=unit.full_scale)}: {new[name]}'
+            yield level, f'{text.format(full_scale=unit.full_scale, topic=topic)}: {new[name]}'
     for name, (fault, step) in status.faults.items():
         if fault in _FAULTS:
             yield _WARN, f'{name} temperature {_FAULTS[fault].format(step)}'

@@ -88,7 +88,7 @@ class LiveField:
 
 
 def live_field(node: Node, topic: str) -> LiveField | None:
-    """Return the field of ``TOPIC[:FIELD]``; None without publisher or given or implied FIELD."""
+    """Return the field of ``TOPIC[:FIELD]``; None without a publisher or a known field."""
     name, path = split_field(topic)
     name = node.resolve_topic_name(name)
     offers = node.get_publishers_info_by_topic(name)

@@ -137,7 +137,7 @@ class CompensationNode:
         try:
             after = self._relay.successor(loaded, model, config)
             self._run_with(after)
-            # rclpy refuses fixed parameters.
+            # rclpy refuses changes of fixed parameters.
             result = self.node.set_parameters_atomically(changes)
             if not result.successful:
                 raise parameters.ParameterError(result.reason)

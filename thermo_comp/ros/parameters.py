@@ -127,7 +127,7 @@ class NodeConfig:
     diagnostics_period: float = _parameter(1.0, 'Period of /diagnostics [s].', (0.01, 60.0))
 
     def compensator_config(self) -> CompensatorConfig:
-        """Build the compensator's settings, named like the parameters, with a unit at the end."""
+        """Build the compensator's settings, named as the parameters with a unit appended."""
         names = [field.name for field in fields(CompensatorConfig)]
         values = (getattr(self, name.removesuffix('_m_s2').removesuffix('_s')) for name in names)
         return CompensatorConfig(**dict(zip(names, values, strict=True)))

@@ -11,6 +11,7 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from itertools import groupby
 from operator import itemgetter
 
 from rclpy.executors import ExternalShutdownException
@@ -29,8 +30,10 @@ from .reader import LoadedCalibration
 from .rest_log import BLOCK, RestKeeper
 from .waitloop import RawSubscription, RCLError, WaitLoop
 
-#: While no samples come, a reading is used once another reading is stamped this much later [ns].
+#: Without samples, a reading is used once a reading arrives with a stamp later by this time [ns].
 IDLE_NS = 1_000_000_000
+
+_SECOND = slice(4, 8)  # bytes of a message in CDR: seconds of the stamp
 
 # A received temperature: time of reception [ns]; thermometer, stamp [ns], degC.
 _Reading = tuple[int, tuple[str, int, float]]
@@ -80,6 +83,7 @@ class Relay:
         self.rests = RestKeeper(config.rest_log) if config.rest_log else None
         #: Samples that the rest log has not summed yet, or None without a rest log.
         self.waiting: list[bytes] | None = [] if self.rests else None
+        self._second = b''  # seconds of the last stamp in `waiting`, as in the message
         self._readings: list[_Reading] = []
         self._newest_reading_ns: int | None = None
 
@@ -172,14 +176,9 @@ class Relay:
         self.traffic.n_contested += n_others
         if not messages:
             return
-        waiting = self.waiting
-        if waiting is not None:
-            waiting += messages
         if self._readings:
             messages = self._relay_with_readings(messages, received_ns)
         self._relay(messages)
-        if waiting is not None and len(waiting) >= BLOCK:
-            self.gather()
 
     def gather(self) -> None:
         """Sum the samples since the last call, for the rest log."""
@@ -218,7 +217,7 @@ class Relay:
                 self._readings.append((received, (name, *reading)))
 
     def _relay_with_readings(self, messages: list[bytes], received_ns: list[int]) -> list[bytes]:
-        """Relay samples and readings in order of arrival; return samples after the readings."""
+        """Relay samples and readings by arrival; return the samples after the last reading."""
         start, push = 0, self.running.compensator.push
         self._readings.sort(key=itemgetter(0))
         n = bisect_right(self._readings, received_ns[-1], key=itemgetter(0))
@@ -236,6 +235,18 @@ class Relay:
         return messages[start:]
 
     def _relay(self, messages: list[bytes]) -> None:
+        if self.waiting is None:
+            self._correct(messages)
+            return
+        # The rest log needs the thermal state at the end of each second of the stamps.
+        for second, run in groupby(messages, key=itemgetter(_SECOND)):
+            if second != self._second or len(self.waiting) >= BLOCK:
+                self.gather()
+            part, self._second = list(run), second
+            self._correct(part)
+            self.waiting += part
+
+    def _correct(self, messages: list[bytes]) -> None:
         compensator = self.running.compensator
         convert, process = self.running.converter.convert, compensator.process
         correct_rate = compensator.correct_rate if compensator.corrects_rate else None

@@ -215,12 +215,10 @@ def samples_of(messages: Sequence[bytes], *, is_imu: bool) -> tuple[Stamps, Floa
     is_plain = (rows[:, :4] == _PLAIN).all(axis=1)
     if not is_plain.all():
         rows = rows[is_plain]
-    at = size + (_FORCE if is_imu else _COUNTS)
-    samples = rows[:, at : at + 24].view('<f8')
+    samples = rows[:, _COUNTS:].view('<f8')
     if is_imu:
-        # Angular rate and the first element of its covariance, which is -1 if there is no rate.
-        rate = rows[:, size + _RATE : size + _RATE + 32].view('<f8')
-        if (rate[:, 3] != -1.0).all():
-            samples = np.hstack((samples, rate[:, :3]))
+        parts = [rows[:, size + at : size + at + 32].view('<f8') for at in (_FORCE, _RATE)]
+        # The first element of a covariance is -1 if force or rate was not measured.
+        samples = np.hstack([np.where(p[:, 3:] == -1.0, np.nan, p[:, :3]) for p in parts])
     seconds, rest = rows[:, 4:8].view('<i4')[:, 0], rows[:, 8:12].view('<u4')[:, 0]
     return seconds * np.int64(1_000_000_000) + rest, samples

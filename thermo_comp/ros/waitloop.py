@@ -39,7 +39,7 @@ OTHERS_PERIOD_NS = 20_000_000
 #: Largest number of messages taken at a time, so that a flood does not block the rest of the node.
 DRAIN_LIMIT = 4096
 
-#: A time that is never reached; a limit of waits, against overflow in the middleware [ns].
+#: A time that is never reached [ns]; longest wait [ns], as huge waits overflow in the middleware.
 _NEVER_NS, _LONGEST_WAIT_NS = 1 << 62, 3600 * 10**9
 
 #: Shortest time between two logged failures [ns].

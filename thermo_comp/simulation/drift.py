@@ -93,7 +93,7 @@ class FlowEffect(Effect):
     d is the deviation of `cold` from the reference state [K]. The exponent is 1.25 for convection
     in a gap, 1 for the load of a heat pump, 2 for the losses of a heat pump. If `is_limited`, like
     the supply of a heat pump, ``x ** exponent / (1 + x ** exponent)`` replaces ``x ** exponent``.
-    The second signal is the first signal times the deviation of `cold` [K].
+    The second signal is the first signal times d.
     """
 
     hot: str

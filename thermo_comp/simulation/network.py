@@ -108,7 +108,7 @@ class ThermalNetwork:
         return flow[:-1]
 
     def settled(self, air: float, power: Floats | None = None) -> Floats:
-        """Return the state after an endless soak, shape (k,); `power` replaces p in ``dx/dt``."""
+        """Return the steady state in air at `air` degC, (k,); `power` replaces p in ``dx/dt``."""
         A, b, p = self.system()
         drive = p if power is None else power
         state = np.linalg.solve(A, -b * air - drive)
@@ -121,7 +121,7 @@ class ThermalNetwork:
         return np.asarray(state, dtype=np.float64)
 
     def equilibrium(self, air: float) -> Floats:
-        """Return the temperatures [degC] of the parts after an endless soak, shape (n_parts,)."""
+        """Return the steady temperatures [degC] of the parts, shape (n_parts,)."""
         return self.settled(air)[: len(self.nodes)]
 
     def air_for(self, node: str, temperature: float) -> float:

@@ -220,7 +220,7 @@ _KINDS = {
     'thermostatted': (0, _thermostatted),
     'bare-quartz': (1, _bare_quartz),
     'mems': (2, _mems),
-    # benchmarks/triads.py uses the streams of random numbers 3 to 12.
+    # The random streams of the kinds 3 to 12 belong to the units of benchmarks/triads.py.
     'demo': (13, _demo),
 }
 UNIT_NAMES = tuple(_KINDS)

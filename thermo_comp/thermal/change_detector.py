@@ -114,7 +114,7 @@ class ChangeDetector:
         self._age_s += dt
         if not 0.95 * self._dt < dt < 1.05 * self._dt:
             self._tune(dt)
-        # A rate between the baseline and 0 is not a departure.
+        # A rate between 0 and the baseline (the rate in a soak) is not a departure.
         baseline, swing = self._baseline, self.swing + self._baseline_error
         high = baseline + swing if baseline > 0.0 else swing
         low = baseline - swing if baseline < 0.0 else -swing

@@ -69,7 +69,7 @@ class Lag(_Lag, Quantity):
     T_board less the temperature of a part that lags the board or, if `input` is a sensor, the
     lagged gradient of the sensor [K]. `tau_s` and `second_tau_s` are the time constants of two
     stages [s]; the second is shorter, or 0 for a lag of one stage. A part may lag a temperature
-    between board and sensor: that of the board plus `sensor_share` of the gradient of `sensor`.
+    between board and sensor: T_board plus `sensor_share` times the gradient of `sensor`.
     `lead_s`: lag of the board thermometer behind the temperature that drives the part [s].
     """
 

@@ -43,7 +43,7 @@ class LagBank:
         self.stamp_ns: int | None = None
         self.start_ns: int | None = None
         self.input = 0.0
-        #: Input less each lag [K], and its variance without that due to the initial state [K^2].
+        #: Input less each lag [K], and its variance for a known initial state [K^2].
         self.lagging = self.extra = [0.0] * len(self.taus)
 
     def step(self, stamp_ns: int, value: float, sd: float = 0.0) -> None:
@@ -82,7 +82,7 @@ class LagBank:
         self.extra = [variance + change * change for variance in self.extra]
 
     def at(self, stamp_ns: int, value: float) -> tuple[list[float], list[float]]:
-        """Return each ``u - L`` [K] at u = `value`, and its variance less the start variance."""
+        """Return each ``u - L`` [K] at u = `value`, and its variance for a known initial state."""
         seen_ns = self.stamp_ns
         if seen_ns is None or stamp_ns <= seen_ns or not self.taus:
             return self.lagging, self.extra
@@ -137,8 +137,8 @@ class ThermalMemory:
         self._needs_sensors = any(play.inputs != (BOARD_INPUT,) for play in spec.plays)
         self._widths = [play.width_k for play in spec.plays]
         self._held: list[float] = []
-        #: Largest rate of the board temperature within its lag after the start [K/s]; largest
-        #: rate less two sd, which `start_rate` is at least.
+        #: Rate of a ramp in which the unit may have been switched on [K/s], by the board's rate
+        #: shortly after the start; lower bound of this rate: largest (rate less two sd) so far.
         self.start_rate = self.sure_rate = 0.0
 
     def forget(self) -> None:
@@ -186,9 +186,9 @@ class ThermalMemory:
         still: Sequence[tuple[float, float]] = (),
     ) -> list[float]:
         """
-        Return each lag [K] and its variance without that due to the initial state [K^2], then
-        each play less its input [K]. `still`: for each input the possible error of constant
-        readings [K], and their duration [s]; empty if no input has constant readings.
+        Return each lag [K] and its variance for a known initial state [K^2], then each play less
+        its input [K]. `still`: for each input the possible error of constant readings [K], and
+        their duration [s]; empty if no input has constant readings.
         """
         behind, extra = self._first_order(stamp_ns, board, gradients)
         if still:
@@ -219,7 +219,7 @@ class ThermalMemory:
     def _first_order(
         self, stamp_ns: int, board: float, gradients: Sequence[float]
     ) -> tuple[list[float], list[float]]:
-        """Return each first-order lag [K], and its variance without the initial state's."""
+        """Return each first-order lag [K], and its variance for a known initial state [K^2]."""
         values, extra = self.board.at(stamp_ns, board)
         for name, gradient in zip(self.spec.sensors, gradients, strict=True):
             if (bank := self.banks[name]).taus:

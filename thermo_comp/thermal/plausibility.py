@@ -38,7 +38,7 @@ STILL_PROBABILITY: Final = 1e-9
 #: Number of equal readings in a row that are doubtful if the quantum is not far above the noise.
 DOUBTFUL_READINGS: Final = 4
 #: Constant readings of a sensor count as frozen if the other sensor's temperature changes by more
-#: than its noise, the quanta and a margin [K]; `BEYOND_CELL`: if quantum far exceeds noise.
+#: than noise, quanta and this margin [K]; the second margin is for a quantum far above the noise.
 OTHER_MOVED: Final = 0.3
 OTHER_MOVED_BEYOND_CELL: Final = 0.7
 #: Largest assumed error of a sensor with constant readings [K].
@@ -70,25 +70,25 @@ class Fault(Enum):
     NONE = 'none'
     #: Readings that have been equal for longer than noise explains: used with a growing variance.
     STILL = 'stands still'
-    #: Readings, not used, that stay equal while the other sensor's temperature changes.
+    #: Readings that stay equal while the other sensor's temperature changes: they are not used.
     FROZEN = 'frozen'
-    #: A reading, not used, that has changed faster than the temperature of any part can.
+    #: A reading that has changed faster than the temperature of any part can: it is not used.
     STEP = 'jumped'
     #: A board temperature that differs from the case's by more than ramp and self-heating explain,
     #: as with a loose thermometer: its readings are used, with a larger variance.
     LOOSE = 'apart'
-    #: Readings, used, since a jump that no part's temperature can make and that no jump back has
-    #: undone: their variance includes the square of the jump.
+    #: Readings after a jump that no part's temperature can make and that no jump back has undone:
+    #: they are used, with a variance that includes the square of the jump.
     SHIFTED = 'shifted'
-    #: Readings, used, that equal the board's, as if both inputs had one topic; the variance of the
-    #: gradient then includes the square of the gradient that is expected without the sensor.
+    #: Readings that equal the board's, as if both inputs had one topic: they are used, and the
+    #: variance of the gradient includes the square of the gradient expected without the sensor.
     COPY = 'copy of the board'
 
 
 class SensorCheck:
     """
     Judges readings of `sensor` by its earlier readings and by those of `other`; `lag_s`: lag of
-    the board behind `other` [s], 0 if `other` is the board; `is_revived`: `sensor` must restart.
+    the board behind `other` [s], 0 if `other` is the board; `is_revived`: restart the estimator.
     """
 
     def __init__(self, sensor: Thermometer, other: Thermometer, lag_s: float) -> None:

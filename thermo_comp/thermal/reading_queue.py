@@ -12,7 +12,8 @@ from .lags import BOARD_INPUT
 #: thermometer, order of arrival, temperature [degC].
 Entry = tuple[int, bool, str, int, float]
 
-#: Largest number of waiting readings; if more wait, readings and samples use different clocks.
+#: Largest number of waiting readings; if more wait, readings and samples use different clocks, or
+#: no samples come: only the newest half of the readings is then kept.
 PENDING_LIMIT: Final = 4096
 #: Largest backward step between consecutive stamps of one sensor [ns]; after a larger step the
 #: earlier readings are taken to be from another clock.
@@ -35,25 +36,26 @@ class ReadingQueue:
         """Stamp of the earliest waiting reading; `NEVER_NS` if none waits."""
         return self._entries[0][0] if self._entries else NEVER_NS
 
-    def push(self, name: str, stamp_ns: int, celsius: float) -> int:
-        """Add a reading; return how many were dropped: queue full, or stamps of another clock."""
-        n_before = len(self)
+    def push(self, name: str, stamp_ns: int, celsius: float) -> list[str]:
+        """Add a reading; return the names of readings dropped: queue full, or another clock."""
+        dropped = []
         last_ns, self._last_ns[name] = self._last_ns.get(name, -NEVER_NS), stamp_ns
         if stamp_ns < last_ns - DISORDER_NS:
             latest_ns = stamp_ns + DISORDER_NS
-            self.keep(lambda entry: entry[2] != name or entry[0] <= latest_ns)
-        n_dropped = n_before - len(self)
+            dropped += self.keep(lambda entry: entry[2] != name or entry[0] <= latest_ns)
         if len(self) >= PENDING_LIMIT:
-            return 1
+            oldest = self._n_pushed - PENDING_LIMIT // 2
+            dropped += self.keep(lambda entry: entry[3] >= oldest)
         entry = (stamp_ns, name != BOARD_INPUT, name, self._n_pushed, celsius)
         heapq.heappush(self._entries, entry)
         self._n_pushed += 1
-        return n_dropped
+        return dropped
 
-    def keep(self, is_kept: Callable[[Entry], bool]) -> None:
-        """Drop the readings for which `is_kept` is False."""
-        self._entries = [entry for entry in self._entries if is_kept(entry)]
+    def keep(self, is_kept: Callable[[Entry], bool]) -> list[str]:
+        """Drop the readings for which `is_kept` is False; return their thermometers."""
+        before, self._entries = self._entries, list(filter(is_kept, self._entries))
         heapq.heapify(self._entries)
+        return [entry[2] for entry in before if not is_kept(entry)]
 
     def due(self, stamp_ns: int) -> Iterator[Entry]:
         """Remove and return the readings up to a stamp, in order of stamps."""

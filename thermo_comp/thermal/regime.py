@@ -171,12 +171,12 @@ class _Watch:
             return False
         change = self.change
         # When the temperature ripples, the rate from the third-order filter of `Thermometer`
-        # overshoots, and that from the detector's filters does not.
+        # overshoots, but the rate from the detector's filters does not.
         rate = change.rate if change.is_following(stamp_ns) else sensor.rate
         sd, relaxed = sqrt(sensor.var_rate), self._relaxed
         stamp, self._stamp_ns = self._stamp_ns, stamp_ns
         if stamp is None or sd > relaxed:
-            self._mean = rate  # restart the mean rate while the rate is too uncertain
+            self._mean = rate  # the rate is too uncertain for a mean
         else:
             dt = (stamp_ns - stamp) * 1e-9
             self._mean += dt / (dt + self._memory_s) * (rate - self._mean)

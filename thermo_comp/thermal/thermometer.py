@@ -31,8 +31,8 @@ OUTLIER_LIMITS: Final = 5.0  # innovation / outlier limit, beyond which a readin
 RESTART_READINGS: Final = 4  # number of consecutive outliers of equal sign for a restart
 # Mean time in the quiet mode [s]; the mean time in the bending mode is the lag of the sensor.
 SOAK_S: Final = 900.0
-# Sd of the noise that drives the temperature's second derivative: quiet filter / bending filter.
-# `CELL_SHARE`: if the quantum is so large that noise alone never changes a reading.
+# Sd of the noise that drives the temperature's second derivative: quiet filter / bending filter;
+# `CELL_SHARE` is this ratio for a sensor whose readings never change by noise alone.
 QUIET_SHARE: Final = 5e-3
 CELL_SHARE: Final = 0.2
 _ROOT_HALF: Final = 0.7071067811865476  # 1 / sqrt(2)

@@ -63,7 +63,7 @@ class ThermalTracker:
         self._weight = 0.0
         self._weight_ns = 0
         self._target = 0.0
-        #: Last gradient in the static regime less board lag times board rate, by sensor [K].
+        #: Gradient of each sensor in the last static regime, less lag times rate of the board [K].
         self._rest_gradients: dict[str, float] = {}
         self._begin_watch()
         self.reconfigure(config or ThermalConfig(), board_lag_s, rest_gradient_range_k, None)
@@ -137,7 +137,7 @@ class ThermalTracker:
             memory.board_step(stamp_ns, board.temperature, error)
             age_s = (stamp_ns - (memory.board.start_ns or 0)) * 1e-9
             if age_s <= max(self._board_lag_s, board.settings.lag_s):
-                # Within a lag the rate of the board shows a ramp that began before the start.
+                # A ramp that began before the start is visible in the board's rate within its lag.
                 rate = abs(board.rate)
                 memory.sure_rate = max(memory.sure_rate, rate - 2.0 * sqrt(board.var_rate))
                 memory.start_rate = max(memory.sure_rate, rate)

@@ -184,6 +184,9 @@ class Calibration:
     unit: Unit
     reference_temperature_c: Annotated[Celsius, 'Reference temperature T_ref; paper: 20 degC.']
     gravity_m_s2: Annotated[float, QUANTITIES['gravity'], 'Local gravity used by the fit.']
+    gravity_sd_m_s2: Annotated[
+        float, QUANTITIES['deviation'], 'Sd of local gravity that `posterior` includes.'
+    ] = field(default=0.0, kw_only=True)
     axes: Axes
     static: Annotated[RegimeSet, 'Curves of the static regime (S = 0 in the paper).']
     dynamic: Annotated[RegimeSet, 'Curves of the dynamic regime (S = 1 in the paper).']
@@ -250,7 +253,7 @@ class Calibration:
         check_limits(self, parameter_layout(self))
         if self.gyroscope is not None:
             try:
-                rate_triad(self)  # apply a triad's rules to the gyroscope
+                rate_triad(self)  # the rules of an accelerometer triad apply
             except ValueError as error:
                 raise ValueError(str(error).replace('`', '`gyroscope.', 1)) from error
 

@@ -103,7 +103,7 @@ def _rename(data: dict[str, Any]) -> None:
 
 
 def dump_calibration(calibration: Calibration) -> str:
-    """Return a Calibration as YAML; CalibrationError if too large or if read back as another."""
+    """Return a Calibration as YAML; CalibrationError if too large or if not read back as equal."""
     content: str = yaml.dump(
         plain(calibration),
         Dumper=_Dumper,

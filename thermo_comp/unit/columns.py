@@ -9,9 +9,9 @@ dynamic regime. u is limited to the column's range, and t to the calibrated temp
 the calibrated temperatures t^power is constant, though the curves over temperature first follow
 tangents: no recording determines the weights of columns there.
 
-The function `bank` makes the columns in groups of one kind or more. The fit makes the group *part*
-from the kinds board, square and cube: the sum of these columns and of a curve over the board
-temperature is a curve over the temperature of a part.
+The function `bank` makes the columns in groups of one kind or more. The group *part* has columns
+of the kinds board, square and cube, whose sum with a curve over the board temperature is a curve
+over the temperature of a part.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -42,8 +42,8 @@ BANK_TAUS: Final = FINE_TAUS[::2]
 EVEN_WIDTHS: Final = (0.375, 0.75, 1.5, 3.0, 6.0)
 PLAY_WIDTHS: Final = (0.4, 0.8, 1.6, 3.2, 6.4)
 PLAY_TAUS: Final[tuple[float, ...]] = (0.0, 450.0, 900.0, 1800.0)
-#: Kind bend: time constants [s]; least span of board temperatures per knee (change of slope) [K];
-#: most knees per lag without and with the argument `parts` of `bank` (with: a third of the span).
+#: Kind bend: time constants [s]; least span of board temperatures per knee (change of slope) [K],
+#: or a third of it if `bank` gets `parts`; most knees per lag without and with `parts`.
 BEND_TAUS: Final = (0.0, *FINE_TAUS[4:11])
 LEAST_KNEE_K, MOST_KNEES, MOST_PART_KNEES = 1.0, 20, 60
 
@@ -303,7 +303,7 @@ class ColumnTable:
         return hold(raw, *self._range)
 
     def excess(self, raw: Floats) -> Floats:
-        """Return (1 + e)^(1 / n) - 1 for u of order n in T at e half ranges from its range."""
+        """Return how far each column is outside its range [half ranges], as if linear in T."""
         lower, upper = self._range
         excess = np.asarray(np.abs(raw - self.held(raw)) / ((upper - lower) / 2.0))
         for order in {*self._orders.tolist()} - {1}:

@@ -187,7 +187,7 @@ class Correction:
         noise_excess: npt.ArrayLike,
     ) -> Floats:
         """
-        Evaluate the correction in segments of 1 s, linear in time between the states at the ends.
+        Evaluate the correction in segments, linear in time between the states `start` and `end`.
 
         `slow` is the slowly varying error covariance, shape (n_slow, n), see
         `SlowUncertainty.at`. Returns (52,) or (52, n): for each axis bias, its change over the
@@ -254,14 +254,14 @@ class Correction:
         static_weight, beyond_range = 1.0 - weight, raw - held
         excess, _, relative, by_rate = self.curves.excess(states)
         if not self._has_lags:
-            # The rate's distance from its range counts only if no column has a lag.
+            # Lags contain the effect of the rate: its range counts only if no column has a lag.
             relative = relative + by_rate
         outside = static_weight * relative[0] + weight * relative[1]
         shares = np.array([static_weight + unknown * weight, weight + unknown * static_weight])
         variances = (shares * states[VAR_BOARD], states[self.layout.variances])
         by_source, direct = self.table.slopes(states)
         by_pair = self.by_pairs(by_source * factors[0])
-        # Derivative of the columns w.r.t. T_board, through t^power, gradients and lags.
+        # Columns depend on T_board by t^power, by gradients (T_s - T_board) and by lags.
         on_board = raw * factors[1]
         if direct is not None:
             on_board = on_board + direct * factors[0]

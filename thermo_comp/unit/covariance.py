@@ -80,7 +80,7 @@ class CovarianceMap:
 
 def grown(between: Floats, growth: Floats) -> Floats:
     """Increase the covariances `BETWEEN`, (36, n), by growth factors of axis variances, (3, n)."""
-    # The misalignment does not depend on the temperature, so its errors have the factor 1.
+    # The misalignment does not depend on the temperature, so its errors do not grow.
     roots = np.concatenate((np.repeat(np.sqrt(growth), 2, 0), np.ones_like(growth)))
     return np.asarray(between * roots[_FIRST] * roots[_SECOND])
 
@@ -88,7 +88,7 @@ def grown(between: Floats, growth: Floats) -> Floats:
 def rows_between(errors: Floats, misalignment_variances: Floats) -> Floats:
     """
     Return the rows `BETWEEN`, (36, n), of the covariance of u. `errors`, (9, p, n): u due to each
-    of p independent causes; `misalignment_variances`, (3,): variances due to further causes.
+    of p independent causes; `misalignment_variances`, (3,): further variances of M's elements.
     """
     # The sums do not use BLAS, whose results depend on the arrays' alignment.
     result = in_order(errors[_FIRST] * errors[_SECOND], 1)

@@ -18,9 +18,9 @@ class Curves:
     """
     Bias and scale of the static set (row 0) and the dynamic set over the board temperature.
 
-    Where only one set is within its range, the other set's curves run parallel to its curves.
-    Beyond both ranges the set whose range extends farther follows tangents for `TANGENT_SPANS`
-    times the width of its range, then is constant; the other set's curves run parallel.
+    Where only one set is within its range, the curves of the other set run parallel to it. Beyond
+    both ranges the set whose range extends farther follows tangents for `TANGENT_SPANS` times the
+    width of its range, then is constant; the curves of the other set run parallel to it.
     """
 
     def __init__(self, calibration: Calibration) -> None:
@@ -72,7 +72,7 @@ class Curves:
         return result
 
     def _evaluate(self, t: Floats, what: str = 'value') -> Floats:
-        """Evaluate curves or slopes of each regime at its row of t [K from T_ref], (2, n)."""
+        """Evaluate curves or slopes; row k of `t`, (2, n) [K from T_ref], is for regime k."""
         pairs = zip(self._rows, t, strict=True)
         return np.array([[getattr(function, what)(at) for function in row] for row, at in pairs])
 

@@ -85,15 +85,15 @@ class SlowUncertainty:
     def of_start(self, states: Floats, start_shares: Floats, rates: Floats) -> Floats:
         """
         Differentiate bias [input units] and scale [relative] w.r.t. the unknown initial lag
-        states, as variables of unit variance, shape (n_unknown, 6, n). `rates`: board
-        rate of a ramp at the start, (n,) [K/s].
+        states, as variables of unit variance, shape (n_unknown, 6, n). `rates`: assumed
+        rate of the board temperature at the start, as in a ramp, (n,) [K/s].
         """
         table = self._correction.table
         factors, _ = table.factors(states[BOARD], states[WEIGHT])
         by_pair = self._correction.by_pairs(table.slopes(states)[0] * factors)
         moved = by_pair[self._correction.layout.lag_pairs] * start_shares[:, np.newaxis]
-        # The unit may have been started in a ramp, long or new: the sd of each lag at the start is
-        # its value in a ramp of this rate, within the calibrated span.
+        # The unit may have been switched on in a ramp: the sd of a lag at the start is the lag in
+        # a ramp of this rate, limited to the calibrated span of temperatures.
         behind = hold(self._behind_s[:, :, np.newaxis] * rates, -self._span, self._span)
         in_ramp = in_order(moved * behind[:, :, np.newaxis], 1)
         by_root = in_order(self._root[:, :, np.newaxis, np.newaxis] * moved[:, np.newaxis], 0)

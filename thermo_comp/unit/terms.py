@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class Form(NamedTuple):
-    """A function of x and its derivative; the bits of each result depend on its own x only."""
+    """A function of x and its derivative; a result has the same bits in any array of x."""
 
     value: Callable[[Floats], Floats]
     slope: Callable[[Floats], Floats]
@@ -90,7 +90,7 @@ class Term:
         return (column.source.largest + abs(self.centre(column))) ** self.order
 
     def steepest(self, column: Column, raw: Floats, flow_k: float) -> float:
-        """Return the largest slope of a column's value u [1/K]; for bounded u 1 / RMS gradient."""
+        """Return the largest slope of u [1/K]; of bounded u, 1 / `flow_k`, the RMS gradient."""
         if self.bounds is not None:
             return 1.0 / flow_k
         largest = float(np.abs(raw).max(initial=0.0)) ** (1.0 / self.order)
@@ -112,7 +112,7 @@ def _lagged_gradient(column: Column) -> Quantity:
 
 
 def _part(column: Column) -> Quantity:
-    # A bend without lag is computed from the board temperature.
+    # A column of kind `bend` without lag is computed from the board temperature.
     return _lag_of_part(column) if column.tau_s else state.Board()
 
 
@@ -132,7 +132,7 @@ _ALL: Final = (
     # `board`: for a part that lags the board; `gradient_lag`: for a part between thermometers.
     Term('board', 'T_board - lagged T_board', _part, positive=('tau_s',)),
     Term('gradient_lag', 'lagged g_s', _lagged_gradient, positive=('tau_s',)),
-    # `square`: with a lag, a curve over a part's temperature; without, the square of a heat flow.
+    # `square` with a lag is for a curve over a part's temperature; q_s is a heat flow.
     Term(
         *('square', '(T_board - lagged T_board)^2, or q_s^2 without lag', _part_or_gradient),
         *(_SQUARE, 2, 'rest_k'),
