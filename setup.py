@@ -79,7 +79,7 @@ setup(
     entry_points={
         'console_scripts': [
             'thermo_comp = thermo_comp.__main__:main',
-            'thermo_comp_node = thermo_comp.ros.node:main',
+            'thermo_comp_node = thermo_comp.__main__:node',
         ]
     },
     zip_safe=True,

@@ -79,6 +79,11 @@ def test_evaluate_and_report_print_the_history(cli, tmp_path, monkeypatch):
     assert drawn['history'] == content['history']
     assert '2020-01-01' in page.read_text(encoding='utf-8')
     assert '<h2>History</h2>' not in render_report(evidence())
+    # WHY: the calibration of another unit was left out of the history without a message.
+    unit = replace(now.unit, serial='other')
+    save_calibration(replace(now, unit=unit), tmp_path / 'other.yaml')
+    refused = cli('report', *given, '-c', tmp_path / 'other.yaml', '-o', tmp_path / 'p', code=1)
+    assert 'other.yaml: unit.serial: must be ' in refused.stderr
 
 
 FACTS = (

@@ -113,6 +113,23 @@ def test_help_that_cannot_be_written_prints_no_traceback(sink, code):
 ABSENT = ('typer', 'rich', 'rosbags', 'mcap', 'zstandard', 'scipy', 'matplotlib')
 
 
+def test_node_and_commands_without_ros_end_with_advice(tmp_path, monkeypatch):
+    # ROS 2 for another version of Python, such as that of conda.
+    absent = 'rclpy._rclpy_pybind11'
+    (tmp_path / 'rclpy').mkdir()
+    text = f'raise ImportError("No module named {absent}\\nSee another page")\n'
+    (tmp_path / 'rclpy' / '__init__.py').write_text(text)
+    monkeypatch.setenv('PYTHONPATH', str(tmp_path))
+    finished = ran(sys.executable, '-c', 'from thermo_comp.__main__ import node; node()')
+    text = f'thermo_comp_node: error: No module named {absent}: source the setup file of ROS 2'
+    assert (finished.returncode, finished.stdout) == (1, '')
+    assert finished.stderr.startswith(text)
+    assert finished.stderr.count('\n') == 1
+    finished = ran(sys.executable, '-m', 'thermo_comp', 'play', 'bag')
+    assert (finished.returncode, finished.stdout) == (1, '')
+    assert f'cannot import (No module named {absent}): source the setup' in finished.stderr
+
+
 def test_the_node_needs_only_ros_numpy_and_yaml(unit, tmp_path, monkeypatch):
     # Python imports sitecustomize at its start, in the node and in its child processes.
     (tmp_path / 'sitecustomize.py').write_text(

@@ -11,6 +11,7 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..errors import CalibrationError
 from ..files import CALIBRATION, CSV, PAGE, check_output
 from ..unit.gravity import STANDARD_GRAVITY, ug_text
 from . import shared_options as options
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from ..field.update import Update
     from ..judging.evaluation import Drift
     from ..judging.judgement import Judgement
+    from ..unit.calibration import Calibration
 
 #: Exit code of an update that determines no axis, or is not clearly better on left-out days.
 NOTHING_GAINED = 3
@@ -225,6 +227,7 @@ def report(
     check_output(output, PAGE, overwrite=force, others=[*paths, *(calibration or [])])
     known = [load_calibration(path) for path in calibration or []]
     loaded = known[0] if known else None
+    _require_one_unit(calibration or [], known)
     info = None
     if certificate_info is not None:
         info = load_certificate_info(certificate_info, loaded.unit.serial if loaded else None)
@@ -245,6 +248,14 @@ def report(
         history=drifts_of(evidence.history),
         **(judgement.facts() if judgement else {}),
     )
+
+
+def _require_one_unit(paths: Sequence[Path], calibrations: 'Sequence[Calibration]') -> None:
+    for path, calibration in zip(paths, calibrations, strict=True):
+        first, serial = calibrations[0].unit.serial, calibration.unit.serial
+        if serial != first:
+            rule = f'must be {first!r}, as in the first calibration'
+            raise CalibrationError(f'unit.serial: {rule}, got {serial!r}', path)
 
 
 def update(

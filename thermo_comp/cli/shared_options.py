@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import wraps
-from importlib.util import find_spec
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
@@ -355,9 +355,12 @@ def acceleration(text: str | None, name: str) -> float | None:
 
 
 def require_ros() -> None:
-    """Raise ThermoCompError, with advice, if ROS is not installed."""
-    if find_spec('rclpy') is None:
+    """Raise ThermoCompError, with advice, if ROS cannot be imported by this interpreter."""
+    try:
+        import_module('rclpy')
+    except ImportError as error:
         raise ThermoCompError(
-            f'this command needs ROS 2, whose package rclpy is missing for {sys.executable}: '
-            "source the setup file of ROS 2, or pip install 'thermo_comp[ros]'"
-        )
+            f'this command needs ROS 2, which {sys.executable} cannot import '
+            f'({str(error).splitlines()[0]}): source the setup file of ROS 2 for this version of '
+            "Python, or pip install 'thermo_comp[ros]'"
+        ) from error

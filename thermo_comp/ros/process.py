@@ -33,9 +33,9 @@ def use_profile() -> None:
 
 class SignalWatch:
     """
-    Calls a stop function at the first signal; a second signal ends the process. A `SignalWatch`
-    must be used in the main thread. `os._exit` ends a process that still runs `ending_s` [s] after
-    the stop function has returned.
+    Calls a stop function at the first signal. A `SignalWatch` must be used in the main thread.
+    `os._exit` ends a process that still runs `ending_s` [s] after the stop function has returned;
+    without `ending_s`, a second signal ends the process.
     """
 
     # A separate thread calls the stop function, because the interpreter runs no signal handlers
@@ -75,9 +75,12 @@ class SignalWatch:
         if os.read(self._reader, 1):
             self._is_over = True
             self._stop()
-            if not select.select([self._reader], [], [], self._ending_s)[0]:
-                # The process has not ended by itself within `ending_s`.
-                os._exit(0)
-            number = os.read(self._reader, 1)
-            if number:
-                os._exit(128 + number[0])
+            # A launch without a terminal passes a signal of the process group on, as a second one.
+            while select.select([self._reader], [], [], self._ending_s)[0]:
+                number = os.read(self._reader, 1)
+                if not number:
+                    return
+                if self._ending_s is None:
+                    os._exit(128 + number[0])
+            # The process has not ended by itself within `ending_s`.
+            os._exit(0)
