@@ -301,8 +301,14 @@ def test_a_rest_has_the_temperature_at_its_own_time_at_any_speed_of_playing(tmp_
     folder, rate_k_s = tmp_path / 'rests', 0.02
     words = node_arguments(unit, f'rest_log:={folder}', 'diagnostics_period:=1.0')
     with node_in_thread(*words) as node:
-        send(drive(peer, node), standing(40 * RATE_HZ), rate_k_s=rate_k_s)
+        driver, samples = drive(peer, node), standing(40 * RATE_HZ)
+        send(driver, samples, rate_k_s=rate_k_s)
+        # Samples of two seconds that arrive again must not change a rest, nor fail.
+        send(driver, samples[-2 * RATE_HZ :], 38 * RATE_HZ, rate_k_s)
         peer.poll(lambda: len(logged(folder)) >= 3, 'three rests on the disk')
+        counters = node._relay.running.compensator.counters
+        peer.poll(lambda: counters.n_in >= 42 * RATE_HZ, 'the repeated samples')
+        assert node._loop.n_failures == 0
     for _, row in logged(folder):
         true = 21.0 + rate_k_s * (row.stamp_ns - START_NS) / SECOND_NS
         assert row.state[0] == pytest.approx(true, abs=rate_k_s)

@@ -157,14 +157,13 @@ class RestKeeper:
         # another calibration before a reload.
         self._use(loaded, compensator)
         stamps, samples = samples_of(messages, is_imu=loaded.calibration.unit.input != 'counts')
+        if len(stamps) and stamps[-1] < self._last_ns - _JUMP_NS:
+            self._last_ns = 0  # a new recording begins, with earlier stamps
+        before = np.maximum.accumulate(np.concatenate(([self._last_ns], stamps[:-1])))
+        samples, stamps = samples[stamps > before], stamps[stamps > before]
         if not len(stamps):
             return
-        if stamps[-1] < self._last_ns - _JUMP_NS:
-            self._last_ns = 0  # a new recording begins, with earlier stamps
-        if stamps[0] <= self._last_ns or (np.diff(stamps) <= 0).any():
-            before = np.maximum.accumulate(np.concatenate(([self._last_ns], stamps[:-1])))
-            samples, stamps = samples[stamps > before], stamps[stamps > before]
-        self._last_ns = int(stamps[-1]) if len(stamps) else self._last_ns
+        self._last_ns = int(stamps[-1])
         for rest in self._finder.add(stamps, samples):
             stamp_ns = rest.stamp_ns if rest.stamp_ns >= _EPOCH_NS else time.time_ns()
             self.log.put(stamp_ns, self._start, encode(replace(rest, stamp_ns=stamp_ns)))
