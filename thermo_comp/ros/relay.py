@@ -182,9 +182,11 @@ class Relay:
 
     def gather(self) -> None:
         """Sum the samples since the last call, for the rest log."""
-        if self.rests is not None and self.waiting:
-            messages, self.waiting = self.waiting, []
-            self.rests.gather(messages, self.running.loaded, self.running.compensator)
+        rests, waiting = self.rests, self.waiting
+        if rests is not None and waiting:
+            messages = waiting.copy()
+            waiting.clear()
+            rests.gather(messages, self.running.loaded, self.running.compensator)
 
     def advance_without_samples(self, silence_ns: int) -> None:
         """Use temperatures while no samples arrive, so that regime flags are still published."""
@@ -235,16 +237,17 @@ class Relay:
         return messages[start:]
 
     def _relay(self, messages: list[bytes]) -> None:
-        if self.waiting is None:
+        waiting = self.waiting
+        if waiting is None:
             self._correct(messages)
             return
         # The rest log needs the thermal state at the end of each second of the stamps.
         for second, run in groupby(messages, key=itemgetter(_SECOND)):
-            if second != self._second or len(self.waiting) >= BLOCK:
+            if second != self._second or len(waiting) >= BLOCK:
                 self.gather()
             part, self._second = list(run), second
             self._correct(part)
-            self.waiting += part
+            waiting += part
 
     def _correct(self, messages: list[bytes]) -> None:
         compensator = self.running.compensator
