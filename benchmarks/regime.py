@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 from regime_figures import plot_ramp
-from regime_runs import Job, Outcome, cost, ours, rng_of, run_ramps, run_soak, settings
+from regime_runs import Job, Outcome, cost, regime_flags, rng_of, run_ramps, run_soak, settings
 from regime_scenes import SENSORS, Scene, known_signature_delays, read, temperatures
 
 from thermo_comp.thermal.regime import Regime
@@ -178,7 +178,7 @@ def draw_ramp(seed: int, folder: Path) -> None:
     rng = rng_of(seed, 11, scene)
     t = np.arange(-2700.0, 10800.0)
     case, board = temperatures(scene, t, 3600.0, rng)
-    flag = ours(scene, read(case, scene, rng), read(board, scene, rng))
+    flag = regime_flags(scene, read(case, scene, rng), read(board, scene, rng))
     plot_ramp(t, case, board, flag == Regime.DYNAMIC, folder)
 
 

@@ -47,7 +47,7 @@ def rng_of(seed: int, purpose: int, scene: Scene) -> np.random.Generator:
     return np.random.default_rng([seed, purpose, *(round(1e6 * v) for v in vars(scene).values())])
 
 
-def ours(scene: Scene, case: Floats, board: Floats) -> npt.NDArray[np.int8]:
+def regime_flags(scene: Scene, case: Floats, board: Floats) -> npt.NDArray[np.int8]:
     """Return the flag of the detector at each reading: 1 dynamic, 0 static, -1 unknown."""
     detector_settings = settings(scene)
     case_thermometer = Thermometer(detector_settings.case)
@@ -96,7 +96,7 @@ def run_ramps(job: Job) -> tuple[Scene, Outcome]:
     flags: list[tuple[Floats, Bools]] = []
     for _ in range(n):
         case, board = temperatures(scene, t, duration, rng, RIPPLE_C if is_rippled else 0.0)
-        found = ours(scene, read(case, scene, rng), read(board, scene, rng))
+        found = regime_flags(scene, read(case, scene, rng), read(board, scene, rng))
         flags.append((t, found == Regime.DYNAMIC))
     return scene, judge(flags, duration)
 
@@ -107,7 +107,7 @@ def run_soak(job: tuple[Scene, float, int]) -> tuple[str, int, int, float]:
     rng = rng_of(seed, 7, scene)
     t = np.arange(0.0, 3600.0 * hours, 1.0 / scene.rate_hz)
     case, board = temperatures(scene, t, 0.0, rng)
-    flag = ours(scene, read(case, scene, rng), read(board, scene, rng))
+    flag = regime_flags(scene, read(case, scene, rng), read(board, scene, rng))
     known = flag[flag >= 0]
     switches = int(np.count_nonzero(np.diff(known)))
     return scene.sensor, int(np.count_nonzero(np.diff(known) == 1)), switches, len(known) / len(t)

@@ -238,10 +238,10 @@ def test_the_input_that_the_user_names_is_compensated(tmp_path):
 def test_a_topic_that_thermo_comp_wrote_is_refused_as_input(tmp_path):
     facts = {'corrected_by': 'thermo_comp 0.1'}
     path = driver_bag(tmp_path / 'bag', ('imu/data_raw', 'imu'), metadata=facts)
-    told = '/imu/data_raw is no input: thermo_comp wrote it'
-    with pytest.raises(RecordingError, match=told):
+    message = '/imu/data_raw is no input: thermo_comp wrote it'
+    with pytest.raises(RecordingError, match=message):
         open_recording(path, require=('accel',))
-    assert told in str(inspect_recording(path).chosen)
+    assert message in str(inspect_recording(path).chosen)
     with open_recording(path, Topics.named({'imu': 'imu/data_raw'}), require=('accel',)) as reader:
         assert reader.topics['accel'] == '/imu/data_raw'
 
@@ -250,8 +250,8 @@ def test_one_topic_for_two_inputs_is_refused_with_its_name(tmp_path):
     path = driver_bag(tmp_path / 'bag', ('accel/counts', 'vector'), ('imu/temperature', 'celsius'))
     for second in ('case', 'temperature/lid'):
         names = {'board': '/imu/temperature', second: 'imu/temperature'}
-        told = f'/imu/temperature: one topic for both board and {second.rpartition("/")[2]}: '
-        with pytest.raises(RecordingError, match=told):
+        message = f'/imu/temperature: one topic for both board and {second.rpartition("/")[2]}: '
+        with pytest.raises(RecordingError, match=message):
             open_recording(path, Topics.named(names), require=('accel',))
 
 

@@ -61,8 +61,9 @@ def convert(
     Without a map, convert guesses a map from the headings and prints the map; a
     table with the columns t ax ay az wx wy wz, in this order, or without t or
     wx wy wz, needs no headings. The board temperature of a PX4 or ArduPilot log
-    is the IMU's (if missing, the barometer's), the case temperature the barometer's;
-    in a bag the board thermometer is the one with most namespaces in common with the Imu.
+    is the IMU's (if missing, the barometer's), the case temperature the
+    barometer's; in a bag the board thermometer is the one with most namespaces in
+    common with the Imu.
 
     Example:
       thermo_comp convert log.csv --columns map.yaml -o unit42
@@ -182,9 +183,10 @@ def export(
     """
     Write a calibration as a file of another tool.
 
-    PX4 and ArduPilot keep the offset of each axis as a cubic of temperature; imu_tk (.calib),
-    imu_calib and Kalibr (YAML) keep bias, scale and misalignment at the reference temperature.
-    Parts of the calibration that the file lacks are listed, most with the resulting error.
+    PX4 and ArduPilot keep the offset of each axis as a cubic of temperature;
+    imu_tk (.calib), imu_calib and Kalibr (YAML) keep bias, scale and misalignment
+    at the reference temperature. Parts of the calibration that the file lacks are
+    listed, most with the resulting error.
 
     Example:
       thermo_comp export unit42.yaml --to px4 -o unit42.params
@@ -233,10 +235,11 @@ def import_(
     """
     Convert a file of another tool into a calibration.
 
-    Thermal parameters of PX4 and ArduPilot give the bias over temperature; the files of imu_tk,
-    imu_calib and Kalibr give bias, scale and misalignment. The static and the dynamic regime get
-    the same coefficients. The calibration corrects samples in the unit of the file: m/s^2 (node:
-    input:=imu), or counts. Parameters that the file lacks need a fit to bags of a thermal test.
+    Thermal parameters of PX4 and ArduPilot give the bias over temperature; the
+    files of imu_tk, imu_calib and Kalibr give bias, scale and misalignment. The
+    static and the dynamic regime get the same coefficients. The calibration
+    corrects samples in the unit of the file: m/s^2 (node: input:=imu), or counts.
+    Parameters that the file lacks need a fit to bags of a thermal test.
 
     Example:
       thermo_comp import autopilot.params --serial 42 -o unit42.yaml

@@ -278,8 +278,9 @@ def update(
     The calibration is the prior; the ageing since the fit is estimated from the
     rests, which may be in any attitude. Old and new calibration are compared on
     days left out of the update. The new calibration is written only if the rests
-    determine an axis and the mean decrease of (|f| - g)^2 on left-out days exceeds
-    its standard error; else the exit code is 3, and sds with ageing are printed.
+    determine an axis and the mean decrease of (|f| - g)^2 on left-out days
+    exceeds its standard error; else the exit code is 3, and sds with ageing are
+    printed.
 
     Example:
       thermo_comp update unit42.yaml rests -o unit42_new.yaml

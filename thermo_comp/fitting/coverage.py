@@ -97,7 +97,7 @@ def distinct_directions(up: Floats) -> Floats:
 
 
 def directions(means: Floats, centre: Floats) -> Floats:
-    """Return unit vectors from a centre to mean readings (n, 3); NaN for one at the centre."""
+    """Return unit vectors from a centre to mean readings (n, 3); NaN where both are equal."""
     norms = np.linalg.norm(means - centre, axis=1, keepdims=True)
     return np.asarray((means - centre) / np.where(norms > 0.0, norms, np.nan))
 

@@ -32,12 +32,12 @@ from .windows import Model, Sets
 
 
 def prior_columns(calibration: Calibration) -> tuple[Column, ...]:
-    """Return the response columns; FitError for a term of one regime only (format version 1)."""
+    """Return the response columns; FitError for a term that applies in one regime only."""
     for term in calibration.response:
         if term.during != 'always':
             raise FitError(
-                f'the prior has a thermal response for the {term.during} regime only, as in files '
-                'of format_version 1: fit the bags of the prior again, with this release'
+                f'the prior has a thermal response for the {term.during} regime only: fit the '
+                'bags of the prior again, with this release'
             )
     names = [field.name for field in fields(Column)]
     return tuple(

@@ -282,7 +282,11 @@ class Regression(Equations):
     _linearised: tuple[State, Layout, Floats, Tangent, Normal] | None = None
 
     def at(self, state: State, prior: Prior, grams: Floats | None = None) -> Point:
-        """Linearise about `state`, inactive weights 0; `grams`: see `Point`, None: all windows."""
+        """
+        Linearise about `state` with inactive weights set to 0.
+
+        `grams`: sums over windows, as in `Point`; None: over all windows.
+        """
         layout = self.layout(prior.column_sd > 0.0, prior.nonlinear_sd > 0.0)
         grams = self.products(layout.used).of_positions if grams is None else grams
         return Point(self, without_inactive(state, layout), prior, layout, grams)

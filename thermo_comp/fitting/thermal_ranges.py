@@ -58,7 +58,8 @@ def temperature_range(windows: ThermalWindows) -> Range:
 def soak_gradient(windows: ThermalWindows, earlier: Calibration | None) -> Range | None:
     """
     Return the gradient of the first sensor in soaks and its robust scatter [K], both by the prior
-    calibration `earlier` if it has them, else by the windows; None without the sensor or a soak.
+    calibration `earlier` if it has them, else by the windows; None if the bags have no such sensor
+    or no soak.
     """
     if earlier is not None and earlier.soak_gradient_k is not None:
         return earlier.soak_gradient_k
