@@ -37,7 +37,7 @@ def ratios_to_sd(seed, effect_sd):
     used = np.array(fitting_truth.GROUPS) != 'idle'
     missed = fitted.state.weights[0] - truth.on_bias * regression.rms
     places = fitted.layout.weights[0][:, used]
-    chosen = SimpleNamespace(posterior=fitted, informative=(), lacks_effects=True)
+    chosen = SimpleNamespace(posterior=fitted, informative=())
     covariances = fitted.covariance, claim_of(Fit(windows, regression, chosen)).covariance
     return [missed[:, used] / np.sqrt(np.diag(each)[places]) for each in covariances]
 

@@ -279,17 +279,6 @@ def test_the_contribution_of_a_group_is_the_rms_of_its_effect(calm):
     assert explains['bias', 'board'] == pytest.approx(expected, rel=0.05)
 
 
-@pytest.mark.parametrize('noise', [Noise(), Noise(4.0, 2000.0)])
-def test_noise_is_not_reported_as_an_effect_that_the_model_lacks(noise):
-    truth = Truth(noise=noise)
-    windows, up = table_of(truth, 12, np.random.default_rng(1))
-    _, chosen = selected_of(truth, without_starts(windows), up)
-    # An effect counts as missing if left-out data drift by over twice the noise.
-    assert not chosen.lacks_effects
-    calmer = replace(chosen.posterior.prior, sigma=0.3 * chosen.posterior.prior.sigma)
-    assert replace(chosen, posterior=replace(chosen.posterior, prior=calmer)).lacks_effects
-
-
 def test_outliers_do_not_shift_the_fit(calm):
     regression, calm_fit, truth = calm
     rng = np.random.default_rng(6)

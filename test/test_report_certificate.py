@@ -199,7 +199,7 @@ def test_without_a_stated_uncertainty_of_gravity_that_of_scale_factors_is_withhe
     assert 'withheld' not in page
     # WHY: gravity's sd was in all expanded uncertainties, but its line in the page was blank.
     assert re.search(r'Standard uncertainty of gravity<[^0-9]*2e-05 m/s²', page)
-    assert {source.name: source.standard for source in budget(stated, info)}['gravity'] == 0.0
+    assert {source.name: source.standard for source in budget(stated, info)}['gravity'] == 2e-5
 
 
 def float_of(cell):

@@ -81,8 +81,7 @@ def claim_of(fit: Fit, gravity_sd: float = 0.0, known_offset_sd: float = 0.0) ->
         fits = _fits(regression, posterior, priors, n_steps=3)
         mixture, _ = _mixture(posterior, fits, np.array([log_density(each) for each in fits]))
         covariance = covariance + _excess(mixture, posterior.covariance)
-    if fit.selected.lacks_effects:
-        covariance = covariance + _excess(_jackknifed(regression, posterior), covariance)
+    covariance = covariance + _excess(_jackknifed(regression, posterior), covariance)
     if turn_on_variance:
         # Derivatives of the unknowns by a bias offset on each axis that all positions share.
         point = regression.at(posterior.state, prior)

@@ -192,7 +192,8 @@ def lack_of_fit(fit: Fit, claim: Claim) -> tuple[tuple[LackOfFit, ...], tuple[La
     """Return the lack of fit in the static and the dynamic regime, at 0 to 5 temperatures each."""
     windows, regression, selected = fit[:3]
     prior, state, position = fit.posterior.prior, fit.posterior.state, windows.data.position
-    noise = prior.sigma**2 * (1.0 / regression.weight[:, None] + prior.noise.variance)
+    # Outliers have the noise of their samples: a small weight is no reason for a large error.
+    noise = prior.sigma**2 * (1.0 / windows.data.weight[:, None] + prior.noise.variance)
     claimed = drift_variance(regression, state, claim.layout, claim.covariance)
     excess = selected.score.drift**2 - noise - claimed
     near = [trial.posterior.state for trial in selected.trials if trial.is_near]

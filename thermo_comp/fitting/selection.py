@@ -73,13 +73,6 @@ class Selected:
     trials: tuple[Trial, ...]
     informative: tuple[InformativePrior, ...] = ()
 
-    @property
-    def lacks_effects(self) -> bool:
-        """Whether the left-out drift exceeds twice the noise of a window, white plus slow."""
-        prior = self.posterior.prior
-        noise = float(prior.sigma.mean() * np.sqrt(1.0 + prior.noise.variance))
-        return self.score.rms > 2.0 * noise
-
 
 class Fit(NamedTuple):
     """

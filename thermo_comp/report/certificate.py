@@ -111,7 +111,8 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
         by_element = np.stack((x * y, x * z, y * z)) * windows.gravity
         attitude = _rms(np.linalg.norm(by_element.T * calibration.misalignment_sd, axis=1))
         claimed = _rms(windows.claimed_sd)
-        model = float(np.sqrt(max(claimed**2 - noise**2 - attitude**2, 0.0)))
+        of_gravity = evidence.gravity_sd  # the claimed sd contains it
+        model = float(np.sqrt(max(claimed**2 - noise**2 - attitude**2 - of_gravity**2, 0.0)))
     excess = float(np.sqrt(max(judgement.headline_rms**2 - claimed**2, 0.0)))
     drift_k, drift, slope = info.thermometers.standard_uncertainty_k, None, ''
     if drift_k is not None:
@@ -119,15 +120,16 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
         slope = f'{drift_k:g} K times the RMS slope of the bias'
     seconds = f'white noise of a mean over {windows.window_s:g} s'
     beyond = 'RMS of |f| − g in excess of noise, attitude and model'
-    # The claimed sd already contains the uncertainty of gravity that was given to the fit.
     gravity = unclaimed_gravity_sd(evidence, info)
-    in_fit = 'given to the fit: included in the model' if evidence.gravity_sd else ''
+    if gravity is not None and calibration.has_uncertainty:
+        gravity = float(np.hypot(gravity, evidence.gravity_sd))
+    in_fit = 'given to the fit' if evidence.gravity_sd else ''
     return (
         Contribution('noise', 'A', noise, seconds),
         Contribution('gravity', 'B', gravity, info.gravity.source or in_fit),
         Contribution('attitude', 'A', attitude, 'uncertainty of the misalignment of the axes'),
         Contribution('thermometers', 'B', drift, slope),
-        Contribution('model', 'A', model, 'claimed sd of |f| in excess of noise and attitude'),
+        Contribution('model', 'A', model, 'claimed sd of |f| beyond noise, attitude, gravity'),
         Contribution('repeatability', 'A', excess, beyond),
     )
 
