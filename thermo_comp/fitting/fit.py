@@ -282,9 +282,8 @@ def _fit(
     findings += enforce(data_checks.judge_windows(windows, up, has_case, earlier), options)
     findings += raw_checks.judge_missing(bags, windows)
     progress(0.7)
-    fit = regressed(
-        windows, Problem(bags, options, start, up, progress, is_by_settled, has_pieces)
-    )
+    problem = Problem(bags, options, start, up, progress, is_by_settled, has_pieces)
+    fit = regressed(windows, problem)
     data_checks.check_scale(fit)
     selected, terms = choose(fit.regression, fit.selected, options)
     fit = fit._replace(selected=selected)

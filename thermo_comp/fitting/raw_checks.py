@@ -99,14 +99,7 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
         text = '; '.join(f'{axis.bag}: {axis.text}' for axis in dead)
         yield Finding('stuck', 'refusal', f'{text}: {_why_dead(bags, dead)}')
     size = float(np.median(np.linalg.norm(np.concatenate([rest.mean for rest in rests]), axis=1)))
-    full_scale = full_scale_of(bags, options)
-    if full_scale not in (options.full_scale, COUNTS_FULL_SCALE):
-        text = (
-            f'samples of {full_scale:.5g} {options.input} ({full_scale / size:.2g} times gravity) '
-            'or more on an axis will count as saturated, and will not be published: if the sensor '
-            'measures more, state its range with --full-scale'
-        )
-        yield advice('full-scale', text)
+    yield from _judge_full_scale(bags, size, options)
     yield from _judge_thermometers(bags)
     yield from _judge_units(bags, size, options)
     per_mg = 1e-3 * (STANDARD_GRAVITY if options.input == 'm/s^2' else size)
@@ -115,6 +108,20 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
         names = ', '.join(bag.source.name for bag in bags if bag.angular_rate != 'whole')
         text = f'{names}: not every sample has an angular rate, so no gyroscope was fitted'
         yield advice('rate', text)
+
+
+def _judge_full_scale(
+    bags: Sequence[ReducedBag], size: float, options: FitOptions
+) -> Iterator[Finding]:
+    """Report a full scale that is neither stated nor the default; `size`: median |reading|."""
+    full_scale = full_scale_of(bags, options)
+    if full_scale not in (options.full_scale, COUNTS_FULL_SCALE):
+        text = (
+            f'samples of {full_scale:.5g} {options.input} ({full_scale / size:.2g} times gravity) '
+            'or more on an axis will count as saturated, and will not be published: if the sensor '
+            'measures more, state its range with --full-scale'
+        )
+        yield advice('full-scale', text)
 
 
 def _rests(bags: Sequence[ReducedBag]) -> list[StillInterval]:
