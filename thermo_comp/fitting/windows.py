@@ -442,8 +442,10 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
     lengths_s = (float(np.median(np.diff(i.time))) for i in bag.intervals if len(i.time) > 1)
     step_s = max(min(lengths_s, default=1.0) / 5.0, 0.1)
     inputs = spec.inputs
-    # The filter of a thermometer needs more time for a reading than the tracker for a state.
-    bag, detector = averaged(bag, model.detector, inputs, 2.0 * step_s)
+    # The filter of a thermometer needs more time for a reading than the tracker for a state, so
+    # each mean is over two steps, unless a mean over more than 8 s would delay the dynamic regime.
+    mean_s = 2.0 * step_s if step_s <= 4.0 else step_s
+    bag, detector = averaged(bag, model.detector, inputs, mean_s)
     config = ThermalConfig()
     tracker = ThermalTracker(detector, spec, config)
     board, *others = tracker.thermometers.values()
