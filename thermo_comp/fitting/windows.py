@@ -455,7 +455,7 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
     reading = next(readings, None)
     for stamp_ns in range(begin_ns, max(bag.end_ns, begin_ns) + step_ns, step_ns):
         # As in the node, a state depends on all readings with a stamp up to that of the state. A
-        # mean has the mean stamp of its readings, so single readings may be half a step later.
+        # mean has the mean stamp of its readings, so single readings may be one step later.
         while reading is not None and reading[1] <= stamp_ns:
             tracker.read(*reading)
             reading = next(readings, None)
