@@ -4,6 +4,7 @@
 
 from dataclasses import replace
 from itertools import product
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from fitting_truth import (
 )
 
 from thermo_comp.fitting.claim import claim_of
-from thermo_comp.fitting.evidence import group_evidence
+from thermo_comp.fitting.evidence import group_evidence, lack_of_fit
 from thermo_comp.fitting.hyperparameters import downweigh, settle
 from thermo_comp.fitting.initialisation import STEEPEST
 from thermo_comp.fitting.left_out import is_better
@@ -427,3 +428,27 @@ def test_the_drift_of_scale_factors_determines_the_sd_of_turn_on_offsets():
     for errors in truth.errors(regression, posterior).values():
         # The RMS of three standard normal errors exceeds 2 with a probability of 0.7 %.
         assert np.sqrt(np.mean(errors**2)) < 2.0
+
+
+def test_windows_that_the_model_misses_count_in_the_lack_of_fit_in_spite_of_their_weight():
+    windows, up = table_of(Truth(), 12, np.random.default_rng(6), n_windows=60)
+    temperature = windows.columns[:, 0]
+    # A bump that no column describes, in the middle tenth of the temperatures.
+    low, high = np.quantile(temperature, (0.45, 0.55))
+    is_bump = (low <= temperature) & (temperature <= high)
+    bump = 100.0 * MICRO * is_bump[:, None]
+    regression, chosen = selected_of(
+        Truth(), replace(windows, mean=windows.mean + NOMINAL * bump), up
+    )
+    # WHY: the noise expected of a window of small weight was so large that it showed no excess.
+    assert np.median(regression.weight[is_bump]) < 0.1
+    table = SimpleNamespace(
+        data=regression.windows, temperature=temperature, is_dynamic=np.zeros_like(is_bump)
+    )
+    fit = Fit(table, regression, chosen)
+    points, _ = lack_of_fit(fit, claim_of(fit))
+    widest = np.max([point.sd_m_s2 for point in points], axis=0)
+    # The bump is in half of the windows of the middle of five bins: RMS 100 ug / sqrt(2) = 71 ug,
+    # of which the curve and the means of positions take up to a half.
+    assert (widest > 35.0 * MICRO).all()
+    assert (widest < 100.0 * MICRO).all()
