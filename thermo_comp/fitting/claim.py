@@ -35,7 +35,7 @@ from .hyperparameters import CLEAR_GAIN, log_density, log_student
 from .initial_triad import within_positions
 from .layout import Layout
 from .regression import PosteriorMode, Regression
-from .selection import Fit
+from .selection import LARGE_OFFSETS, Fit
 from .unknowns import Prior, State
 from .windows import CURVE, LAGS, PART
 
@@ -156,11 +156,10 @@ def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Fl
     # triads repeats to 10 ug at best between turn-ons, better between mountings of a turn-on.
     smallest_ratio = 0.01 if kind == 'mounting' else min(1e-4 / scale, 1.0)
     # `largest`: largest usual offset sd / `scale`, for mountings within a turn-on, for a single
-    # turn-on, and ('both') for several turn-ons or mountings that each begin with a turn-on. By
-    # data sheets, the bias repeats to 0.3 .. 1 mg over turn-ons of tactical triads and to some mg
-    # over turn-ons of MEMS: a ratio of 10 to 20. A bias that repeats perfectly has the ratio 0, so
-    # `largest` for turn-ons is between 0 and these ratios.
-    largest = {'mounting': 1.0, 'turn-on': 2.0, 'both': 5.0}[kind]
+    # turn-on, and ('both') for several turn-ons or mountings that each begin with a turn-on. A
+    # single turn-on shows no repeatability, and a bias that repeats perfectly has the ratio 0, so
+    # its value is between 0 and `LARGE_OFFSETS`.
+    largest = {'mounting': 1.0, 'turn-on': 2.0, 'both': LARGE_OFFSETS}[kind]
     # The log evidence is smooth over the grid's step, a third of a decade of the sd.
     ratio = 10.0 ** np.linspace(-3.45, 2.25, 19)
     small = np.minimum(np.log(ratio / smallest_ratio), 0.0)
