@@ -54,6 +54,26 @@ def test_the_claimed_sd_covers_effects_that_the_model_lacks(effect_sd):
         np.testing.assert_allclose(ratios[:, 0], ratios[:, 1], rtol=1e-6)
 
 
+def test_three_attitudes_determine_their_norms_as_well_as_mountings_repeat(rng):
+    # WHY: three attitudes do not separate bias and scale, which differed by percents between the
+    # fits of the mixture: the claimed sd of |f| was up to ten times that of the mountings' means.
+    kappa, bias = np.array([1.03, 0.97, 1.02]), np.array([0.3, -0.2, 0.5])
+    truth = fitting_truth.Truth(kappa, bias, offset_sd=2.0 * fitting_truth.MICRO)
+    up = np.repeat(np.eye(3) + 0.02 * rng.standard_normal((3, 3)), 4, axis=0)
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    windows, up = fitting_truth.table_of(truth, 12, rng, n_windows=24, up=up)
+    regression, state = fitting_truth.begin(fitting_truth.without_starts(windows), up)
+    prior = fitting_truth.prior_of(truth, offset_scale=truth.offset_sd)
+    fitted = regression.solve(state, prior, n_steps=10)
+    claim = claim_of(Fit(windows, regression, SimpleNamespace(posterior=fitted, informative=())))
+    along = regression.at(fitted.state, prior).norms_by_unit
+    variance = np.einsum('ij,jk,ik->i', along, claim.covariance, along)
+    # Four mountings per attitude; the fitted sd of mounting offsets has an error of 25 %. The
+    # drifts, which share the axes' scale factors, correlate the three means.
+    assert (0.7 * claim.offset_sd / 2.0 < np.sqrt(variance)).all()
+    assert (np.sqrt(variance) < 1.4 * claim.offset_sd / 2.0).all()
+
+
 def ratio(path):
     """Fit one log; return the jackknife's sd over its positions divided by the claimed sd."""
     accel = np.loadtxt(path, usecols=(0, 1, 2))

@@ -30,6 +30,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from ..typing import Floats, Ints
+from .elimination import inverse_root
 from .equations import as_vector
 from .hyperparameters import CLEAR_GAIN, log_density, log_student
 from .initial_triad import within_positions
@@ -79,7 +80,8 @@ def claim_of(fit: Fit, gravity_sd: float = 0.0, known_offset_sd: float = 0.0) ->
         # is of fits that assume different amounts of ageing.
         priors = [replace(prior, informative=each) for each in informative]
         fits = _fits(regression, posterior, priors, n_steps=3)
-        mixture, _ = _mixture(posterior, fits, np.array([log_density(each) for each in fits]))
+        log_weight = np.array([log_density(each) for each in fits])
+        mixture, _ = _mixture(regression, posterior, priors, log_weight)
         covariance = covariance + _excess(mixture, posterior.covariance)
     covariance = covariance + _excess(_jackknifed(regression, posterior), covariance)
     if turn_on_variance:
@@ -128,7 +130,7 @@ def _over_offsets(
         priors = [replace(posterior.prior, turn_on_sd=sd) for sd in values.tolist()]
         fits = _fits(regression, posterior, priors)
         evidence = np.array([fit.log_evidence for fit in fits])
-        mixture, weight = _mixture(posterior, fits, evidence + log_prior)
+        mixture, weight = _mixture(regression, posterior, priors, evidence + log_prior)
         variance = float(weight @ values**2)
         covariance = covariance + _excess(mixture, posterior.covariance)
         return covariance, float(np.hypot(offset_sd, variance**0.5)), 0.0
@@ -259,11 +261,8 @@ def _over_mountings(
     prior, mounting = posterior.prior, regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
 
-    def fits_with(offset_sd: Floats) -> list[PosteriorMode]:
-        priors = [replace(prior, offset_sd=sd) for sd in offset_sd.tolist()]
-        return _fits(regression, posterior, priors)
-
-    fits = fits_with(tried)
+    priors = [replace(prior, offset_sd=sd) for sd in tried.tolist()]
+    fits = _fits(regression, posterior, priors)
     # A large sd of mounting offsets lets attitudes absorb errors of the model, so the log evidence
     # of a fit rises: limit it to the rise of the log evidence of |f|, plus `CLEAR_GAIN`.
     of_data = np.array([fit.log_evidence for fit in fits])
@@ -273,8 +272,9 @@ def _over_mountings(
     evidence = np.minimum(of_data, of_norms + CLEAR_GAIN)
     if n_rests > 1.0:
         # The rests of a mounting share its offset: only mountings' means determine the offset sd.
-        fits, evidence = fits_with(n_rests**0.5 * tried), of_norms
-    covariance, weight = _mixture(posterior, fits, evidence + log_prior)
+        priors = [replace(prior, offset_sd=n_rests**0.5 * sd) for sd in tried.tolist()]
+        evidence = of_norms
+    covariance, weight = _mixture(regression, posterior, priors, evidence + log_prior)
     return covariance, float(np.sqrt(weight @ tried**2))
 
 
@@ -285,17 +285,23 @@ def _fits(
 
 
 def _mixture(
-    posterior: PosteriorMode, fits: Sequence[PosteriorMode], log_weight: Floats
+    regression: Regression, posterior: PosteriorMode, priors: Sequence[Prior], log_weight: Floats
 ) -> tuple[Floats, Floats]:
-    """Return the unit's covariance about the mode by a mixture of fits, and the fits' weights."""
+    """
+    Return the unit's covariance about the mode by a mixture over `priors`, and their weights.
+
+    The equations of all priors are linearised at the mode: bias and scale that the attitudes do
+    not separate change by percents from prior to prior, and the covariance at another point
+    would attribute a part of their large sds to directions that the data determine well.
+    """
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
     n = posterior.layout.n_unit
-    mode = as_vector(posterior.state, posterior.layout)[:n]
     covariance = np.zeros((n, n))
-    for share, fit in zip(weight, fits, strict=True):
-        difference = as_vector(fit.state, fit.layout)[:n] - mode
-        covariance += share * (fit.covariance + np.outer(difference, difference))
+    for share, prior in zip(weight, priors, strict=True):
+        step, factor = regression.at(posterior.state, prior).solution
+        root = inverse_root(factor)
+        covariance += share * (root @ root.T + np.outer(step[:n], step[:n]))
     return covariance, weight
 
 
