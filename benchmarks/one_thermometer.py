@@ -52,7 +52,7 @@ def without_case(bag: Path, target: Path) -> Path:
 
 
 def bags_of(unit: str, folder: Path) -> tuple[list[Path], list[Path]]:
-    """Return the bags of a fit and held-out bags; all but those of 'sample' are simulated."""
+    """Return bags of a fit and held-out bags; simulate them, except the bags of 'sample'."""
     if unit == 'sample':
         return sorted((ROOT / 'bags' / 'fit').glob('*.mcap')), [ROOT / 'bags' / 'held_out.mcap']
     common = ('simulate', '--unit', unit, '--rate-hz', RATE_HZ)

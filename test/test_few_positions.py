@@ -158,8 +158,8 @@ def test_after_soaks_in_one_position_the_drift_error_is_within_three_claimed_sd(
 
 @pytest.mark.slow
 def test_rests_at_three_temperatures_give_the_bias_slope_despite_a_warm_up_of_the_board(rng):
-    # WHY: while the board warmed up, the bias did not change. The fit found a bias slope of 0, and
-    # attributed differences of |f| between rests to mounting offsets.
+    # WHY: as the bias did not change while the board warmed up, the fit found a bias slope of 0,
+    # and attributed differences of |f| between rests to mounting offsets.
     bags = []
     for celsius in (5.0, 20.0, 35.0):
         for up in positions(8, 3):
@@ -175,7 +175,7 @@ def test_rests_at_three_temperatures_give_the_bias_slope_despite_a_warm_up_of_th
     np.testing.assert_allclose(slopes, 0.1 * MG * SLOPE, atol=0.002 * MG)
     assert 'misfit' not in findings_of(result)
     # Soaks do not determine the weights of lags, which can be as large as the bias slope: the
-    # claimed sd of these weights is 0.5 to 1 times the bias slope.
+    # root of the sum of their claimed variances is 0.5 to 1 bias slope.
     variance, layout = np.diag(calibration.posterior.covariance()), parameter_layout(calibration)
     of_lags = [variance[block.response : block.end].sum() for block in layout.bias]
     assert 0.5 < np.sqrt(np.mean(of_lags) / np.mean(slopes**2)) < 1.0

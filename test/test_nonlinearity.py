@@ -103,7 +103,7 @@ def test_a_nonlinearity_without_terms_does_not_change_a_bit(rng):
 
 
 def test_the_variance_of_a_nonlinear_axis_includes_all_parameters(rng):
-    # For a term |f| f the claimed variance exceeds the exact variance: the unit has no such term.
+    # The unit has no term |f| f, for which the claimed variance exceeds the exact variance.
     unit = calibration(nonlinearity=replace(BENT, terms=(SQUARE, CUBE)))
     unit = with_covariance(unit, rng)
     layout, correction = parameter_layout(unit), Correction(unit)

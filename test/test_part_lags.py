@@ -98,7 +98,7 @@ def test_lags_of_parts_coupled_to_board_and_case_are_fitted():
     parts = {term.part for term in calibration.response if term.kind == 'board'}
     assert {part.second_tau_s for part in parts} == {0.0}
     taus, _, shares, leads = np.array(sorted(parts)).T
-    # Ramps determine time constants to 1 %, and the share of T_case in a part's input to 0.01.
+    # Ramps determine time constants to 1 %, and the share of T_case in what parts lag to 0.01.
     assert taus == pytest.approx(unit.part_s, rel=0.02)
     assert shares == pytest.approx(case_share, abs=0.02)
     assert not leads.any()

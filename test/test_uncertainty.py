@@ -86,7 +86,7 @@ def test_if_the_case_sensor_is_lost_the_gradient_is_its_last_value_at_rest():
         if second < 1500:
             compensator.push('case', stamp, 19.0 + 2e-3 * (second % 5))
         corrected.append(compensator.process(stamp, 300.0, 300.0, 2943.0 + second % 2))
-    # An error of the gradient of 0.1 K is 3 counts, or 0.01 m/s^2 at 300 counts per m/s^2.
+    # 0.1 K of gradient error at 30 counts/K is 3 counts: 0.01 m/s^2 at 300 counts per m/s^2.
     assert corrected[-1][0] == pytest.approx(corrected[1499][0], abs=0.01)
 
 

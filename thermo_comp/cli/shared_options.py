@@ -295,7 +295,7 @@ def force(
 def fitting(
     where: dict[str, float] = site,
     model: Literal['response', 'golovach'] = option(
-        'response: coefficients for soaks and ramps, and thermal response; golovach: no response.',
+        'response: curves for soaks and ramps, and a thermal response; golovach: curves alone.',
         'response',
         metavar='MODEL',
     ),

@@ -32,8 +32,8 @@ from .table import STAMP_EXPONENTS, Format, Stamp, Table, TimeUnit, read_parquet
 _CELSIUS = {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}
 #: Range of plausible intervals between samples [s], which decides the unit of the times.
 _STEPS_S = (5e-5, 0.5)
-#: If the unit turns by over `_TURN` [rad] between two still blocks (`_BLOCK` samples, sd below
-#: `_QUIET` [g]), intervals in ms would be too short for a hand: up to `_SLOW_S` [s] are plausible.
+#: Longest plausible interval [s] if the unit turns by over `_TURN` [rad] between two still blocks
+#: (`_BLOCK` samples, sd below `_QUIET` [g]): with times in ms no hand could turn it so fast.
 _SLOW_S, _BLOCK, _TURN, _QUIET = 2.0, 12, 0.5, 0.02
 _FASTEST_RAD_S = 20.0  # largest angular rate of a unit that is turned by hand [rad/s]
 #: Stamps of the years 2000 to 2038, and their largest interval [s]. A time since power-up in us,
@@ -311,7 +311,7 @@ def _span(values: Floats) -> float:
 def _stamp(
     named: Headings, times: Floats | None, rate_hz: float | None, accel: Floats, span: float
 ) -> Stamp:
-    """Guess the unit of times by heading or values; `span`: range of temperatures [K]."""
+    """Guess the unit of times by heading or values; `span` [K] bounds the duration."""
     if times is None:
         return Stamp(rate_hz=rate_hz)
     column = f'its column {named.time!r}'

@@ -88,7 +88,7 @@ def _shortened(quantity: Lag | Play) -> tuple[Any, ...]:
 
 
 def decode(content: bytes) -> tuple[list[tuple[Start, Rest]], int]:
-    """Return the rests of a file, each with the node's start, and the number of damaged lines."""
+    """Return a file's rests, each with the start of the node, and the number of damaged lines."""
     rests: list[tuple[Start, Rest]] = []
     start: Start | None = None
     n_damaged = 0

@@ -4,10 +4,11 @@
 Owns rests as measurements of the error of a calibration: ``|f| - g`` and its derivatives.
 
 A rest at an unknown attitude measures one number, |f|. Let x be the forces along the axes, f = M
-x, u = f / |f| and v = M^T u. A bias of axis i that is too large by d_bias [input units], and a
-scale too large by d_scale [of K_i], change |f| by ``-v_i (d_bias + K_i x_i d_scale) /
-scale_i``, scale_i: scale factor at the rest. To first order ``|f| - g`` is noise plus H times the
-errors of all parameters (true less calibrated); H: derivatives of |f| by these errors.
+x and u = f / |f|. A bias of axis i that is too large by d_bias [input units], and a scale too
+large by d_scale [of K_i], change |f| by ``-(M^T u)_i (d_bias + K_i x_i d_scale) / scale_i``,
+x_i: force along axis i, scale_i: scale factor at the rest. To first order ``|f| - g`` is noise
+plus H times the errors of all parameters (true less calibrated); H: derivatives of |f| by these
+errors.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ def build_calibration(
     """Make a fit's calibration; its valid ranges include those of the prior `earlier`."""
     (windows, regression, *_), posterior = fit, fit.posterior
     model, prior, state, layout = windows.model, posterior.prior, posterior.state, claim.layout
-    # The response columns that have rows in the covariance; their weights may be 0.
+    # Response columns whose weights have rows in the covariance; a weight may be 0.
     used = _of_columns(windows, np.any(layout.weights[:, 0] >= 0, axis=0))
     kinds = tuple(term.kind for term in nonlinearity.terms) if nonlinearity else ()
     to_file = file_jacobian(regression, layout, state, model, used, kinds)
@@ -320,7 +320,7 @@ def file_jacobian(
         for places in layout.nonlinear:
             rows += [*unknown[places[at]], *unknown[places[[len(all_kinds) + k for k in at]]]]
     a, _, c = state.misalignment
-    # With a, b, c from the inverse of M: M[1][0] = -a, M[2][0] = a c - b, M[2][1] = -c.
+    # a, b, c below the diagonal of M^-1 give M[1][0] = -a, M[2][0] = a c - b, M[2][1] = -c.
     of_a, of_b, of_c = unknown[layout.misalignment]
     return np.array([*rows, -of_a, c * of_a - of_b + a * of_c, -of_c])
 

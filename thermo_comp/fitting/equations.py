@@ -227,7 +227,7 @@ class Equations(Series):
         return np.asarray(along @ np.linalg.inv(state.inverse).T)
 
     def weight_sd(self, prior: Prior) -> Floats:
-        """Return the prior sd of the weights of each axis, shape (2, 3, m)."""
+        """Return the prior sd of weights by bias and scale, axis, and column, (2, 3, m)."""
         return np.asarray(prior.column_sd[:, None] * self.windows.share)
 
     def precision(self, prior: Prior, layout: Layout) -> Floats:

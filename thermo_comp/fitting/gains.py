@@ -67,7 +67,7 @@ class Inactive:
     def gain(self, column_sd: Floats, wanted: Bools) -> float:
         """
         Return the gain in log evidence, at least 0, if the columns in the mask `wanted`, (m,), are
-        added: ``(Q (1 + S)^-1 Q - log det(1 + S)) / 2``, for weights divided by their prior sds. A
+        added: ``(Q (1 + S)^-1 Q - log det(1 + S)) / 2``, S, Q of weights in their prior sds. A
         prior sd is `column_sd`, (2, m), times the factor of largest gain (`_SQUARED_FACTORS`).
         """
         S, Q, _ = self._in_prior_sd(column_sd, wanted)

@@ -96,7 +96,7 @@ class Layout:
 
     @cached_property
     def of_bag(self) -> Ints:
-        """Indices of the unknowns of each bag, shape (n_bags, r + 3) or (n_bags, r)."""
+        """Indices of r lag states and 3 or 0 turn-on offsets of each bag, (n_bags, r + 3 or r)."""
         return np.hstack((self.start, self.turn_on))
 
     @cached_property

@@ -140,7 +140,7 @@ class Score:
 
     @property
     def kinds(self) -> tuple[Folds, Folds, Folds]:
-        """The left-out errors of each kind of folds."""
+        """The errors of left-out positions, of left-out sections, and of |f|."""
         return self.positions, self.sections, self.norms
 
     @property

@@ -263,7 +263,7 @@ def averaged(
     """
     Average readings over steps of time if there are at least two per step, as from IMU drivers.
 
-    Return the bag with the means as readings, and the settings with the noise of a mean.
+    Return the bag with mean readings, and the settings with the noise of a mean reading.
     `inputs`: the thermometers, the board's first; all others have the settings of the case's.
     """
     temperatures = {**bag.temperatures}

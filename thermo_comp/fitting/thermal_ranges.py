@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns ranges of temperatures, rates and gradients in a fit's data, the lag of the board, and the
-error of an axis at temperatures at which no position had gravity along this axis.
+error of an axis at temperatures at which gravity acted along this axis in no position.
 
 A scale factor has an effect on the readings only if gravity acts along its axis. A recording in
 one attitude at new temperatures extends the temperature range of the calibration, but determines

@@ -321,7 +321,7 @@ class State:
 
     @property
     def from_pose(self) -> Floats:
-        """Rotation of k attitudes from their poses, along the tangents of the pose, (k, 2)."""
+        """Deviation of k attitudes from their poses along `pose_tangents` [rad], (k, 2)."""
         posed = self.pose_of[self.pose_of >= 0]
         change = self.up[self.pose_of >= 0] - self.pose[posed]
         return np.asarray(np.einsum('pi,pij->pj', change, self.pose_tangents[posed]))

@@ -48,7 +48,7 @@ class Spread(NamedTuple):
     values: Floats
     is_counted: Bools
     middle: float
-    sd: float  # 1.4826 times the median absolute deviation; of logarithms, also times `middle`
+    sd: float  # 1.4826 median |deviation|; times `middle` if deviations are of logarithms
     z: Floats
     limit: float = float('inf')  # smallest |z| of an outlier; infinite below eight units
 

@@ -186,7 +186,7 @@ class _Cursor:
         elif content[0] in _KINDS:
             self._leap(1, int(_KINDS[content[0]][1:]))
         else:
-            raise RecordingError(f'a {content[0]} field before the number is not supported')
+            raise RecordingError(f'a {content[0]} field before the wanted number is not supported')
 
     def enter(self, description: Any, place: int) -> Any:
         """Advance to an element of an array or a sequence; return the element's description."""

@@ -60,8 +60,8 @@ PLAN_NAMES = (
     *('chamber-18', 'chamber-9', 'tumble-3', 'tumble-1', 'tumble', 'held-out'),
     *('centrifuge', 'rate-table'),
 )
-# Times of runs through several rotation rates [s]: ends of the soaks with a run; time from a run's
-# start to the end of its soak; duration of each rate; duration of a change of the rate.
+# A run through several rotation rates begins `_LEAD_S` before each of `_SOAK_ENDS_S`; each rate
+# lasts `_DWELL_S`, each change of the rate `_RAMP_S` [s].
 _SOAK_ENDS_S, _LEAD_S, _DWELL_S, _RAMP_S = (3600.0, 8100.0, 13500.0), 1800.0, 300.0, 60.0
 # Radius [m] and rotation rates [rad/s] of the simulated centrifuge (1 m, 2 to 10 g horizontally)
 # and of the simulated rate table (0.25 m, up to 1000 deg/s).

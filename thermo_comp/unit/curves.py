@@ -77,7 +77,7 @@ class Curves:
         return np.array([[getattr(function, what)(at) for function in row] for row, at in pairs])
 
     def _beyond(self, t: Floats) -> tuple[Floats, Floats]:
-        """Return how far t is below and above the ranges, up to the tangents' ends [K], (2, n)."""
+        """Return how far t is below and above the ranges, at most the tangents [K], (2, n)."""
         (lower, upper), (below, above) = self._ends, self._reaches
         return hold(t - lower, -below, 0.0), hold(t - upper, 0.0, above)
 

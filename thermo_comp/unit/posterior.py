@@ -101,7 +101,7 @@ class Block(NamedTuple):
 def lay_out(
     pairs: Iterable[tuple[TemperatureFunction, TemperatureFunction]], n_columns: int
 ) -> list[Block]:
-    """Return the indices of the parameters of each pair of a static and a dynamic curve."""
+    """Return parameter indices of each bias or scale, a static and a dynamic curve."""
     blocks = [Block(0, 0, 0, 0)]
     for static, dynamic in pairs:
         begin = blocks[-1].end
