@@ -90,7 +90,7 @@ def made(residual, raw, claimed, n=40, dynamic=10, outside=0):
         mean=constant * K, board=np.full(n, 20.0), rate=np.zeros(n), is_dynamic=rows < dynamic,
         is_inside=rows >= outside, is_swapped=np.zeros(n, bool), raw=constant, force=force,
         size=np.full(n, GRAVITY), claimed_sd=np.full(n, claimed * MICRO_G), noise_sd=np.zeros(n),
-        gyro=np.zeros((n, 0)),
+        lack_sd=np.zeros(n), gyro=np.zeros((n, 0)),
     )  # fmt: skip
 
 

@@ -23,15 +23,19 @@ from thermo_comp.report.certificate import (
     results,
     table_temperatures,
 )
+from thermo_comp.report.evidence import evidence_of_bags
 from thermo_comp.report.page import render_report
 from thermo_comp.report.statements import CertificateInfo, load_certificate_info
 from thermo_comp.report.style import rounded
+from thermo_comp.unit.calibration import LackOfFit
 from thermo_comp.unit.calibration_file import dump_calibration, parse_calibration, save_calibration
 from thermo_comp.unit.gravity import MICRO_G
 from thermo_comp.unit.prediction import in_a_soak
 
 pytestmark = pytest.mark.usefixtures('equal_fits_once', 'no_figures')
 
+#: The row of the budget for the error on data left out of the fit.
+LACK = 'lack of fit (left-out data)'
 LAB = """
 number: 2026-017
 laboratory: {name: Inertial Lab, address: 1 Street, accreditation: L-1}
@@ -154,10 +158,10 @@ def test_the_uncertainty_budget_adds_up_to_the_claimed_sd(tmp_path):
     standards = {source.name: source.standard for source in budget(evidence(), CertificateInfo())}
     assert standards['gravity'] is None
     assert standards['thermometers'] is None
-    # The claimed sd is the root sum square of `noise`, `attitude` and `model`.
+    # The claimed sd is the root sum square of four rows.
     windows = evidence().judgement.windows
     claim = float(np.sqrt(np.mean(windows.claimed_sd[windows.is_inside] ** 2)))
-    parts = [standards[name] for name in ('noise', 'attitude', 'model')]
+    parts = [standards[name] for name in ('noise', 'attitude', LACK, 'model')]
     assert float(np.linalg.norm(parts)) == pytest.approx(claim)
     # The residual is below the claimed sd.
     assert standards['repeatability'] == 0.0
@@ -168,6 +172,34 @@ def test_the_uncertainty_budget_adds_up_to_the_claimed_sd(tmp_path):
     assert by_name['gravity'] == 2e-5
     expected = math.hypot(claim, 2e-5, by_name['thermometers'])
     assert combined(stated) == pytest.approx(expected)
+
+
+def test_the_lack_of_fit_is_a_row_of_the_budget_and_not_part_of_the_model():
+    # WHY: the budget did not name the lack of fit, which the row `model` contained.
+    def with_lack(*sds):
+        points = [LackOfFit(c, (sd,) * 3) for c, sd in zip((15.0, 30.0), sds, strict=True)]
+        sets = [
+            replace(part, lack_of_fit=tuple(points)) for part in fitted().calibration.regime_sets()
+        ]
+        unit = replace(fitted().calibration, static=sets[0], dynamic=sets[1])
+        judged = evidence_of_bags(fitted().bags, unit, serial='')
+        lines = budget(judged, CertificateInfo())
+        return judged.judgement.windows, {line.name: line.standard for line in lines}, lines
+
+    _, without, _ = with_lack(0.0, 0.0)
+    assert without[LACK] == 0.0
+    windows, standards, lines = with_lack(1e-3, 2e-3)
+    # The variance of the lack of fit is linear between 15 and 30 degC, and equal on all axes.
+    variance = 1e-6 + 3e-6 * np.clip((windows.board - 15.0) / 15.0, 0.0, 1.0)
+    # In the first five minutes of a bag the regime may be unknown: both sets count.
+    known = windows.time > 300.0
+    np.testing.assert_allclose(windows.lack_sd[known] ** 2, variance[known], rtol=0.01)
+    assert (windows.lack_sd**2 / variance).max() == pytest.approx(2.0, rel=0.01)
+    lack = float(np.sqrt(np.mean(windows.lack_sd[windows.is_inside] ** 2)))
+    assert standards[LACK] == pytest.approx(lack)
+    assert standards['model'] == pytest.approx(without['model'], rel=0.005)
+    claim = float(np.sqrt(np.mean(windows.claimed_sd[windows.is_inside] ** 2)))
+    assert combined(lines) == pytest.approx(claim)
 
 
 def test_a_residual_above_the_claimed_sd_is_listed_as_repeatability():

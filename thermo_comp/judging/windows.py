@@ -20,7 +20,7 @@ from ..fitting.sensors import readings_in_order
 from ..online.checks import variance_along
 from ..online.compensator import Compensator
 from ..online.status import CompensatorConfig
-from ..thermal.state import BOARD, RATE, WEIGHT, StateLayout
+from ..thermal.state import BOARD, RATE, UNKNOWN, WEIGHT, StateLayout
 from ..typing import Bools, Floats, Ints, Stamps
 from ..unit.calibration import AXES, Calibration
 from ..unit.correction import Correction
@@ -50,8 +50,9 @@ class JudgedWindows:
     temperature. `raw` is the specific force with the constants at the reference temperature,
     `force` with the calibration, shapes (n, 3). `size`: the known |f|, which is gravity unless the
     bag states another value. `claimed_sd`: sd of ``|force| - size`` due to the calibration, `size`
-    and white noise of the mean; `noise_sd`: sd due to the white noise alone. Rows of `gyro`: raw
-    and corrected angular rate, claimed variances, thermal state; empty without a gyroscope.
+    and white noise of the mean; `noise_sd`, `lack_sd`: sd due to the white noise alone, and due to
+    the lack of fit alone. Rows of `gyro`: raw and corrected angular rate, claimed variances,
+    thermal state; empty without a gyroscope.
     """
 
     window_s: float
@@ -72,6 +73,7 @@ class JudgedWindows:
     size: Floats
     claimed_sd: Floats
     noise_sd: Floats
+    lack_sd: Floats
     gyro: Floats
 
     def __len__(self) -> int:
@@ -124,13 +126,14 @@ def corrected_windows(
         gravity = calibration.gravity_m_s2 if gravity is None else gravity
     gravity = np.nan if gravity is None else gravity
     table = _table(bags, calibration, window_s, gravity)
-    raw, claimed_sd, noise_sd = table['mean'], *np.full((2, len(table)), np.nan)
+    raw, claimed_sd, noise_sd, lack_sd = table['mean'], *np.full((3, len(table)), np.nan)
     is_inside = table['excess'] <= _RANGE_TOLERANCE
     if calibration is not None:
         constants, force = constants_of(calibration), table['force']
+        correction = Correction(calibration)
         raw = constants.force(raw)
         along = force / np.linalg.norm(force, axis=1, keepdims=True) @ constants.misalignment
-        noise = along**2 @ np.array(Correction(calibration).noise)
+        noise = along**2 @ np.array(correction.noise)
         # A mean has no rounding noise: the converter adds the remainder to the next sample.
         white = along**2 @ np.square(calibration.noise_density_m_s2_sqrt_hz)
         # A higher sample rate increases the noise of a sample: the mean's noise does not decrease.
@@ -139,6 +142,11 @@ def corrected_windows(
         variance = np.maximum(table['variance'] - noise, 0.0) + mean_white
         claimed_sd = np.sqrt(variance + table['size_sd'] ** 2)
         noise_sd = np.sqrt(mean_white)
+        regimes = np.array([1.0 - table['weight'], table['weight']])
+        # In an unknown regime the claimed variance includes the lack of fit of both sets.
+        shares = (regimes + table['unknown'] * regimes[::-1])[:, np.newaxis]
+        lack = (shares * correction.curves.lack_of_fit(table['board'])).sum(axis=0)
+        lack_sd = np.sqrt(np.sum(along**2 * lack.T, axis=1))
         known = calibration.nonlinearity
         is_inside &= table['size'] <= (known.force_range_m_s2[1] if known else AT_REST * gravity)
     return JudgedWindows(
@@ -150,6 +158,7 @@ def corrected_windows(
         raw=raw,
         claimed_sd=claimed_sd,
         noise_sd=noise_sd,
+        lack_sd=lack_sd,
         **{
             name: table[name]
             for name in (*_ONCE, 'time', 'board', 'rate', 'size', *_TRIPLES, 'gyro')
@@ -184,7 +193,10 @@ _Table: TypeAlias = npt.NDArray[Any]
 # Integer fields of a window: `count` is the total of the partial sums, the rest is copied from the
 # first partial sum. Fields in `_AVERAGED` and `_TRIPLES` are means over a window's partial sums.
 _ONCE = ('bag', 'position', 'start_ns', 'count')
-_AVERAGED = ('time', 'board', 'rate', 'weight', 'variance', 'swapped', 'size', 'size_sd')
+_AVERAGED = (
+    *('time', 'board', 'rate', 'weight', 'unknown'),
+    *('variance', 'swapped', 'size', 'size_sd'),
+)
 _TRIPLES = ('mean', 'force')
 
 
@@ -283,7 +295,8 @@ def _correct(calibration: Calibration, bag: ReducedBag, sums: _Table) -> None:
         row['variance'] = variance_along(corrected[:3], corrected[3:])
         row['excess'] = thermal.correction.excess(state, is_dynamic=False).relative
         row['swapped'] = thermal.tracker.lead.is_reversed
-        row['board'], row['rate'], row['weight'] = state[BOARD], state[RATE], state[WEIGHT]
+        row['board'], row['rate'] = state[BOARD], state[RATE]
+        row['weight'], row['unknown'] = state[WEIGHT], state[UNKNOWN]
         if compensator.corrects_rate:
             row['gyro'][3:9] = compensator.correct_rate(stamp_ns, *row['gyro'][:3])
             row['gyro'][9:] = thermal.tracker.sample(stamp_ns)

@@ -103,7 +103,7 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
         return ()
     windows = judgement.windows.select(judgement.windows.is_inside)
     noise = _rms(windows.noise_sd)
-    attitude = model = None
+    attitude = lack = model = None
     claimed = noise
     if calibration.has_uncertainty:
         x, y, z = (windows.force / np.linalg.norm(windows.force, axis=1, keepdims=True)).T
@@ -112,14 +112,16 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
         attitude = _rms(np.linalg.norm(by_element.T * calibration.misalignment_sd, axis=1))
         claimed = _rms(windows.claimed_sd)
         of_gravity = evidence.gravity_sd  # the claimed sd contains it
-        model = float(np.sqrt(max(claimed**2 - noise**2 - attitude**2 - of_gravity**2, 0.0)))
+        lack = _rms(windows.lack_sd)
+        known = noise**2 + attitude**2 + lack**2 + of_gravity**2
+        model = float(np.sqrt(max(claimed**2 - known, 0.0)))
     excess = float(np.sqrt(max(judgement.headline_rms**2 - claimed**2, 0.0)))
     drift_k, drift, slope = info.thermometers.standard_uncertainty_k, None, ''
     if drift_k is not None:
         drift = drift_k * _slope(calibration)
         slope = f'{drift_k:g} K times the RMS slope of the bias'
     seconds = f'white noise of a mean over {windows.window_s:g} s'
-    beyond = 'RMS of |f| − g in excess of noise, attitude and model'
+    left_out = 'error on data left out of the fit, beyond noise and the sd of the parameters'
     gravity = unclaimed_gravity_sd(evidence, info)
     if gravity is not None and calibration.has_uncertainty:
         gravity = float(np.hypot(gravity, evidence.gravity_sd))
@@ -129,8 +131,9 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
         Contribution('gravity', 'B', gravity, info.gravity.source or in_fit),
         Contribution('attitude', 'A', attitude, 'uncertainty of the misalignment of the axes'),
         Contribution('thermometers', 'B', drift, slope),
-        Contribution('model', 'A', model, 'claimed sd of |f| beyond noise, attitude, gravity'),
-        Contribution('repeatability', 'A', excess, beyond),
+        Contribution('lack of fit (left-out data)', 'A', lack, left_out),
+        Contribution('model', 'A', model, 'rest of the claimed sd of |f|'),
+        Contribution('repeatability', 'A', excess, 'RMS of |f| − g beyond the claimed sd'),
     )
 
 
