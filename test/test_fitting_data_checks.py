@@ -168,7 +168,7 @@ def test_geometry_is_the_largest_sd_of_nine_parameters_per_sd_of_the_norm(rng):
 def judged(raw, fitted, slow, left=None, span=30.0, drift=500.0, noise=0.1, sigma=0.1, **options):
     steps = [
         residual_statistics(np.full(0 if rms is None else 9, (rms or 0.0) * MICRO_G))
-        for rms in (raw, raw, raw, fitted, left)
+        for rms in (raw, raw, raw, fitted, left, left)
     ]
     prior = Parts(sigma=sigma * MICRO_G, informative=None)
     fit = Parts(
@@ -193,7 +193,7 @@ def test_only_a_residual_that_no_initial_lag_state_explains_contradicts_the_prio
 def test_the_residual_of_the_fit_is_reported():
     good = judged(100.0, 1.0, 0.2, 1.5)
     assert set(good) == {'residual'}
-    assert '100.0 ug RMS raw, 1.5 ug on data left out, 1.0 ug' in good['residual'].message
+    assert 'raw, 1.0 ug in sample; error on data left out 1.5 ug' in good['residual'].message
     # Without left-out positions the message has no residual of left-out data.
     assert 'left out' not in judged(100.0, 1.0, 0.2)['residual'].message
 

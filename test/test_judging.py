@@ -4,11 +4,13 @@
 
 import csv
 import dataclasses
+import json
 
 import numpy as np
 import pytest
 from builders import GRAVITY, axis_set, calibration, equal_axes, regime_set
 
+from thermo_comp.cli.output import micro_g
 from thermo_comp.errors import RecordingError
 from thermo_comp.fitting.sources import digest
 from thermo_comp.judging.evaluation import evaluate
@@ -266,6 +268,31 @@ class TestVerdict:
         assert limited.verdict == 'recalibrate'
         assert '300 ug RMS on positions left out, limit 100 ug' in limited.reason
         assert judge(windows, unit, 100.0 * MICRO_G).verdict == 'valid'
+
+    def test_the_error_found_stands_beside_that_on_data_left_out_of_the_fit(self, cli, tmp_path):
+        # 2 counts on z are an error of 2 / 300 m/s^2 = 680 ug; without noise there is no drift.
+        bag = resting(tmp_path / 'bag.mcap', 25.0, error=2.0)
+        path = tmp_path / 'it.yaml'
+        for norm, drift, rows in (
+            (500.0, 40.0, ['|f| - g 680 500 {}', 'drift of an axis 0.0 40.0 -']),
+            (None, 40.0, ['|f| - g 680 - {}', 'drift of an axis 0.0 40.0 -']),
+            (None, None, []),
+        ):
+            known = [value and value * MICRO_G for value in (norm, drift)]
+            fitted = ResidualSummary('all', 40, 1e-3, 5e-4, 1e-3, *known)
+            provenance = Provenance(residuals=(fitted,))
+            unit = dataclasses.replace(corrected_by(SLOPE, 0.01), provenance=provenance)
+            save_calibration(unit, path, overwrite=True)
+            claimed = judged(bag, unit).sections['all'].claimed_rms
+            printed = cli('evaluate', bag, '-c', path).stdout
+            lines = [' '.join(line.split()) for line in printed.splitlines()]
+            first = lines.index('RMS in ug found expected claimed sd') + 1 if rows else 0
+            right = [row.format(micro_g(claimed)) for row in rows]
+            assert lines[first : first + len(rows)] == right
+            facts = json.loads(cli('evaluate', bag, '-c', path, '--json').stdout)
+            expected = facts['expectations_m_s2']
+            assert [expected[key]['expected_rms'] for key in ('norm', 'drift')] == known
+            assert expected['norm']['claimed_rms'] == claimed
 
     def test_a_bag_of_the_fit_is_recognised_by_its_hash(self, tmp_path):
         bag = resting(tmp_path / 'bag', 25.0)

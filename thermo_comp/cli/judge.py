@@ -89,6 +89,7 @@ def evaluate(
     drifts = drifts_of(history_of([model for _, model in models]))
     print_sections(out, result.judgements)
     _print_axes(out, judged)
+    _print_expectations(out, judged)
     _print_levels(out, judged)
     rates = {k: judged.rate for k, judged in result.judgements.items() if judged.rate is not None}
     if rows := _sections(rates, millidegrees):
@@ -124,6 +125,21 @@ def _print_axes(out: Output, judged: 'Judgement') -> None:
         row += [micro_g(shift.bias), micro_g(shift.bias_sd)]
         row += [micro(1e6 * shift.scale), micro(1e6 * shift.scale_sd)]
     out.table(columns, axes, title=title)
+
+
+def _print_expectations(out: Output, judged: 'Judgement') -> None:
+    """Print the errors beside those on data left out of the fit, if the file has any of these."""
+    names = {'norm': '|f| - g', 'drift': 'drift of an axis'}
+    parts = {names[key]: part for key, part in judged.expectations.items()}
+    if any(isfinite(part.expected_rms) for part in parts.values()):
+        out.table(
+            ('RMS in ug', 'found', 'expected', 'claimed sd'),
+            [
+                (name, *map(micro_g, (part.found_rms, part.expected_rms, part.claimed_rms)))
+                for name, part in parts.items()
+            ],
+            title='errors within the calibrated ranges; expected: on data left out of the fit',
+        )
 
 
 def _print_levels(out: Output, judged: 'Judgement') -> None:

@@ -194,6 +194,7 @@ def _provenance(
                 rms_m_s2=row.fitted.rms,
                 max_m_s2=row.fitted.peak,
                 left_out_rms_m_s2=row.left_out.rms if is_norm and row.left_out.n else None,
+                left_out_drift_m_s2=row.left_out_drift.rms if row.left_out_drift.n else None,
             )
             for row in residuals
             if row.fitted.n

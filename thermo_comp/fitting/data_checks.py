@@ -356,8 +356,8 @@ def judge_result(
     raw, fitted, left_out = (
         row.rms / MICRO_G for row in (overall.raw, overall.fitted, overall.left_out)
     )
-    others = f'{left_out:.1f} ug on data left out, ' if overall.left_out.n else ''
-    text = f'|f| - g: {raw:.1f} ug RMS raw, {others}{fitted:.1f} ug in sample'
+    others = f'; error on data left out {left_out:.1f} ug' if overall.left_out.n else ''
+    text = f'|f| - g: {raw:.1f} ug RMS raw, {fitted:.1f} ug in sample{others}'
     is_slow = slow / MICRO_G > max(0.3 * raw, 0.5 * fitted)
     # Noise explains a residual of up to twice the white noise.
     if span > 0.0 and is_slow and overall.fitted.rms > 2.0 * noise:

@@ -70,6 +70,7 @@ class ResidualRow:
     two_sets: corrected with a curve for each regime
     fitted: corrected with the calibration, in sample
     left_out: corrected by fits without the position; drift if such a fit does not determine |f|
+    left_out_drift: drift of an axis by fits without the position or section (`Score.drift`)
     """
 
     section: str
@@ -78,6 +79,7 @@ class ResidualRow:
     two_sets: ResidualStatistics
     fitted: ResidualStatistics
     left_out: ResidualStatistics
+    left_out_drift: ResidualStatistics
 
 
 def residual_rows(fit: Fit) -> tuple[tuple[ResidualRow, ...], Floats, Floats]:
@@ -99,7 +101,8 @@ def residual_rows(fit: Fit) -> tuple[tuple[ResidualRow, ...], Floats, Floats]:
     left_out = np.where(np.isfinite(norm), norm, drift)
     if not windows.model.sets.is_shared:
         residuals[1] = np.full_like(left_out, np.nan)
-    tables = [statistics_by_regime(each, windows.is_dynamic) for each in (*residuals, left_out)]
+    shown = *residuals, left_out, drift
+    tables = [statistics_by_regime(each, windows.is_dynamic) for each in shown]
     rows = (ResidualRow(section, *(table[section] for table in tables)) for section in tables[0])
     return tuple(rows), residuals[-1], left_out
 

@@ -16,6 +16,7 @@ from ..typing import Floats
 from ..unit.calibration import Calibration
 from ..unit.gravity import MICRO_G, ug_text
 from ..unit.metrics import means_by
+from ..unit.provenance import Provenance
 from . import verdicts
 from .verdicts import Section, Sections, Verdict
 from .windows import JudgedWindows
@@ -42,6 +43,15 @@ class AxisShift:
 
 
 @dataclass(frozen=True)
+class Expectation:
+    """RMS error of windows and on data left out of the fit, RMS claimed sd [m/s^2], or NaN."""
+
+    found_rms: float
+    expected_rms: float
+    claimed_rms: float = np.nan
+
+
+@dataclass(frozen=True)
 class Judgement:
     """
     The judgement of a calibration on recordings: the verdict, and a sentence with its numbers.
@@ -49,7 +59,8 @@ class Judgement:
     `left_out_rms` is the fit's RMS on positions left out, NaN if the bags are not those of the
     fit; `tolerance` is the user's limit on the RMS [m/s^2]. `shifts`: shift of bias and scale of
     each axis, empty with fewer than six distinct positions; `moved`: text of each significant
-    shift; `axis_rms`: RMS drift by regime and axis; `rate`: judgement of the gyroscope.
+    shift; `axis_rms`: RMS drift by regime and axis; `rate`: judgement of the gyroscope;
+    `expectations`: |f| - g and drift of an axis (`norm`, `drift`) within the calibrated ranges.
     """
 
     kind: Verdict
@@ -63,6 +74,7 @@ class Judgement:
     n_positions: int
     windows: JudgedWindows
     rate: verdicts.RateJudgement | None
+    expectations: dict[str, Expectation]
     by_force: dict[float, Section] = field(default_factory=dict)
 
     @property
@@ -103,6 +115,7 @@ class Judgement:
             'window_s': self.windows.window_s,
             'tolerance_m_s2': self.tolerance,
             'left_out_rms_m_s2': self.left_out_rms,
+            'expectations_m_s2': self.expectations,
             'sections_m_s2': self.sections.facts(),
             'n_positions': self.n_positions,
             'moved': self.moved,
@@ -144,10 +157,24 @@ def judge(
         n_positions=distinct_positions(windows),
         windows=windows,
         rate=verdicts.judge_rates(windows.select(windows.is_usual), calibration),
+        expectations=_expectations(windows, sections['all'], calibration.provenance),
         by_force=verdicts.by_force(windows, claimed),
     )
     kind, reason = _verdict(judgement, claims, calibration)
     return replace(judgement, kind=kind, reason=reason)
+
+
+def _expectations(
+    windows: JudgedWindows, full: Section, provenance: Provenance
+) -> dict[str, Expectation]:
+    """Compare |f| - g and the drift of the axes with those on data left out of the fit."""
+    inside = windows.select(windows.is_inside)
+    drift = within_positions(inside.force, inside.position)
+    found = float(np.sqrt(np.mean(drift**2))) if len(inside) else np.nan
+    return {
+        'norm': Expectation(full.rms, provenance.left_out_rms, full.claimed_rms),
+        'drift': Expectation(found, provenance.left_out_drift),
+    }
 
 
 def _ranges(celsius: Floats, k_min: Floats) -> str:

@@ -53,7 +53,15 @@ class ResidualSummary:
     rms_m_s2: _Error
     max_m_s2: _Error
     left_out_rms_m_s2: Annotated[
-        _Error | None, 'RMS error of positions that the fit leaves out in turn; null if unknown.'
+        _Error | None,
+        'RMS error of the magnitude of the force in positions that the fit leaves out in turn; '
+        'null if the other positions do not determine this magnitude in each of them.',
+    ] = None
+    left_out_drift_m_s2: Annotated[
+        _Error | None,
+        'RMS drift of an axis (force less its mean in the position) on data that the fit leaves '
+        'out: each position in turn or, if the rest does not determine its drift, each section of '
+        'the temperature program; null if unknown.',
     ] = None
 
 
@@ -79,5 +87,15 @@ class Provenance:
     @property
     def left_out_rms(self) -> float:
         """RMS of ``|f| - g`` on positions left out of the fit [m/s^2]; NaN where unknown."""
-        values = [row.left_out_rms_m_s2 for row in self.residuals if row.section == 'all']
-        return math.nan if not values or values[0] is None else values[0]
+        return _of_all([(row.section, row.left_out_rms_m_s2) for row in self.residuals])
+
+    @property
+    def left_out_drift(self) -> float:
+        """RMS drift of an axis on data left out of the fit [m/s^2]; NaN where unknown."""
+        return _of_all([(row.section, row.left_out_drift_m_s2) for row in self.residuals])
+
+
+def _of_all(values: list[tuple[str, float | None]]) -> float:
+    """Return the value of the section ``all``; NaN where unknown."""
+    value = dict(values).get('all')
+    return math.nan if value is None else value
