@@ -99,7 +99,7 @@ def test_the_certificate_has_the_left_out_residual_of_each_position(page):
     shown = [position.residual_rms.get(LEFT_OUT) for position in evidence().positions]
     assert shown == [*LEFT_OUT_RMS, None]
     assert 'left out, µg RMS' in page.text
-    assert 'Left out: RMS of |f| − g by a fit to the other positions' in page.text
+    assert 'Left out: RMS of |f| − g of each position by a fit to the other pos' in page.text
 
 
 def test_the_page_loads_no_file_and_runs_no_script(page):

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The certificate prints statements of the laboratory, and right budgets and rounded values."""
 
+import json
 import math
 import re
 from dataclasses import replace
@@ -28,7 +29,12 @@ from thermo_comp.report.page import render_report
 from thermo_comp.report.statements import CertificateInfo, load_certificate_info
 from thermo_comp.report.style import rounded
 from thermo_comp.unit.calibration import LackOfFit
-from thermo_comp.unit.calibration_file import dump_calibration, parse_calibration, save_calibration
+from thermo_comp.unit.calibration_file import (
+    dump_calibration,
+    load_calibration,
+    parse_calibration,
+    save_calibration,
+)
 from thermo_comp.unit.gravity import MICRO_G
 from thermo_comp.unit.prediction import in_a_soak
 
@@ -326,6 +332,26 @@ def test_conformity_is_stated_only_with_a_tolerance():
         statement, rule = conformity(replace(evidence(), judgement=judged))
         assert statement == ''
         assert 'o statement of conformity is made' in rule
+
+
+def test_a_fit_in_one_pose_states_that_the_error_on_data_left_out_is_a_drift(cli, tmp_path):
+    # WHY: the certificate called the drift |f| - g in another attitude; the file had no value.
+    bag, page, unit = write_bag(tmp_path / '01.mcap'), tmp_path / 'fit.html', tmp_path / 'fit.yaml'
+    given = ('--gravity', '9.80665', '--groups', 'curve,set', '--report', page, '--json')
+    facts = json.loads(cli('fit', bag, '-o', unit, *given).stdout)
+    text = page.read_text(encoding='utf-8')
+    assert text.count('Left out: RMS drift of an axis (force less its mean in the position)') == 2
+    assert 'by a fit to the other positions' not in text
+    (row,) = (row for row in facts['residuals_m_s2'] if row['section'] == 'all')
+    known = load_calibration(unit).provenance
+    assert math.isnan(known.left_out_rms)
+    assert known.left_out_drift == row['left_out_drift']['rms'] == row['left_out']['rms'] > 0.0
+    # A file of an earlier version has no left-out drift.
+    older = re.sub(r',\s+left_out_drift_m_s2: \S+}', '}', unit.read_text(encoding='utf-8'))
+    assert math.isnan(parse_calibration(older.encode()).provenance.left_out_drift)
+    chosen = [model for model in facts['models'] if model['is_chosen']]
+    assert len(chosen) == 1
+    assert {model['is_near'] for model in chosen} == {False}
 
 
 def test_fit_and_report_print_the_statements_of_a_laboratory(cli, tmp_path):

@@ -272,7 +272,7 @@ def _print_positions(out: Output, result: 'FitResult') -> None:
             )
             for position in result.positions
         ],
-        title='positions at rest; |f| - g, RMS, in the fit and in a fit without the position',
+        title='positions at rest; RMS of |f| - g in the fit, and RMS error on data left out',
     )
 
 
@@ -374,7 +374,8 @@ def _name_lines(groups: tuple[str, ...]) -> list[str]:
 def _model(trial: 'Trial') -> dict[str, Any]:
     names = ('positions', 'sections', 'norms')
     left_out = {name: folds.rms for name, folds in zip(names, trial.score.kinds, strict=True)}
-    return {'groups': trial.groups, 'is_chosen': trial.is_chosen, 'left_out_rms_m_s2': left_out}
+    kept = picked(trial, 'groups is_chosen is_near')
+    return {**kept, 'left_out_rms_m_s2': left_out}
 
 
 def _of_axes(values: Iterable[float], shown: Callable[[float], str | None]) -> str:

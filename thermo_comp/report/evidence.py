@@ -219,12 +219,28 @@ class Evidence:
         )
 
     @property
+    def n_directions(self) -> int:
+        """Number of distinct directions of the force."""
+        ups = np.array([rest.up for rest in self.positions])
+        return len(distinct_directions(ups.reshape(-1, 3)))
+
+    @property
     def positions_text(self) -> str:
         """Numbers of distinct directions and, if different, of rests, as text."""
-        n_rests = len(self.positions)
-        n = len(distinct_directions(np.array([rest.up for rest in self.positions]).reshape(-1, 3)))
+        n_rests, n = len(self.positions), self.n_directions
         text = counted(n, 'position')
         return text if n == n_rests else f'{text} ({counted(n_rests, "rest")})'
+
+    @property
+    def left_out_text(self) -> str:
+        """The meaning of the left-out errors: |f| - g or, if that is not determined, drift."""
+        drift = 'RMS drift of an axis (force less its mean in the position)'
+        if self.n_directions == 1:
+            return f'{drift} on data left out of the fit'
+        return (
+            'RMS of |f| − g of each position by a fit to the other positions, the error expected '
+            f'in a new attitude; if the other positions do not determine |f|: {drift}'
+        )
 
     def axis_residuals(self) -> dict[str, Floats]:
         """Return the force less the mean direction of the position times the known |f|, (n, 3)."""
