@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from report_helpers import evidence, fitted, write_bag
 
+from thermo_comp.cli.output import micro_g
 from thermo_comp.errors import ThermoCompError
 from thermo_comp.judging.verdicts import Verdict
 from thermo_comp.report.certificate import (
@@ -346,6 +347,9 @@ def test_a_fit_in_one_pose_states_that_the_error_on_data_left_out_is_a_drift(cli
     known = load_calibration(unit).provenance
     assert math.isnan(known.left_out_rms)
     assert known.left_out_drift == row['left_out_drift']['rms'] == row['left_out']['rms'] > 0.0
+    shown = cli('info', unit).stdout
+    drift = micro_g(known.left_out_drift)
+    assert re.search(rf'^all +\d+ .* - +{re.escape(drift)}$', shown, re.MULTILINE)
     # A file of an earlier version has no left-out drift.
     older = re.sub(r',\s+left_out_drift_m_s2: \S+}', '}', unit.read_text(encoding='utf-8'))
     assert math.isnan(parse_calibration(older.encode()).provenance.left_out_drift)

@@ -139,11 +139,16 @@ def _calibration(out: Output, path: Path) -> None:
     )
     if provenance.residuals:
         out.table(
-            ('section', 'windows', 'raw ug RMS', 'ug RMS', 'ug max'),
+            ('section', 'windows', 'raw', 'RMS', 'max', 'left out', 'left-out drift'),
             [
-                (n.section, n.n_windows, *map(micro_g, (n.raw_rms_m_s2, n.rms_m_s2, n.max_m_s2)))
+                (
+                    *(n.section, n.n_windows),
+                    *map(micro_g, (n.raw_rms_m_s2, n.rms_m_s2, n.max_m_s2)),
+                    *(x and micro_g(x) for x in (n.left_out_rms_m_s2, n.left_out_drift_m_s2)),
+                )
                 for n in provenance.residuals
             ],
+            title='|f| - g of the fit and on data left out, and left-out drift of an axis, in ug',
         )
     print_nonlinearity(out, calibration)
     out.points(provenance.notes)
