@@ -9,6 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import strangers_cases as cases
+from builders import source_of
 from conftest import ROOT
 from hypothesis import given
 from hypothesis import strategies as st
@@ -16,6 +18,7 @@ from report_helpers import evidence, fitted, write_bag
 
 from thermo_comp.cli.output import micro_g
 from thermo_comp.errors import ThermoCompError
+from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.judging.verdicts import Verdict
 from thermo_comp.report.certificate import (
     budget,
@@ -25,7 +28,7 @@ from thermo_comp.report.certificate import (
     results,
     table_temperatures,
 )
-from thermo_comp.report.evidence import evidence_of_bags
+from thermo_comp.report.evidence import evidence_of_bags, evidence_of_fit
 from thermo_comp.report.page import render_report
 from thermo_comp.report.statements import CertificateInfo, load_certificate_info
 from thermo_comp.report.style import rounded
@@ -209,6 +212,29 @@ def test_the_lack_of_fit_is_a_row_of_the_budget_and_not_part_of_the_model():
     assert combined(lines) == pytest.approx(claim)
 
 
+@pytest.mark.slow
+def test_the_budget_of_a_unit_with_a_kink_names_the_lack_of_fit():
+    # The slope of the bias changes by 8 to 20 ug/K at one temperature, which no cubic describes.
+    (study,) = cases.kink(2)
+    sources = []
+    for bag in study.bags:
+        series = (bag.time_s, bag.samples), bag.temperatures['board'], bag.temperatures['case']
+        arrays = [
+            part for time_s, of in series for part in (np.rint(1e9 * time_s).astype(int), of)
+        ]
+        sources.append(source_of(*arrays, name=bag.name))
+    options = FitOptions(gravity=study.gravity, groups=('curve',), **study.options)
+    judged = evidence_of_fit(fit(sources, options))
+    lines = budget(judged, CertificateInfo())
+    standards = {line.name: line.standard for line in lines}
+    # The lack of fit is a part of the drift on left-out data; the rest is the noise of the fit.
+    left_out = judged.calibration.provenance.left_out_drift
+    assert 0.3 * left_out < standards[LACK] < left_out
+    windows = judged.judgement.windows
+    claim = float(np.sqrt(np.mean(windows.claimed_sd[windows.is_inside] ** 2)))
+    assert combined(lines) == pytest.approx(claim)
+
+
 def test_a_residual_above_the_claimed_sd_is_listed_as_repeatability():
     judgement, claim = evidence().judgement, combined(budget(evidence(), CertificateInfo()))
     doubtful = replace(evidence(), judgement=replace(judgement, left_out_rms=3.0 * claim))
@@ -365,12 +391,12 @@ def test_fit_and_report_print_the_statements_of_a_laboratory(cli, tmp_path):
     assert 'Inertial Lab' in (tmp_path / 'page.html').read_text(encoding='utf-8')
     bag = write_bag(tmp_path / '01.mcap')
     known = ('--gravity', '9.80665', '--groups', 'curve', '--certificate-info')
-    fit = ('fit', bag, '-o', tmp_path / 'fit.yaml', *known)
-    cli(*fit, lab(tmp_path), '--report', tmp_path / 'fit.html')
+    arguments = ('fit', bag, '-o', tmp_path / 'fit.yaml', *known)
+    cli(*arguments, lab(tmp_path), '--report', tmp_path / 'fit.html')
     page = (tmp_path / 'fit.html').read_text(encoding='utf-8')
     assert 'Inertial Lab' in page
     assert 'class="simulated"' in page
     assert '1 position in bags of the fit' in page
-    assert '--report' in cli(*fit, lab(tmp_path), '--force', code=2).stderr
+    assert '--report' in cli(*arguments, lab(tmp_path), '--force', code=2).stderr
     refused = cli('report', *given, lab(tmp_path, 'number: 17'), '--force', code=1)
     assert 'lab.yaml: number: must be a valid text, got 17' in refused.stderr
