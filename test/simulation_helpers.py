@@ -5,6 +5,7 @@
 from dataclasses import replace
 
 import numpy as np
+from builders import source_of
 
 from thermo_comp.simulation.campaign import Cyclogram
 
@@ -50,3 +51,15 @@ def slow(bag):
         for values in (bag.time_s, bag.samples)
     )
     return replace(bag, time_s=time_s, samples=samples)
+
+
+def sources_of(bags):
+    """Return the sources of bags of benchmarks/strangers_units.py with board and case."""
+    sources = []
+    for number, bag in enumerate(bags):
+        arrays = [bag.time_s, bag.samples]
+        for name in ('board', 'case'):
+            arrays += bag.temperatures[name]
+        arrays[::2] = (10**18 + np.rint(time_s * 1e9).astype(np.int64) for time_s in arrays[::2])
+        sources.append(source_of(*arrays, name=f'{number}'))
+    return sources

@@ -210,6 +210,7 @@ def _print_fit(
         out.line(_text_of(parts))
     _print_groups(out, calibration, has_prior=result.fit.posterior.prior.informative is not None)
     print_nonlinearity(out, calibration)
+    _print_contributions(out, result)
     _print_residuals(out, result, n_positions)
     if gyroscope is not None:
         _print_rates(out, result, gyroscope)
@@ -235,6 +236,7 @@ def _print_fit(
         part_leads_s=parts and [part.lead_s for part in parts],
         **picked(calibration, 'evidence noise_density_m_s2_sqrt_hz slow_noise_m_s2_sqrt_h'),
         gyroscope=gyroscope and picked(gyroscope, _RATES) | {'residuals_rad_s': result.rates},
+        contributions_m_s2=result.contributions,
         **picked(result, 'positions least_known findings'),
     )
 
@@ -293,6 +295,16 @@ def _print_groups(out: Output, calibration: 'Calibration', has_prior: bool) -> N
     white = _of_axes(calibration.noise_density_m_s2_sqrt_hz, micro_g)
     walk = _of_axes(calibration.slow_noise_m_s2_sqrt_h, micro_g)
     out.line(f'noise of x y z: white {white} ug/sqrt(Hz), random walk {walk} ug/sqrt(h)')
+
+
+def _print_contributions(out: Output, result: 'FitResult') -> None:
+    """Print a table of the thermal response and of the effects of the unknowns of the bags."""
+    effects = {name: x for name, x in vars(result.contributions).items() if x is not None}
+    out.table(
+        ('effect', 'RMS ug'),
+        [(name.replace('_', ' '), micro_g(value)) for name, value in effects.items()],
+        title='effects on an axis: response of the unit, then unknowns of the bags',
+    )
 
 
 def _print_residuals(out: Output, result: 'FitResult', n_positions: int) -> None:

@@ -25,6 +25,7 @@ from . import data_checks, raw_checks, refit_checks
 from .alternatives import model_of, regressed, windows_of
 from .assembly import build_calibration
 from .claim import claim_of
+from .contributions import Contributions, contributions_of, judge_contributions
 from .coverage import LeastKnown, least_known, rough_centre
 from .data_checks import Finding, advice, enforce
 from .environments import contradicting_bag, contradiction, is_better_without, with_excluded_error
@@ -47,7 +48,12 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True)
 class FitResult:
-    """A calibration with its residuals and findings; `rates`: residuals of the gyroscope."""
+    """
+    A calibration with its residuals and findings.
+
+    rates: residuals of the gyroscope
+    contributions: what the unknowns of bags and positions explain; None before the end of a fit
+    """
 
     calibration: Calibration
     fit: Fit
@@ -57,6 +63,7 @@ class FitResult:
     least_known: LeastKnown | None
     bags: tuple[ReducedBag, ...]
     rates: tuple[RateRow, ...] = ()
+    contributions: Contributions | None = None
 
 
 def fit(
@@ -110,7 +117,7 @@ def fit_bags(
     # Threads would slow down the products of small matrices in the fit.
     with threadpool_limits(1, 'blas'):
         try:
-            result = _fit_without_code_offset(recordings, options, progress)
+            result = _judged_result(_fit_without_code_offset(recordings, options, progress))
         except np.linalg.LinAlgError as error:
             raise FitError(
                 'the bags do not determine the fit: its equations have no solution in double '
@@ -121,6 +128,13 @@ def fit_bags(
     calibration = result.calibration
     provenance = replace(calibration.provenance, notes=notes)
     return replace(result, calibration=replace(calibration, provenance=provenance))
+
+
+def _judged_result(result: FitResult) -> FitResult:
+    """Add what the unknowns of the bags explain."""
+    contributions = contributions_of(result.fit.regression, result.fit.posterior)
+    found = judge_contributions(contributions, result.fit.selected.score.noise)
+    return replace(result, findings=(*result.findings, *found), contributions=contributions)
 
 
 def _fit_without_code_offset(
