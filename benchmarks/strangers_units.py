@@ -36,15 +36,16 @@ CASE, BOARD, PARTS, HIDDEN = 0, 1, slice(2, 5), 5
 class Environment:
     """
     Thermal conductances relative to those in a chamber with a fan: air to case (`film`), case to
-    hidden node (`path`).
+    hidden node (`path`), air to board (`vent`).
     """
 
     film: float = 1.0
     path: float = 1.0
+    vent: float = 1.0
 
 
 CHAMBER = Environment()
-STILL_AIR = Environment(film=0.3, path=0.25)
+STILL_AIR = Environment(film=0.3, path=0.25, vent=0.0)
 
 
 def _zeros() -> Floats:
@@ -76,6 +77,9 @@ class Unit:
         Time constants [s]; a part with a time constant of 0 s has the board's temperature.
     case_share : ndarray, shape (3,)
         Share of a part's thermal coupling that is to the case; the other share is to the board.
+    vent_share : float
+        Share of the board's thermal coupling that is to the air of a chamber with a fan; the other
+        share is to the case.
     heat_k : float
         Temperature of the board above that of the case at rest, by self-heating [K].
     counts : float
@@ -112,6 +116,7 @@ class Unit:
     part_s: Floats = field(default_factory=_zeros)
     case_share: Floats = field(default_factory=_zeros)
     hidden_s: float = 1500.0
+    vent_share: float = 0.0
     heat_k: float = 1.0
     counts: float = 4e5
     carries: bool = True
@@ -238,7 +243,9 @@ def network(unit: Unit, environment: Environment = CHAMBER) -> tuple[Floats, Flo
     b[CASE] = environment.film
     A[CASE] /= unit.case_s
     b[CASE] /= unit.case_s
-    A[BOARD, CASE], A[BOARD, BOARD] = 1.0 / unit.board_s, -1.0 / unit.board_s
+    to_case, to_air = 1.0 - unit.vent_share, unit.vent_share * environment.vent
+    A[BOARD, [CASE, BOARD]] = np.array([to_case, -to_case - to_air]) / unit.board_s
+    b[BOARD] = to_air / unit.board_s
     h[BOARD] = unit.heat_k / unit.board_s
     for node, lag_s, share in zip(range(2, 5), unit.part_s, unit.case_share, strict=True):
         A[node, [BOARD, CASE, node]] = np.array([1.0 - share, share, -1.0]) / max(lag_s, 1.0)

@@ -56,6 +56,20 @@ def test_a_node_lags_a_ramp_by_its_time_constant():
     assert board - states[-1, units.PARTS] == pytest.approx(0.01 * lags, rel=1e-6)
 
 
+def test_a_board_cooled_by_the_fan_follows_the_case_in_another_way_without_fan():
+    given = unit(board_s=700.0, vent_share=0.3)
+    lags = []
+    for environment in (units.CHAMBER, units.STILL_AIR):
+        at, states = ramp(given, 0.01, 12, environment)
+        case, board, air = states[-1, units.CASE], states[-1, units.BOARD], 0.01 * at[-1]
+        to_air = 0.3 * environment.vent
+        # In a ramp the heat that the board stores comes from case and air.
+        stored = 0.7 * (case - board) + to_air * (air - board)
+        assert stored == pytest.approx(0.01 * 700.0, rel=1e-6)
+        lags.append(case - board)
+    assert lags[1] > 1.3 * lags[0]
+
+
 def test_the_integration_is_exact_at_each_step_of_a_ramp():
     # The lag of x behind a ramp u after a soak is u - x = rate * tau * (1 - exp(-t / tau)).
     A, b, h = np.array([[-1 / 300.0]]), np.array([1 / 300.0]), np.zeros(1)

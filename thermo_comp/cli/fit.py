@@ -237,7 +237,7 @@ def _print_fit(
         **picked(calibration, 'evidence noise_density_m_s2_sqrt_hz slow_noise_m_s2_sqrt_h'),
         gyroscope=gyroscope and picked(gyroscope, _RATES) | {'residuals_rad_s': result.rates},
         contributions_m_s2=result.contributions,
-        **picked(result, 'positions least_known findings'),
+        **picked(result, 'positions least_known likeness findings'),
     )
 
 

@@ -26,13 +26,14 @@ from .alternatives import model_of, regressed, windows_of
 from .assembly import build_calibration
 from .claim import claim_of
 from .contributions import Contributions, contributions_of, judge_contributions
-from .coverage import LeastKnown, least_known, rough_centre
+from .coverage import LeastKnown, distinct_directions, least_known, rough_centre
 from .data_checks import Finding, advice, enforce
 from .environments import contradicting_bag, contradiction, is_better_without, with_excluded_error
 from .evidence import PositionReport, ResidualRow, position_reports, residual_rows
 from .gyroscope import RateRow, add_gyroscope
 from .initialisation import Problem, initial_triad
 from .joining import joined
+from .likeness import Likeness, judge_likeness, likenesses
 from .nonlinear import choose, is_beyond, judge_terms, of_file, with_blank, with_forces
 from .options import COUNTS_FULL_SCALE, FitOptions
 from .priors import constants_of, offset_sd_of
@@ -53,6 +54,7 @@ class FitResult:
 
     rates: residuals of the gyroscope
     contributions: what the unknowns of bags and positions explain; None before the end of a fit
+    likeness: correlations of terms that the bags may not tell apart
     """
 
     calibration: Calibration
@@ -64,6 +66,7 @@ class FitResult:
     bags: tuple[ReducedBag, ...]
     rates: tuple[RateRow, ...] = ()
     contributions: Contributions | None = None
+    likeness: tuple[Likeness, ...] = ()
 
 
 def fit(
@@ -131,10 +134,17 @@ def fit_bags(
 
 
 def _judged_result(result: FitResult) -> FitResult:
-    """Add what the unknowns of the bags explain."""
-    contributions = contributions_of(result.fit.regression, result.fit.posterior)
-    found = judge_contributions(contributions, result.fit.selected.score.noise)
-    return replace(result, findings=(*result.findings, *found), contributions=contributions)
+    """Add what the unknowns of the bags explain, and the terms that the bags do not tell apart."""
+    fit, findings = result.fit, list(result.findings)
+    contributions, likeness = contributions_of(fit.regression, fit.posterior), likenesses(fit)
+    findings += judge_contributions(contributions, fit.selected.score.noise)
+    if all(finding.name != 'environment' for finding in findings):
+        # Otherwise a bag of another environment was recorded, and excluded from the fit.
+        n_directions = len(distinct_directions(fit.posterior.state.up))
+        findings += judge_likeness(likeness, n_directions)
+    return replace(
+        result, findings=tuple(findings), contributions=contributions, likeness=likeness
+    )
 
 
 def _fit_without_code_offset(
