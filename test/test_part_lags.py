@@ -375,3 +375,14 @@ def test_fit_prints_the_fitted_lags_of_the_parts(parts):
     assert content['part_lags_s'] == pytest.approx(unit.part_s, rel=0.01)
     assert printed == pytest.approx(content['part_lags_s'], abs=0.5)
     assert content['part_case_shares'] == [0.0, 0.0, 0.0]
+
+
+def test_the_effects_of_unknowns_and_the_most_similar_terms_are_printed(parts):
+    *_, (text, content) = parts
+    content = json.loads(content)
+    effects = content['contributions_m_s2']
+    assert effects['thermal_response'] > 100.0 * effects['initial_lag_states'] > 0.0
+    (line,) = (line for line in text.splitlines() if line.startswith('thermal response'))
+    assert float(line.split()[-1]) == pytest.approx(effects['thermal_response'] / UG, abs=0.5)
+    (pair,) = (p for p in content['likeness'] if p['groups'] == ['board', 'gradient_lag'])
+    assert f'(correlation {pair["correlation"]:.5f};' in text
