@@ -1,8 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the simulated bag of the fault tests (a unit in a soak, a ramp and a soak) with its truth, and
-the functions that change its messages.
+Owns the simulated bag of the fault tests, with its truth, and functions that change its messages.
 
 The unit has only effects that its calibration contains, so that an error above the noise is caused
 by the fault. The lags are seconds instead of minutes, so that the bag is short.

@@ -42,16 +42,13 @@ def test_the_columns_equal_the_derivatives_of_the_measured_force(rng):
         np.testing.assert_allclose(coverage.norm_columns(up)[:, k], slope, atol=1e-9)
 
 
-def test_without_positions_the_covariance_is_that_of_the_prior():
+def test_none_or_two_opposite_positions_determine_no_other_constants():
     covariance = coverage.constants_covariance(NOTHING, np.empty(0))
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), PRIOR_SD)
     # Along an axis the variance of |f| is the sum of the variances of its bias and scale.
     assert coverage.worst_sd(covariance) == pytest.approx(
         np.hypot(PRIOR_SD[0], PRIOR_SD[3]), rel=1e-3
     )
-
-
-def test_two_opposite_faces_determine_bias_and_scale_of_their_axis():
     sd = np.sqrt(np.diag(coverage.constants_covariance(FACES[:2], np.full(2, SD))))
     # Bias and scale errors: half the difference and half the sum of errors of |f| on +x and -x.
     assert sd[[0, 3]] == pytest.approx(SD / np.sqrt(2.0), rel=1e-6)
@@ -100,7 +97,6 @@ def test_the_proposed_directions_are_nearly_as_good_as_spread_positions():
 
 
 def test_farthest_returns_the_direction_farthest_from_all_given_directions():
-    # The corners of a cube are the directions farthest from all six faces.
     up, angle = coverage.farthest(FACES)
     assert np.abs(up) == pytest.approx(1.0 / np.sqrt(3.0))
     assert angle == pytest.approx(np.degrees(np.arccos(1.0 / np.sqrt(3.0))))

@@ -84,7 +84,6 @@ def test_the_node_finds_the_message_type_of_a_topic_while_it_runs(peer, unit, is
         ('bord=/t', 'parameter `topics`: `bord` is not an input'),
         ('board=/t,case', 'parameter `topics`: expected INPUT=TOPIC, got case'),
         ('/none/drivers.yaml', '/none/drivers.yaml: cannot be read'),
-        ('board=/t,case=/t', '/t: one topic for both board and case'),
         ('counts=/imu/data_raw', '/imu/data_raw: is both input and output: remap imu/data_raw'),
         ('imu=/imu/data_raw', "must be 'm/s^2' (parameter `input` is imu), got 'counts'"),
     ],

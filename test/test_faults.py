@@ -1,9 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-For each row of the fault table the output of compensator and diagnostics is compared with the
-truth. Rows that depend on the order of arrival of messages are also sent over DDS to a node
-process, whose output must equal the output without DDS.
+The output for each row of the fault table agrees with the truth. Rows that depend on the order of
+messages are also sent over DDS to a node process, whose output must equal that without DDS.
 """
 
 from copy import deepcopy

@@ -178,7 +178,7 @@ def test_a_bag_with_a_message_type_of_the_driver_is_read(tmp_path, store, storag
     assert case.stamp_ns.tolist() == [START_NS + row * 10**7 for row in range(0, 50, 5)]
 
 
-def test_two_fields_of_one_message_are_two_inputs(tmp_path, store):
+def test_two_fields_of_a_message_are_two_inputs_and_info_names_further_fields(tmp_path, store):
     driver_bag(tmp_path / 'bag', store)
     topic = '/fmu/out/sensor_accel'
     names = {'board': f'{topic}:temperature', 'case': f'{topic}:z'}
@@ -193,10 +193,6 @@ def test_two_fields_of_one_message_are_two_inputs(tmp_path, store):
         open_recording(tmp_path / 'bag', Topics.named({'board': f'{topic}:temp'}), require=())
     with pytest.raises(ValueError, match='`imu` takes whole messages'):
         Topics.named({'imu': '/imu/data:linear_acceleration'})
-
-
-def test_info_names_topics_that_could_be_a_second_thermometer(tmp_path, store):
-    driver_bag(tmp_path / 'bag', store)
     topics = Topics.named({'board': '/case'})
     findings = survey_recording(tmp_path / 'bag', topics).findings
     message = next(text for text in findings if 'no case' in text)

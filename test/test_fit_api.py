@@ -52,8 +52,7 @@ def test_a_knee_in_the_curve_of_the_bias_is_found():
     knees = [term.knee_k for term in unit.response if term.group == 'bend']
     # The fit tries knees every 1 K, and uses the two that are next to the true knee.
     assert min(abs(20.0 + knee - KNEE_C) for knee in knees) < 1.0
-    # Two knees, 1 K apart, in place of the true knee between them give an error of at most 20 ug/K
-    # times 0.25 K = 5 ug, and only in 1 K of the range of 22 K.
+    # Two knees 1 K apart beside the true knee give an error of at most 5 ug, in 1 K of 22 K.
     assert left < 1.5
     # The bends of a part end at its highest temperature in the bags, whatever their knees.
     bends = [term for term in unit.response if term.group == 'bend']
@@ -95,8 +94,7 @@ def columns_of(slopes, shift=0.0):
 @pytest.mark.slow
 @pytest.mark.parametrize('shift', [300.0, -20000.0])
 def test_a_changed_unit_is_updated_although_its_drift_contradicts_the_prior(shift, monkeypatch):
-    # WHY: the drift contradicted the prior, so the update excluded all new bags and kept the old
-    # constants, whose error was 35 times their claimed sd.
+    # WHY: the drift contradicted the prior, so all new bags were excluded: errors of 35 sd.
     monkeypatch.setitem(globals(), 'KNEE_C', 5.0)
     options = {'gravity': G, 'input': 'm/s^2', 'groups': ('curve',)}
     old = tc.fit(columns_of([SLOPE] * len(UPS)), mounting_sd=1e-7, **options)
@@ -138,6 +136,5 @@ def test_a_bag_of_another_environment_is_excluded_and_increases_the_claimed_sd()
         # The variance added because of bag r4 covers the bias error in r4, up to 1.1 mg.
         more = sd_of_a_correction(unit) ** 2 - sd_of_a_correction(alone) ** 2
         assert 0.5 < true_error / np.sqrt(more.mean()) < 1.5
-    # A new bag with the bias slope of the first four bags gives no note `environment`.
     again = tc.fit(columns_of([SLOPE] * 5)[-1:], gravity=G, input='m/s^2', prior=alone)
     assert not [note for note in again.provenance.notes if note.startswith('environment')]

@@ -111,7 +111,6 @@ def test_errors_of_square_and_cube_are_below_4_claimed_sd(rng):
     sd = np.sqrt(posterior.variance[places])
     error = posterior.state.nonlinear[:, [0, 2, 3, 5]] - np.array([1e-5, -1e-6, 1e-7, -1e-8])
     assert np.abs(error / sd).max() < 4.0
-    # The goal for the error of K2 and K3 is 2 %.
     assert np.abs(error[:, :2] / [1e-5, 1e-6]).max() < 0.02
     assert all(term.left_out_gain > 1.0 and term.log_evidence_change > 100.0 for term in terms)
 
@@ -261,7 +260,6 @@ def test_runs_of_a_centrifuge_determine_nonlinear_terms_that_a_later_fit_keeps()
     assert outside.sections['outside'].n == most.n
     rows = results(evidence_of_fit(result), CertificateInfo(), ())
     assert {'K2 x', 'K3 z'} < {row.quantity for row in rows}
-    # Six positions at 1 g, with the centrifuge's calibration as prior, keep the nonlinear terms.
     still = [Position(program, position) for position in positions(6, 2)]
     later = arrays(unit, still, 9, rate_hz=2.0)
     tumble = [source(run, None, f'still{k}') for k, run in enumerate(later)]
@@ -272,7 +270,6 @@ def test_runs_of_a_centrifuge_determine_nonlinear_terms_that_a_later_fit_keeps()
     units = [replace(again.unit, serial=f'{k}') for k in range(3)]
     siblings = [replace(again, unit=unit, gyroscope=None) for unit in units]
     assert population(siblings).nonlinearity is None
-    # A fit to positions at 1 g alone keeps the stated sd of K2, which is reported.
     alone = fit(tumble, FitOptions(gravity=G, model='golovach', k2_sd=5e-5))
     assert [finding.name for finding in alone.findings].count('nonlinearity') == 1
     (square, *_) = nonlinear_coefficients(alone.calibration)

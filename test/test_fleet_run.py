@@ -65,7 +65,6 @@ def test_all_units_are_fitted_despite_a_killed_worker_and_only_once(client, flee
     collected = []
 
     def report(n, total):
-        # When the first result arrives, two workers are at work.
         if n == 1:
             os.kill(min(client.run(os.getpid).values()), signal.SIGKILL)
         collected.append((n, total))
@@ -144,7 +143,6 @@ def test_an_interrupted_fleet_run_continues(scheduler, tmp_path):
         fit_fleet(str(fleet), out, OPTIONS, scheduler=scheduler, progress=stop)
     assert not (out / 'fleet.csv').exists()
     assert len(list(out.rglob('result.json'))) == 1
-    # The result file of unit A/u0 is cut off, as after a power failure.
     (out / 'units/A/u0').mkdir(parents=True, exist_ok=True)
     (out / 'units/A/u0/result.json').write_text('{"format": 1,')
     result = fit_fleet(str(fleet), out, OPTIONS, scheduler=scheduler)
@@ -237,18 +235,13 @@ def test_the_next_run_repeats_a_failed_task(future, problem, fleet, tmp_path):
     assert results.look_up(unit, OPTIONS) is None
 
 
-def test_without_dask_fleet_fit_names_the_package_to_install(tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, 'distributed', None)
-    assert command(tmp_path, tmp_path / 'out', '--gravity', '9.81') == 1
-    text = "thermo_comp: error: a fleet needs Dask: pip install 'thermo_comp[fleet]' (distributed "
-    assert capsys.readouterr().err == f'{text}is not installed)\n'
-
-
 def command(folder, out, *options):
     return run_command(['fleet', 'fit', str(folder), '-o', str(out), *options])
 
 
-def test_wrong_arguments_of_fleet_fit_give_a_message(tmp_path, capsys):
+def test_without_dask_or_with_wrong_arguments_fleet_fit_gives_a_message(
+    tmp_path, capsys, monkeypatch
+):
     assert command(tmp_path, tmp_path / 'out') == 2
     assert 'give --gravity, or --latitude and --height' in capsys.readouterr().err
     assert command(tmp_path, tmp_path / 'out', '--gravity', '-1') == 1
@@ -257,6 +250,10 @@ def test_wrong_arguments_of_fleet_fit_give_a_message(tmp_path, capsys):
     printed = capsys.readouterr().err
     assert 'no bag in it' in printed
     assert len(printed.splitlines()) == 1
+    monkeypatch.setitem(sys.modules, 'distributed', None)
+    assert command(tmp_path, tmp_path / 'out', '--gravity', '9.81') == 1
+    text = "thermo_comp: error: a fleet needs Dask: pip install 'thermo_comp[fleet]' (distributed "
+    assert capsys.readouterr().err == f'{text}is not installed)\n'
 
 
 def test_a_unit_without_a_calibration_gives_exit_code_1(scheduler, tmp_path, capsys):

@@ -65,7 +65,6 @@ def test_parts_of_a_rest_have_the_windows_of_the_whole_rest(rng, edges_s):
     whole = recorded(rng, 600.0)
     (bag,) = reduced([whole])
     (rest,) = bag.intervals
-    # The parts are given in reverse order, which must not change the result.
     (again,) = joined(reduced(cut(whole, edges_s))[::-1])
     (continued,) = again.intervals
     assert (again.start_ns, again.end_ns) == (bag.start_ns, bag.end_ns)
@@ -86,15 +85,6 @@ def test_parts_of_a_rest_have_the_windows_of_the_whole_rest(rng, edges_s):
     np.testing.assert_allclose(continued.sample_sd, NOISE, rtol=0.05)
 
 
-def test_a_move_between_two_parts_of_a_recording_gives_two_rests(rng):
-    whole = recorded(rng, 600.0)
-    before, after = cut(whole, (300.0,))
-    moved = replace(after, accel=after.accel + np.array([0.0, 1.0, 0.0]))
-    (bag,) = joined(reduced([before, moved]))
-    first, second = bag.intervals
-    assert first.time[-1] < 300.0 < second.time[0]
-
-
 def test_recordings_that_are_not_parts_of_one_are_not_joined(rng):
     whole = recorded(rng, 400.0)
     # Parts are joined after a pause of up to 60 s; in a longer pause the unit may have restarted.
@@ -102,7 +92,6 @@ def test_recordings_that_are_not_parts_of_one_are_not_joined(rng):
         assert len(joined(reduced(cut(whole, (200.0,), pause_s=pause_s)))) == n
     known = KnownForce('part', parse_sections('0 400 2.0'))
     assert len(joined(reduced(cut(whole, (200.0,)), force=known))) == 2
-    # Recordings of 2 s that begin at equal times are not parts of one recording.
     short = recorded(rng, 2.0)
     assert len(joined(reduced([short, short]))) == 2
     # Two recordings have equal stamps: each is joined only with its own second part.
@@ -114,7 +103,7 @@ def test_recordings_that_are_not_parts_of_one_are_not_joined(rng):
     assert len(joined(reduced([before], serial='a') + reduced([after], serial='b'))) == 2
 
 
-def test_a_part_in_which_the_unit_never_rests_is_joined(rng):
+def test_a_move_between_parts_gives_two_rests_and_parts_without_a_rest_are_joined(rng):
     before, after = cut(recorded(rng, 600.0), (300.0,))
     shaken = replace(after, accel=1e3 * rng.standard_normal(after.accel.shape))
     parts = reduced([before, shaken])
@@ -128,12 +117,17 @@ def test_a_part_in_which_the_unit_never_rests_is_joined(rng):
     assert len(fit(sources, FitOptions(gravity=9.80665, groups=('curve',))).positions) == 1
     with pytest.raises(FitError, match='part1: '):
         fit(sources[1:], FitOptions(gravity=9.80665))
+    whole = recorded(rng, 600.0)
+    before, after = cut(whole, (300.0,))
+    moved = replace(after, accel=after.accel + np.array([0.0, 1.0, 0.0]))
+    (bag,) = joined(reduced([before, moved]))
+    first, second = bag.intervals
+    assert first.time[-1] < 300.0 < second.time[0]
 
 
 def test_a_split_recording_gives_the_calibration_of_the_whole_recording():
-    # WHY: each part of a split recording was fitted with a separate turn-on and separate initial
-    # lag states. For 18 recordings of 9 h, split every hour, the fit took 30 times as long as a
-    # fit of the whole recordings, and had 6 times its claimed sd.
+    # WHY: each part was fitted with a separate turn-on and separate initial lag states: the error
+    # was 6 times the claimed sd, and the fit took 30 times as long.
     bag = thermo_comp.read(ROOT / 'bags/fit/01.mcap')
     parts = []
     for begin_s in np.arange(0.0, bag.time_s[-1], 1800.0):
@@ -152,8 +146,7 @@ def test_a_split_recording_gives_the_calibration_of_the_whole_recording():
         unit.correct(bag.time_s, bag.counts, **bag.temperatures).specific_force
         for unit in (whole, split)
     ))  # fmt: skip
-    # At the end of each part 30 s of samples are lost; the difference of the forces by both fits
-    # scatters by less than 1.2 ug, the noise of a mean over 60 s.
+    # At the end of each part 30 s are lost; 1.2 ug is the noise of a mean over 60 s.
     assert np.nanstd(difference, axis=0).max() < 1.2 * MICRO_G
 
 
@@ -178,6 +171,5 @@ def test_evaluate_and_report_take_the_parts_as_one_recording(tmp_path, rng, cli)
     assert 'part0.mcap .. part1.mcap: 2 bags of one recording, joined' in errors
     page = tmp_path / 'unit.html'
     cli('report', *paths, '-c', tmp_path / 'unit.yaml', '-o', page)
-    # The certificate has name and SHA-256 of each joined bag.
     text = page.read_text()
     assert all(path.name in text and digest(path) in text for path in paths)

@@ -33,7 +33,7 @@ def dated(created, bias_ug=0.0, ppm=0.0, sd_ug=3.0):
     return replace(unit, provenance=provenance)
 
 
-def test_changes_between_calibrations_and_their_sd_equal_those_found_by_hand():
+def test_changes_between_calibrations_equal_those_found_by_hand_if_they_form_a_history():
     # Dates give the order of calibrations. The change of z bias has the sd hypot(3, 4) = 5 ug.
     drifts = drifts_of(history_of([dated('2026-02-01', 20.0, 50.0, 4.0), dated('2026-01-01')]))
     names = [f'{kind} {axis}' for kind in ('bias', 'scale') for axis in 'xyz']
@@ -47,11 +47,7 @@ def test_changes_between_calibrations_and_their_sd_equal_those_found_by_hand():
     for change in still:
         assert change.change == pytest.approx(0.0, abs=1e-9)
         assert not change.is_sure
-
-
-def test_calibrations_that_do_not_form_a_history_give_no_drift():
     unit = dated('2026-01-01')
-    # One calibration, two of the same bags, or two of different units do not form a history.
     other = replace(unit, unit=replace(unit.unit, serial='other'))
     for calibrations in ([unit], [unit, unit], [unit, other]):
         assert drifts_of(history_of(calibrations)) == []

@@ -149,13 +149,9 @@ def loaded_after(statement, *watched):
     return ran(sys.executable, '-c', code, check=True, timeout=120).stdout.split()
 
 
-def test_help_imports_none_of_the_heavy_libraries():
-    heavy = ('numpy', 'scipy', 'rosbags', 'mcap', 'matplotlib', 'rclpy', 'dask')
-    assert loaded_after('import thermo_comp.cli.app', *heavy) == []
-
-
-def test_the_command_info_does_not_import_the_fit():
+def test_help_and_the_command_info_import_none_of_the_heavy_libraries():
     heavy = ('scipy', 'matplotlib', 'rosbags', 'rclpy', 'thermo_comp.fitting')
+    assert loaded_after('import thermo_comp.cli.app', 'numpy', 'mcap', 'dask', *heavy) == []
     assert loaded_after('import thermo_comp.recording.overview', *heavy) == []
 
 

@@ -96,14 +96,11 @@ def test_foxglove_paths_name_numbers_in_the_messages(topics):
     assert used == {output, *topics} - {'/regime/stamped'}
 
 
-def test_topics_in_the_foxglove_script_and_diagnostics_panels_exist(topics):
+def test_foxglove_panels_are_shown_once_and_their_topics_exist(topics):
     (inputs,) = re.findall(r'export const inputs = (\[.*\])', script())
     assert set(json.loads(inputs)) <= set(topics)
     rendered = {p['topicToRender'] for p in panels().values() if 'topicToRender' in p}
     assert rendered == LIVE_ONLY
-
-
-def test_foxglove_shows_every_panel_once():
     layout = json.dumps(json.loads(FOXGLOVE.read_text())['layout'])
     shown = re.findall(r'"(?:first|second)": "([^"]*)"', layout)
     assert sorted(shown) == sorted(panels())
@@ -125,7 +122,7 @@ def source_kind(topics, series):
     return field_kind(topics[topic], fields)
 
 
-def test_plotjuggler_curves_name_numbers_in_the_messages(topics):
+def test_plotjuggler_curves_name_numbers_and_splitters_count_their_panels(topics):
     root = plotjuggler()
     snippets = {snippet.get('name'): snippet for snippet in root.iter('snippet')}
     curves = {curve.get('name') for curve in root.iter('curve')}
@@ -134,10 +131,7 @@ def test_plotjuggler_curves_name_numbers_in_the_messages(topics):
     assert set(snippets) <= curves
     for series in (curves - set(snippets)) | sources:
         assert source_kind(topics, series) in ('float64', 'bool')
-
-
-def test_plotjuggler_splitters_have_the_right_number_of_panels():
-    for splitter in plotjuggler().iter('DockSplitter'):
+    for splitter in root.iter('DockSplitter'):
         assert int(splitter.get('count')) == len(splitter)
         assert len(splitter.get('sizes').split(';')) == len(splitter)
 

@@ -24,7 +24,8 @@ from thermo_comp.unit.calibration_file import dump_calibration, save_calibration
 
 
 def arguments(*overrides):
-    words = [word for override in overrides for word in ('-p', override)]
+    kinds = ('-r' if rule.startswith('temperature') else '-p' for rule in overrides)
+    words = [word for pair in zip(kinds, overrides, strict=True) for word in pair]
     return ['thermo_comp_node', '--ros-args', *words]
 
 
@@ -48,6 +49,8 @@ def arguments(*overrides):
         (['calibration_file:={unit}', 'qos_overrides./accel/counts.subscription.depth:=deep'],
          "accel/counts cannot be opened: Trying to set parameter 'qos_overrides./accel/counts"),
         (['calibration_file:={unit}', 'use_sim_time:=7'], "set parameter 'use_sim_time' to '7'"),
+        (['calibration_file:={unit}', 'topics:=board=/t', 'temperature/case:=/t'],
+         '/t: one topic for both board and case: name a single thermometer as the board, not as'),
     ],
 )  # fmt: skip
 def test_a_node_that_cannot_start_prints_one_line(overrides, text, unit, tmp_path, capfd):
@@ -62,16 +65,6 @@ def test_a_node_that_cannot_start_prints_one_line(overrides, text, unit, tmp_pat
     (line,) = printed.err.splitlines()
     assert line.startswith('thermo_comp_node: ')
     assert text in line
-
-
-def test_a_node_with_one_topic_for_two_thermometers_does_not_start(unit, capfd):
-    remaps = [f'temperature/{name}:=/imu/temperature' for name in ('board', 'case')]
-    words = [word for remap in remaps for word in ('-r', remap)]
-    assert main([*arguments(f'calibration_file:={unit}'), *words]) == 1
-    assert capfd.readouterr().err == (
-        'thermo_comp_node: /imu/temperature: one topic for both board and case: name '
-        'a single thermometer as the board, not as another input\n'
-    )
 
 
 @pytest.mark.parametrize(
@@ -172,14 +165,11 @@ def test_the_node_needs_only_ros_numpy_and_yaml(unit, tmp_path, monkeypatch):
     assert (finished.stdout, finished.stderr) == ('', text)
 
 
-def test_the_node_prints_its_help_and_names_unknown_arguments(capfd):
+def test_the_node_prints_its_help_and_names_wrong_arguments(capfd):
     assert main(['thermo_comp_node', '--help']) == 0
     assert 'example: thermo_comp_node --ros-args -p calibration_file' in capfd.readouterr().out
     assert main(['thermo_comp_node', 'unit.yaml']) == 2
     assert "unknown argument 'unit.yaml'" in capfd.readouterr().err
-
-
-def test_wrong_ros_arguments_of_the_node_give_one_line(capfd):
     assert main(['thermo_comp_node', '--ros-args', '--params-file', '/none.yaml']) == 2
     printed = capfd.readouterr().err
     assert 'thermo_comp_node: ' in printed

@@ -30,14 +30,6 @@ def term(kind, x, y, z, slope=0.0):
     return NonlinearTerm(kind, (x, y, z), per_kelvin, 1e-4)
 
 
-def test_a_nonlinear_term_that_depends_on_temperature_needs_a_thermometer():
-    # WHY: if only a nonlinear term had a slope, the calibration needed no board temperature.
-    for slope in (0.0, 1e-7):
-        square = NonlinearTerm('square', (1e-5,) * 3, (0.0, 0.0, slope), 1e-4)
-        value = calibration(nonlinearity=Nonlinearity((0.0, 20.0), 1e-5, (square,)))
-        assert value.needs_temperature == bool(slope)
-
-
 SQUARE = term('square', 1e-5, -2e-5, 3e-5, 0.01)
 ODD = term('odd_square', 5e-6, -5e-6, 1e-5, 0.01)
 CUBE = term('cube', 1e-6, -1e-6, 2e-6, 0.01)
@@ -94,12 +86,17 @@ def test_nonlinear_corrections_of_single_samples_and_blocks_have_equal_bits(rng)
     assert (np.abs(rows[:, 2]) > BENT.force_range_m_s2[1]).any()
 
 
-def test_a_nonlinearity_without_terms_does_not_change_a_bit(rng):
+def test_a_nonlinearity_without_terms_changes_no_bit_and_with_a_slope_needs_a_thermometer(rng):
     plain, events = rich_calibration(), run_of(rng, seconds=30)
     empty = replace(plain, nonlinearity=Nonlinearity((9.0, 100.0), 1e-4))
     before, _ = stream(Compensator(plain, UNCHECKED), events)
     np.testing.assert_array_equal(stream(Compensator(empty, UNCHECKED), events)[0], before)
     assert 'nonlinearity: null' in dump_calibration(plain)
+    # WHY: if only a nonlinear term had a slope, the calibration needed no board temperature.
+    for slope in (0.0, 1e-7):
+        square = NonlinearTerm('square', (1e-5,) * 3, (0.0, 0.0, slope), 1e-4)
+        value = calibration(nonlinearity=Nonlinearity((0.0, 20.0), 1e-5, (square,)))
+        assert value.needs_temperature == bool(slope)
 
 
 def test_the_variance_of_a_nonlinear_axis_includes_all_parameters(rng):

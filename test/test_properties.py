@@ -1,10 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-For any calibration file and any messages the output is finite, bounded and in order of time.
-
-In `make nightly` each test has 10 000 examples.
-"""
+"""For any calibration file and any messages the output is finite, bounded and in order."""
 
 import base64
 import json

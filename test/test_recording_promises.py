@@ -104,7 +104,9 @@ def test_a_compressed_file_is_read_up_to_its_damage(tmp_path):
         read_recording(bag)
 
 
-def test_a_compressed_file_expands_within_limits_and_leaves_no_file(tmp_path, monkeypatch):
+def test_compressed_files_and_messages_expand_within_limits_and_leave_no_file(
+    tmp_path, monkeypatch
+):
     bag = whole(tmp_path, 'mcap', 'FILE')
     temporary = tmp_path / 'temporary'
     temporary.mkdir()
@@ -118,10 +120,8 @@ def test_a_compressed_file_expands_within_limits_and_leaves_no_file(tmp_path, mo
     with pytest.raises(RecordingError, match=rf'{packed.name}: damaged: its content exceeds'):
         read_recording(bag)
     assert not list(temporary.iterdir())
-
-
-def test_a_compressed_message_expands_within_limits(tmp_path):
-    bag = whole(tmp_path, 'sqlite3', 'MESSAGE')
+    (tmp_path / 'messages').mkdir()
+    bag = whole(tmp_path / 'messages', 'sqlite3', 'MESSAGE')
     with sqlite3.connect(bag / 'bag.db3') as database:
         bomb = zstandard.compress(bytes(1 << 28))
         database.execute('update messages set data = ? where id = 1', (bomb,))

@@ -113,7 +113,7 @@ def test_metadata_of_a_written_bag_are_read_back(tmp_path, name):
         assert read_recording(tmp_path / name, require=()).info.metadata == pairs
 
 
-def test_a_written_directory_equals_that_of_rosbag2(tmp_path):
+def test_a_written_directory_equals_that_of_rosbag2_and_a_file_contains_its_name(tmp_path):
     small(tmp_path / 'bag', metadata={'serial': '7'})
     assert {p.name for p in (tmp_path / 'bag').iterdir()} == {'metadata.yaml', 'bag_0.mcap'}
     content = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
@@ -142,10 +142,7 @@ def test_a_written_directory_equals_that_of_rosbag2(tmp_path):
     assert qos == topic['topic_metadata']['offered_qos_profiles']
     assert qos[0]['reliability'] == 'reliable'
     assert yaml.safe_load(metadata['rosbag2']['serialized_metadata']) == content
-
-
-def test_metadata_of_an_mcap_file_contain_its_final_name(tmp_path):
-    """A bag is written under a temporary name, which must not be in its metadata."""
+    # A bag is written under a temporary name, which must not be in its metadata.
     small(tmp_path / 'bag.mcap')
     with (tmp_path / 'bag.mcap').open('rb') as stream:
         (metadata,) = make_reader(stream).iter_metadata()
@@ -193,7 +190,7 @@ def test_an_existing_output_stays_until_the_new_output_is_complete(tmp_path, nam
     assert [p.name for p in tmp_path.iterdir()] == [name]
 
 
-def test_an_output_never_replaces_a_file_or_folder_that_is_no_bag(tmp_path):
+def test_an_output_may_be_a_link_but_never_replaces_a_file_or_folder_that_is_no_bag(tmp_path):
     (tmp_path / 'home').mkdir()
     (tmp_path / 'home' / 'thesis.tex').write_text('ten years of work')
     (tmp_path / 'file').write_text('')
@@ -205,9 +202,6 @@ def test_an_output_never_replaces_a_file_or_folder_that_is_no_bag(tmp_path):
     ):
         with pytest.raises(OutputError, match=f'is not replaced: {reason}'):
             BagWriter(tmp_path / name, overwrite=True)
-
-
-def test_an_output_may_be_a_link(tmp_path):
     for name in ('bag', 'bag.mcap'):
         small(tmp_path / 'disk' / name, 1.0)
         (tmp_path / name).symlink_to(tmp_path / 'disk' / name)
@@ -239,8 +233,7 @@ def test_arguments_of_wrong_shape_or_type_are_refused(tmp_path):
 
 @pytest.mark.parametrize('name', ['bag', 'bag.mcap'])
 def test_regime_topics_of_a_bag_have_the_qos_of_the_node(tmp_path, name):
-    # WHY: a bag of `replay` had `regime/stamped` as volatile, so on playing the bag a subscriber
-    # that joined later got no regime.
+    # WHY: `regime/stamped` was volatile, so a subscriber that joined later got no regime.
     with BagWriter(tmp_path / name) as bag:
         bag.write_raw('imu0/regime/dynamic', BOOL, [1], [b''])
         for topic in ('imu0/regime/stamped', '/diagnostics'):

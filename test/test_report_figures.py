@@ -49,7 +49,6 @@ def test_drawn_bias_and_scale_curves_agree_with_formulas():
 
 @pytest.mark.slow
 def test_measured_errors_in_soaks_are_those_of_the_scale_factors():
-    # In soaks the scale factors of all axes have an error of 30 ppm.
     windows = evidence().windows
     up = np.array([position.up for position in evidence().positions])[windows.position]
     length = np.where(windows.is_dynamic, 1.0, 1.0 + 30e-6) * windows.gravity
@@ -63,14 +62,11 @@ def test_measured_errors_in_soaks_are_those_of_the_scale_factors():
     assert np.linalg.norm(bias, axis=1) == pytest.approx(30.0, rel=1e-4)
 
 
-def test_position_errors_of_a_navigator_agree_with_hand_numbers():
+def test_position_errors_and_the_map_of_the_sphere_agree_with_hand_numbers():
     # A bias of 1 mg causes a position error of 9.80665e-3 * 1800 m in 60 s; a bias of 1 ug causes
     # a position error of at most 1e-6 Earth diameters at any time.
     assert position_error(1e3 * MICRO_G, 60.0) == pytest.approx(17.652, rel=1e-4)
     assert schuler_peak(MICRO_G) == pytest.approx(12.742, rel=1e-4)
-
-
-def test_the_map_of_the_sphere_preserves_areas():
     assert figures.equal_area((0.0, 0.0, 1.0), 1) == (0.0, 0.0)
     assert figures.equal_area((0.0, 1.0, 0.0), -1) == (0.0, 1.0)
     # The cap above 45 deg is 1 - sin 45 of the hemisphere; its map is this share of the disc.
@@ -78,7 +74,7 @@ def test_the_map_of_the_sphere_preserves_areas():
     assert x**2 + y**2 == pytest.approx(1.0 - np.sqrt(0.5))
 
 
-def test_the_drawn_trace_covers_the_bag_without_a_gap():
+def test_the_drawn_trace_covers_the_bag_without_a_gap_also_without_a_case():
     bag = fitted().bags[0]
     stretches = shown_bag(bag, 0, DetectorSettings()).stretches
     assert stretches[0].regime == Regime.UNKNOWN
@@ -87,10 +83,6 @@ def test_the_drawn_trace_covers_the_bag_without_a_gap():
     for before, after in pairwise(stretches):
         assert before.stop == after.start
         assert (before.regime, before.direction) != (after.regime, after.direction)
-
-
-def test_the_drawn_trace_without_a_case_thermometer_is_that_of_the_board():
-    bag = fitted().bags[0]
     bag = replace(bag, temperatures={'board': bag.board})
     shown = shown_bag(bag, 0, DetectorSettings())
     assert shown.leader == 'board'
@@ -133,7 +125,6 @@ def test_the_area_of_a_ring_is_proportional_to_the_residual_of_its_position():
         lines = [line for axes in figures.draw_positions(evidence()).axes for line in axes.lines]
     rings = [line for line in lines if line.get_marker() == 'o' and line.get_mfc() == 'none']
     areas = np.sort([ring.get_markersize() ** 2 for ring in rings])
-    # A position without a left-out residual has a ring of area 0.
     rms = np.sort([place.residual_rms.get(LEFT_OUT, 0.0) for place in evidence().positions])
     assert areas / areas[-1] == pytest.approx(rms / rms[-1])
 

@@ -235,7 +235,7 @@ def test_the_size_of_a_rest_log_is_limited_per_day_and_in_total(tmp_path, monkey
     assert (log.n_days, log.n_lost, log.reason) == (6, 0, '')
 
 
-def test_rests_lost_on_a_full_disk_are_counted(small_disk):
+def test_rests_that_cannot_be_kept_are_counted_and_impossible_folders_refused(small_disk, unit):
     log = RestLog(str(small_disk))
     for k in range(100):
         log.put(rest(k).stamp_ns, encode(START), encode(rest(k)))
@@ -244,6 +244,8 @@ def test_rests_lost_on_a_full_disk_are_counted(small_disk):
     assert 0 < len(kept) < 100
     assert (log.n_rests, log.n_lost) == (len(kept), 100 - len(kept))
     assert log.reason == 'No space left on device'
+    with pytest.raises(OutputError, match='rests: parameter `rest_log`: Not a directory'):
+        RestLog(f'{unit}/rests')
 
 
 def test_a_killed_node_damages_at_most_one_line_of_its_rest_log(tmp_path, unit, peer):
@@ -296,8 +298,7 @@ def test_a_killed_node_damages_at_most_one_line_of_its_rest_log(tmp_path, unit, 
 
 
 def test_a_rest_has_the_temperature_at_its_own_time_at_any_speed_of_playing(tmp_path, unit, peer):
-    # WHY: the thermal state was that at the end of a block of samples, which at 70 times real time
-    # is a minute after the rest: an error of 0.75 K in a ramp.
+    # WHY: the thermal state was that at the end of a block: in a ramp an error of 0.75 K.
     folder, rate_k_s = tmp_path / 'rests', 0.02
     words = node_arguments(unit, f'rest_log:={folder}', 'diagnostics_period:=1.0')
     with node_in_thread(*words) as node:
@@ -322,8 +323,3 @@ def test_the_diagnostics_warn_of_a_full_disk(small_disk, unit, peer):
         send(driver, standing(12 * RATE_HZ))
         text = 'not kept in the rest log: No space left on device'
         peer.wait_for(lambda: any(text in each.status[0].message for each in heard), text)
-
-
-def test_a_folder_that_cannot_be_made_is_refused(unit):
-    with pytest.raises(OutputError, match='rests: parameter `rest_log`: Not a directory'):
-        RestLog(f'{unit}/rests')

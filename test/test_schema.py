@@ -99,9 +99,17 @@ def test_the_message_about_a_wrong_value_names_its_key(data, key, message):
     assert str(caught.value).startswith(key)
 
 
-def test_generated_pages_are_up_to_date():
+def test_generated_pages_are_up_to_date_and_targets_of_links_exist():
     for path, text in make_reference.pages().items():
         assert path.read_text() == text, f'{path} is stale: run python docs/make_reference.py'
+    pages = [*ROOT.glob('*.md'), *(ROOT / 'docs').glob('*.md'), *(ROOT / 'bags').glob('*.md')]
+    broken = []
+    for page in pages:
+        for piece in page.read_text().split('](')[1:]:
+            target = piece.partition(')')[0].partition('#')[0]
+            if target and '://' not in target and not (page.parent / target).exists():
+                broken.append(f'{page.name}: {target}')
+    assert not broken
 
 
 def test_json_schema_agrees_with_the_dataclasses():
@@ -125,14 +133,3 @@ def test_json_schema_agrees_with_the_dataclasses():
         'kind': {'const': 'circle', 'default': 'circle'},
     }  # fmt: skip
     assert schema['$defs']['Circle']['required'] == ['radius']
-
-
-def test_targets_of_the_links_between_pages_exist():
-    pages = [*ROOT.glob('*.md'), *(ROOT / 'docs').glob('*.md'), *(ROOT / 'bags').glob('*.md')]
-    broken = []
-    for page in pages:
-        for piece in page.read_text().split('](')[1:]:
-            target = piece.partition(')')[0].partition('#')[0]
-            if target and '://' not in target and not (page.parent / target).exists():
-                broken.append(f'{page.name}: {target}')
-    assert not broken

@@ -14,7 +14,7 @@ from triads import TRIAD_NAMES, unit_of
 
 from thermo_comp.simulation.campaign import Cyclogram, parse_cyclogram, positions
 from thermo_comp.simulation.drift import CreepEffect, PartHistory
-from thermo_comp.simulation.network import AIR, Link, ThermalNetwork, ThermalResponse
+from thermo_comp.simulation.network import AIR, ThermalResponse
 from thermo_comp.simulation.presets import UNIT_NAMES, unit_preset
 from thermo_comp.simulation.run import START_NS, simulate, simulate_blocks
 from thermo_comp.unit.gravity import MICRO_G, STANDARD_GRAVITY
@@ -163,25 +163,6 @@ def response_of(network, time, air):
     return ThermalResponse(network, np.array(time), np.array(air))
 
 
-def test_two_parts_follow_a_ramp_like_the_closed_solution():
-    """The chain air - case - board, in which heat also flows from board to case."""
-    c0, c1, g0, g1, rate = 700.0, 300.0, 3.0, 0.4, 1.0 / 60.0
-    links = Link(AIR, 'case', g0), Link('case', 'board', g1)
-    network = ThermalNetwork({'case': c0, 'board': c1}, links)
-    trace, determinant = -(g0 + g1) / c0 - g1 / c1, g0 * g1 / (c0 * c1)
-    root = math.sqrt(trace * trace - 4.0 * determinant)
-    modes = np.array([(trace + root) / 2.0, (trace - root) / 2.0])
-    # In a ramp the air heats the case and, through the case, the board.
-    lag = np.array([(c0 + c1) / g0, (c0 + c1) / g0 + c1 / g1])
-    shapes = np.array([modes + g1 / c1, [g1 / c1, g1 / c1]])
-    amplitude = np.linalg.solve(shapes, lag)
-    time = np.linspace(0.0, 5400.0, 91)
-    decaying = np.exp(np.outer(time, modes)) * amplitude
-    expected = rate * (time[:, None] - lag + decaying @ shapes.T)
-    response = response_of(network, [0.0, 5400.0], [0.0, rate * 5400.0])
-    np.testing.assert_allclose(response.temperatures(time), expected, atol=ROUNDING)
-
-
 @pytest.mark.parametrize('name', [*UNIT_NAMES, *TRIAD_NAMES])
 def test_presets_agree_with_a_numerical_integrator(name):
     unit = unit_of(name, 3)
@@ -246,5 +227,4 @@ def test_a_thermostat_keeps_its_part_within_0_2_k_by_the_power_that_leaks():
     program = parse_cyclogram('fast')
     response = response_of(network, program.time_s, program.temperature_c)
     grid = np.arange(0.0, program.duration_s, 30.0)
-    # The air changes by 30 K at up to 3 K/min.
     assert np.ptp(response.temperatures(grid)[:, head]) < 0.2

@@ -37,7 +37,7 @@ def test_the_lag_is_unknown_at_the_start_and_known_after_some_time():
     assert tracker.is_settled(round((settled_s + 10.0) * 1e9))
 
 
-def test_the_thermal_state_does_not_depend_on_earlier_queries():
+def test_the_thermal_state_depends_on_no_earlier_query_and_no_origin_of_time():
     tracker, other = (ThermalTracker(DetectorSettings(), LAG) for _ in range(2))
     board = 20.0 + 0.005 * np.arange(3000)
     feed(tracker, board, board + 1.0)
@@ -48,9 +48,6 @@ def test_the_thermal_state_does_not_depend_on_earlier_queries():
         other.is_settled(k * SECOND_NS + 456_000_000)
     at = 3000 * SECOND_NS
     assert tracker.sample(at) == other.sample(at)
-
-
-def test_the_thermal_state_does_not_depend_on_the_origin_of_time():
     epoch_ns = 1_790_000_000 * SECOND_NS
     tracker, other = (ThermalTracker(DetectorSettings(), LAG) for _ in range(2))
     board = 20.0 + 0.01 * np.arange(500)
@@ -59,25 +56,16 @@ def test_the_thermal_state_does_not_depend_on_the_origin_of_time():
     assert tracker.sample(500 * SECOND_NS) == other.sample(epoch_ns + 500 * SECOND_NS)
 
 
-def ramp(tracker):
-    soak = np.full(1200, 20.0)
-    feed(tracker, soak, soak)
-    assert tracker.detector.regime == Regime.STATIC
-    weights = []
-    for k in range(1, 600):
-        case = 20.0 + k / 60.0
-        stamp_ns = (1199 + k) * SECOND_NS
-        tracker.read('board', stamp_ns, 20.0 + (k / 60.0) * 0.2)
-        tracker.read('case', stamp_ns, case)
-        weights.append(tracker.weight_at(stamp_ns))
-    assert tracker.detector.regime == Regime.DYNAMIC
-    return np.array(weights)
-
-
 @pytest.mark.parametrize(('transition_s', 'n_steps'), [(20.0, 20), (0.0, 1)])
 def test_the_dynamic_weight_is_linear_over_the_transition_time(transition_s, n_steps):
-    config = ThermalConfig(transition_time_s=transition_s)
-    weights = ramp(ThermalTracker(DetectorSettings(), None, config))
+    config, soak = ThermalConfig(transition_time_s=transition_s), np.full(1200, 20.0)
+    tracker, weights = ThermalTracker(DetectorSettings(), None, config), []
+    feed(tracker, soak, soak)
+    assert tracker.detector.regime == Regime.STATIC
+    for k in range(1, 600):
+        feed(tracker, [20.0 + (k / 60.0) * 0.2], [20.0 + k / 60.0], start_s=1199 + k)
+        weights.append(tracker.weight_at((1199 + k) * SECOND_NS))
+    assert tracker.detector.regime == Regime.DYNAMIC
     steps = np.diff(weights)
     moving = steps[steps != 0.0]
     np.testing.assert_allclose(moving, [1.0 / n_steps] * n_steps, atol=1e-9)

@@ -1,10 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-A third thermometer, on the lid, is found in the bags, fitted, used by replay, and reduces errors.
-
-Electronics that are switched at random warm the lid by 5 K, but board and case by 0.1 K only, so
-only the thermometer on the lid shows when the lid changes the biases.
+A third thermometer, on the lid, reduces errors: only it shows when the lid changes the biases, as
+electronics switched at random warm the lid by 5 K, board and case by 0.1 K.
 """
 
 import math

@@ -54,8 +54,7 @@ def rms(values):
 
 @pytest.mark.slow
 def test_a_lag_is_corrected_at_twice_the_rates_of_the_fit():
-    # WHY: a fit with products and squares of a lag, but without the lag itself, had small errors
-    # in left-out data, but force errors of over 1.7 mg in ramps of twice the rate.
+    # WHY: a fit with products of a lag, but without the lag, had errors of over 1.7 mg there.
     rng = np.random.default_rng(2)
     up = (0.0, -20.0), (1200.0, -20.0), (9000.0, 45.0), (10200.0, 45.0)
     down = tuple((t, 25.0 - celsius) for t, celsius in up)
@@ -70,27 +69,23 @@ def test_a_lag_is_corrected_at_twice_the_rates_of_the_fit():
     is_used = at_rest & np.isfinite(out.specific_force).all(axis=1)
     error = (out.specific_force - force)[is_used]
     error = error[: len(error) // 60 * 60].reshape(-1, 60, 3).mean(axis=1)
-    # The error must be below a quarter of the effect of the lag. A fit with products of the lag,
-    # but without the lag itself, has an error larger than the effect of the lag.
+    # With products of the lag, but without the lag, the error exceeds the effect of the lag.
     assert rms(of_lag) > 0.5e-3 * GRAVITY
     assert rms(error) < 0.25 * rms(of_lag)
 
 
 def test_the_claimed_sd_of_a_mems_with_a_single_turn_on_is_0_3_to_1_5_mg():
-    # WHY: one recording does not show how much the bias changes at a turn-on. The claimed sd was
-    # too small: a bias change of 0.6 mg at a turn-on of a MEMS was 5 times the claimed sd.
+    # WHY: a bias change of 0.6 mg at a turn-on of a MEMS was 5 times the claimed sd.
     rng = np.random.default_rng(3)
     bag, *_ = turned(rng, ((0.0, 20.0), (9000.0, 20.0)), 'one')
     unit = tc.fit([bag], gravity=GRAVITY, input='m/s^2')
-    # The bias of a MEMS of noise `NOISE` changes by 0.1 to 1 mg (geometric mean 0.3 mg) at a
-    # turn-on. The x axis' residual sd must be 0.3 to 1.5 mg.
+    # The bias of a MEMS of noise `NOISE` changes by 0.1 to 1 mg at a turn-on.
     assert 0.3 * 1e-3 * GRAVITY < unit.static.x.residual_sd_m_s2 < 1.5e-3 * GRAVITY
 
 
 @pytest.mark.slow
 def test_an_update_after_a_new_turn_on_gives_the_mean_of_both_turn_ons():
-    # WHY: an update took the difference of two turn-ons for ageing, and took the bias of the later
-    # turn-on alone: the error after a third turn-on was larger than without the update.
+    # WHY: an update took the bias of the later turn-on alone, as the difference seemed ageing.
     rng = np.random.default_rng(5)
     change = 1e-3 * GRAVITY * np.array([1.0, -0.8, 0.6])
     bags = [turned(rng, ((0.0, 20.0), (5400.0, 20.0)), name)[0] for name in ('one', 'two')]

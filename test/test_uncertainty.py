@@ -30,9 +30,8 @@ from thermo_comp.unit.prediction import SlowUncertainty, bias_scale_and_sd, ramp
 
 
 def test_the_claimed_sd_covers_a_start_in_a_ramp():
-    # WHY: after a restart in a ramp the claimed sd was a third of the error. At the start
-    # the lag of a part (tau = 60 s) is unknown: its sd in a soak is 0.4 K; in a ramp of 1 K/min it
-    # is 1 K. The claimed sd must not change if the ramp ends 40 s after the start.
+    # WHY: after a restart in a ramp the claimed sd was a third of the error. An unknown lag (60 s)
+    # has an sd of 0.4 K in a soak, 1 K in a ramp of 1 K/min, also if the ramp ends after 40 s.
     unit = calibration(response=(term('board', (30.0, 0.0, 0.0), tau_s=60.0),))
     sd = {}
     for rate, end in ((0.0, 60), (1.0 / 60.0, 60), (1.0 / 60.0, 40)):
@@ -53,9 +52,8 @@ def test_the_claimed_sd_covers_a_start_in_a_ramp():
 
 
 def test_the_claimed_sd_covers_a_lagged_gradient_after_a_start_in_a_ramp():
-    # WHY: after a start in a ramp the error of a lag of the gradient was five claimed sds. The
-    # case leads the board by 5 K; at the start the lagged gradient may have its value in a soak.
-    # A ramp that begins over a lag (600 s) after the start does not increase the sd.
+    # WHY: after a start in a ramp with a case 5 K above the board a lagged gradient was wrong by
+    # five claimed sds. A ramp that begins over a lag (600 s) after the start does not matter.
     response = (term('gradient_lag', (30.0, 0.0, 0.0), tau_s=600.0),)
     unit = replace(calibration(response=response), board_lag_s=300.0)
     sd = {}
@@ -74,7 +72,7 @@ def test_the_claimed_sd_covers_a_lagged_gradient_after_a_start_in_a_ramp():
     assert sd[700] < 0.2 * sd[0]
 
 
-def test_if_the_case_sensor_is_lost_the_gradient_is_its_last_value_at_rest():
+def test_without_case_readings_the_gradient_is_that_at_rest():
     # WHY: the board is 1 K warmer than the case; without case readings 0 K was assumed.
     unit = calibration(response=(term('gradient', (30.0, 0.0, 0.0)),))
     compensator = Compensator(unit, UNCHECKED)
@@ -88,9 +86,6 @@ def test_if_the_case_sensor_is_lost_the_gradient_is_its_last_value_at_rest():
         corrected.append(compensator.process(stamp, 300.0, 300.0, 2943.0 + second % 2))
     # An error of the gradient of 0.1 K is 3 counts, or 0.01 m/s^2 at 300 counts per m/s^2.
     assert corrected[-1][0] == pytest.approx(corrected[1499][0], abs=0.01)
-
-
-def test_if_the_case_sensor_never_reads_the_gradient_is_that_of_the_fit_at_rest():
     of_gradient = (term('gradient', (30.0, 0.0, 0.0)),)
     unit = calibration(response=of_gradient, rest_gradient_range_k=(-1.1, -0.9))
     compensator = Compensator(unit, UNCHECKED)
@@ -153,8 +148,7 @@ def test_the_claimed_sd_covers_thermometer_errors_for_parts_that_lag_the_board(f
 
 
 def test_the_lack_of_fit_is_included_in_the_sd_of_bias_and_of_scale():
-    # WHY: where no position had gravity along the axis, the certificate stated the scale factor to
-    # 11 ppm, because the lack of fit increased the sd of the bias only.
+    # WHY: the lack of fit increased the sd of the bias only: the scale was certified to 11 ppm.
     lacks = LackOfFit(0.0, (0.0, 3e-3, 4e-3)), LackOfFit(20.0, (0.0, 0.0, 0.0))
     plain = calibration()
     lacking = replace(plain, static=replace(plain.static, lack_of_fit=lacks))
@@ -192,7 +186,7 @@ def sd_at(unit, board, behind=0.0, force=0.0):
     return math.sqrt(a - correction.noise[0] + b * force + c * force**2)
 
 
-def test_beyond_the_range_curve_and_lag_do_not_cancel_in_the_claimed_sd():
+def test_beyond_the_range_slopes_do_not_cancel_in_the_claimed_sd():
     # Inside the range the slopes of curve and lag over board temperature cancel. Outside of the
     # range the claimed sd is that of the curve's slope alone, as if the lag did not cancel it.
     parts = regime_set(axis_set((0.0, 0.5), residual_sd_m_s2=1e-6))
@@ -202,9 +196,6 @@ def test_beyond_the_range_curve_and_lag_do_not_cancel_in_the_claimed_sd():
     # The board is at 41 degC, 6 K above the range of 20 +- 15 degC.
     far = math.sqrt(1.0 + (6.0 / 15.0) ** 2)
     assert sd_at(unit, 41.0) == pytest.approx(0.5 * 6.0 / 300.0 * far, rel=1e-3)
-
-
-def test_beyond_the_range_bias_and_scale_slopes_do_not_cancel_in_the_claimed_sd():
     # At 35 degC, the end of the range, the bias slope is 0.8 counts/K; at a force of 10 m/s^2 the
     # scale slope cancels the bias slope.
     bent = axis_set((0.0, 0.5, 0.01), (1.0, -0.8 / 3000.0), residual_sd_m_s2=1e-6)
@@ -224,7 +215,7 @@ def curves_at(unit, celsius):
 BENT, WAVY = (0.0, 0.5, 0.01), (0.0, -0.3, 0.02, 1e-3)
 
 
-def test_beyond_the_range_curves_follow_their_tangent_for_a_quarter_of_the_range():
+def test_beyond_the_range_curves_follow_their_tangent_or_the_other_set():
     static, dynamic = axis_set(BENT, (1.0, 1e-4, 2e-6)), axis_set(WAVY, (1.0, 5e-5), delta=2.0)
     unit = calibration(static=regime_set(static), dynamic=regime_set(dynamic))
     for edge, sign in ((35.0, 1.0), (5.0, -1.0)):
@@ -238,9 +229,6 @@ def test_beyond_the_range_curves_follow_their_tangent_for_a_quarter_of_the_range
         for value, beyond in zip(outside, (1e-9, 3.0, 7.5, 7.5, 7.5), strict=True):
             expected = at_edge + sign * beyond * np.array(slopes)
             np.testing.assert_allclose(value, expected, rtol=1e-12, atol=1e-12)
-
-
-def test_outside_its_range_a_set_follows_the_curve_of_the_other_set():
     # The static set of curves is valid from 5 to 35 degC, the dynamic set from 0 to 30 degC.
     unit = calibration(
         static=regime_set(axis_set(BENT)),
@@ -305,9 +293,8 @@ def test_the_claimed_sd_grows_with_the_distance_from_the_range():
         assert (np.sqrt(variances[3]) > 3.0 * np.abs(slopes)).all()
 
 
-def test_with_lags_the_sd_in_a_ramp_does_not_depend_on_the_calibrated_rates():
-    # WHY: for a unit fitted to soaks (rates below 0.1 K/min) the claimed variance in a ramp was
-    # multiplied by several hundred, although it already contained the variance of the lag.
+def test_rates_and_squares_beyond_their_range_increase_the_sd_by_their_distance():
+    # WHY: in a ramp the variance of a unit fitted to soaks, which has that of the lag, grew anew.
     axis = axis_set(residual_sd_m_s2=1e-5)
     soaks = regime_set(axis, rate_range_k_min=(-0.1, 0.1))
     sds = []
@@ -320,11 +307,7 @@ def test_with_lags_the_sd_in_a_ramp_does_not_depend_on_the_calibrated_rates():
     # The rate, 2 K/min, exceeds the largest calibrated rate, 0.1 K/min, by 19 times 0.1 K/min:
     # only the unit without lags gets additional variance.
     assert sds == pytest.approx([1e-5 * math.hypot(1.0, 19.0), 1e-5], rel=1e-6)
-
-
-def test_the_distance_of_a_squared_column_from_its_range_is_that_of_its_quantity():
-    # WHY: a lag of 10 K is 100 times the largest lag in the bags, 0.1 K. The squares of
-    # both lags, with a ratio of 10000, were compared, and the claimed sd was 0.1 g.
+    # WHY: of a lag 100 times the largest in the bags the squares were compared: an sd of 0.1 g.
     unit = calibration(response=(term('square', (1.0, 0.0, 0.0), tau_s=600.0, range=(0.0, 0.01)),))
     correction = Correction(unit)
     state = np.zeros(StateLayout(correction.memory).width)
@@ -333,7 +316,7 @@ def test_the_distance_of_a_squared_column_from_its_range_is_that_of_its_quantity
     assert 99.0 < excess.relative < 150.0
 
 
-def test_a_lagged_temperature_outside_the_range_increases_the_claimed_sd():
+def test_parts_outside_the_range_increase_the_claimed_sd():
     bent = regime_set(axis_set((0.0, 0.5, 0.01), residual_sd_m_s2=1e-6))
     lag = term('board', (-0.5, 0.0, 0.0), tau_s=600.0)
     unit = calibration(static=bent, dynamic=bent, response=(lag,))
@@ -342,11 +325,7 @@ def test_a_lagged_temperature_outside_the_range_increases_the_claimed_sd():
     assert sd_at(unit, 33.0, behind=-1.0) == pytest.approx(1e-6, rel=1e-6)
     bends = 0.6 / math.sqrt(12.0)
     assert sd_at(unit, 33.0, behind=-8.0) == pytest.approx(bends * 6.0 / 300.0, rel=0.05)
-
-
-def test_a_bend_increases_the_claimed_sd_of_a_part_outside_the_range():
-    # WHY: only the slopes of the curve over the board temperature counted: the bias of a part had
-    # a bump, and at 1.5 K below the range the error was 230 ug, the claimed sd 14 ug.
+    # WHY: a bump of the bias of a part caused an error of 230 ug with a claimed sd of 14 ug.
     unit = calibration(response=(term('bend', (0.5, 0.0, 0.0), tau_s=600.0),))
     # The slope is 0 below 20 degC, 0.5 counts/K above: its sd over the range is 0.25 counts/K.
     assert sd_at(unit, 7.0, behind=5.0) == pytest.approx(0.25 * 3.0 / 300.0, rel=0.1)

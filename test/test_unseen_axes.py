@@ -108,22 +108,19 @@ def test_after_one_cold_bag_the_claimed_sd_covers_the_scale_errors_of_all_axes(n
 @pytest.mark.parametrize('poses', [1, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize('unit', [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_rests_in_one_pose_at_four_temperatures_determine_the_drift_of_level_axes(unit, poses):
-    # WHY: if the attitude of each rest is free, only the warm-up of the board determines the bias
-    # curve. The sensor lags the board, which caused bias errors of 1 to 4 mg between the rests.
+    # WHY: the warm-up of the board alone determined the curve: bias errors of 1 to 4 mg.
     study = list(cases.returned(unit))[poses - 1]
     calibration = strangers.fitted(study)
     (held,) = map(slow, study.tests[''])
     force = strangers.corrected(calibration, held).force
     drift = force - strangers.minutes(held).force
     drift -= np.nanmean(drift, axis=0)
-    # Attitude errors of 0.2 mrad RMS in the rests cause errors of about 0.2 mg in the bias curve
-    # of a level axis. The tolerance is 0.4 mg, twice the error of the bias curve.
+    # Attitude errors of 0.2 mrad RMS cause errors of about 0.2 mg; the tolerance is twice that.
     assert np.sqrt(np.nanmean(drift**2)) < 2.0 * 2e-4 * GRAVITY
 
 
 def test_only_an_attitude_to_which_the_unit_was_returned_is_a_pose():
-    # WHY: parts of one long rest counted as returns to a pose, so that a random walk of the bias
-    # was fitted as a curve over temperature.
+    # WHY: parts of one long rest counted as returns to a pose: a random walk became a curve.
     x, y = np.eye(3)[:2]
 
     def poses(*up, start_ns=range(4)):
@@ -157,10 +154,8 @@ def test_rests_in_one_pose_use_the_mounting_sd_that_the_user_stated():
     ],
 )
 def test_the_claimed_sd_is_right_if_one_ramp_cannot_separate_bias_and_scale(draw, unit, is_cold):
-    # WHY: thermometer noise in rests at constant temperature was taken for temperature changes
-    # without effect on the bias. In the only ramp the drift was attributed to scale factors: 470
-    # ppm/K instead of -36 ppm/K. In warm-ups of a cold unit the effect of a lag was attributed to
-    # the scale factor alone.
+    # WHY: the drift in the only ramp was attributed to the scale factors, as thermometer noise at
+    # constant temperature seemed to have no effect on the bias, or by the effect of a lag.
     rng = rng_of('bench beside a ramp', unit)
     imu = draw(rng)
     bench = program(22.0, 5.0)
@@ -178,6 +173,5 @@ def test_the_claimed_sd_is_right_if_one_ramp_cannot_separate_bias_and_scale(draw
     study = cases.Study('', tuple(bags[:15]), cases.one_test(held), options)
     tests = {'': [strangers.minutes(bag) for bag in held]}
     score = strangers.scored(study, strangers.fitted(study), tests)['']
-    # A ramp in one attitude does not determine the slopes of the three scale factors. If claimed
-    # sd are right, the RMS of error / claimed sd exceeds 1.9 for 1 % of all units.
+    # If claimed sd are right, the RMS of error / claimed sd exceeds 1.9 for 1 % of all units.
     assert score.ratio < 1.9

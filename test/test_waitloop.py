@@ -10,7 +10,6 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
 
 from geometry_msgs.msg import Vector3Stamped
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from ros_helpers import DEEP, TIMEOUT, bare_node
@@ -58,22 +57,19 @@ class Running:
         assert not self.thread.is_alive()
 
 
-def test_rclpy_has_the_undocumented_attributes_in_use():
-    for path in (
-        *(f'WaitSet.{name}' for name in ('clear_entities', 'add_subscription', 'add_service')),
-        *('WaitSet.add_guard_condition', 'WaitSet.wait', 'WaitSet.is_ready'),
-        *('Subscription.take_message', 'Subscription.pointer', 'Subscription.get_publisher_count'),
-        *('Service.service_take_request', 'Publisher.publish_raw'),
-    ):
-        kind, name = path.split('.')
-        assert hasattr(getattr(rclpy_implementation, kind), name), f'rclpy._rclpy lost {path}'
-    assert issubclass(rclpy_implementation.RCLError, RuntimeError)
-    assert issubclass(RCLError, Exception)
-
-
-def test_names_of_parameters_that_the_user_set_are_returned(node):
+def test_names_of_set_parameters_are_returned_and_qos_can_be_overridden(node):
     node.declare_parameter('known', 1)
     assert overrides(node) == {'mispelt': 1, 'known': 2}
+    loop = WaitLoop(node)
+    node.declare_parameter('qos_overrides./others.subscription.depth', 3)
+    qos = QoSProfile(depth=7)
+    loop.subscribe(Vector3Stamped, 'samples', qos)
+    loop.subscribe(Vector3Stamped, 'others', qos)
+    # rclpy writes overrides into the given QoS profile, so each subscription needs a copy.
+    assert qos.depth == 7
+    assert node.get_parameter('qos_overrides./samples.subscription.depth').value == 7
+    reliability = node.get_parameter('qos_overrides./samples.subscription.reliability')
+    assert ReliabilityPolicy[reliability.value.upper()] is ReliabilityPolicy.RELIABLE
 
 
 def test_messages_lost_by_a_full_queue_are_counted(node, peer):
@@ -156,19 +152,6 @@ def test_a_subscription_can_be_removed_while_the_loop_runs(node, peer):
         publisher.publish(Vector3Stamped())
         running.wait_for(lambda: len(running.messages) == 2)
     assert all(subscription.topic != 'others' for subscription in node.subscriptions)
-
-
-def test_qos_of_a_subscription_can_be_overridden(node):
-    loop = WaitLoop(node)
-    node.declare_parameter('qos_overrides./others.subscription.depth', 3)
-    qos = QoSProfile(depth=7)
-    loop.subscribe(Vector3Stamped, 'samples', qos)
-    loop.subscribe(Vector3Stamped, 'others', qos)
-    # rclpy writes overrides into the given QoS profile, so each subscription needs a copy.
-    assert qos.depth == 7
-    assert node.get_parameter('qos_overrides./samples.subscription.depth').value == 7
-    reliability = node.get_parameter('qos_overrides./samples.subscription.reliability')
-    assert ReliabilityPolicy[reliability.value.upper()] is ReliabilityPolicy.RELIABLE
 
 
 @pytest.mark.parametrize(
