@@ -160,8 +160,7 @@ def test_one_bag_in_kelvins_or_with_a_constant_axis_is_refused_by_name(rng):
     in_kelvins(rests[4])
     with pytest.raises(FitError, match=r'^bag4: temperature/board reads 2\d+\S* degC .* kelvins'):
         fit(sources_of(rests), FORCE)
-    # WHY: in one position the y axis was constant for hours, and the fit attributed the missing
-    # drift of y to all positions.
+    # WHY: in one position the y axis was constant; the fit attributed its drift to all positions.
     rests = rests_of(rng)
     rests[4].accel[:, 1] = rests[4].level[1]
     with pytest.raises(FitError, match=r'^bag4: y reads exactly \S+ for 0\.\d+ h: the axis is'):
@@ -193,8 +192,7 @@ def test_the_advice_for_rests_without_noise_names_the_parameter_of_the_node(rng)
 
 @pytest.mark.parametrize(('n', 'n_prior', 'step'), [(8, 6, 1e-2), (2, 1, 1e-4)])
 def test_samples_with_steps_above_their_noise_are_fitted_or_refused(rng, n, n_prior, step):
-    # WHY: for an axis with constant samples the fit assumed a noise of 1e-8 m/s^2, and a fit with
-    # a prior ended with a LinAlgError.
+    # WHY: for constant samples the fit assumed a noise of 1e-8 m/s^2, and a LinAlgError ended it.
     rests = rests_of(rng, n, sd=1e-5)
     for rest in rests:
         drift = 1e-2 * np.outer((rest.temperature(rest.time) - 25.0) / 20.0, (1.0, -0.5, 0.3))

@@ -102,7 +102,7 @@ def test_equal_readings_in_any_form_give_equal_output(arrays):
         np.testing.assert_array_equal(same.covariance, out.covariance)
 
 
-def test_unusable_samples_give_rows_of_nan(arrays):
+def test_unusable_samples_give_rows_of_nan_and_empty_arrays_empty_arrays(arrays):
     counts = arrays['counts'].copy()
     counts[7, 1], counts[9, 2] = np.nan, 32767.0
     board = np.where(arrays['time_s'] < 0.55, np.nan, arrays['board'])
@@ -117,9 +117,6 @@ def test_unusable_samples_give_rows_of_nan(arrays):
     # Without a case thermometer the dynamic regime begins no earlier than with one.
     assert late.dynamic.any()
     assert np.argmax(late.dynamic) >= np.argmax(out.dynamic)
-
-
-def test_empty_arrays_give_empty_arrays():
     out = thermal_calibration().correct([], np.empty((0, 3)), board=[])
     assert out.specific_force.shape == (0, 3)
     assert out.covariance.shape == (0, 3, 3)

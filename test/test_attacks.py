@@ -171,7 +171,6 @@ def test_a_write_killed_at_any_line_leaves_the_old_or_the_new_calibration(tmp_pa
     lines = [line.split() for line in done.stdout.splitlines()]
     *killed, last = lines
     assert last == ['0', 'new']
-    # The writing process was killed at each line before and after the rename of the new file.
     assert len(killed) > 30
     assert {code for code, _ in killed} == {str(signal.SIGKILL.value)}
     assert [name for name, _ in itertools.groupby(name for _, name in killed)] == ['old', 'new']

@@ -26,7 +26,6 @@ from thermo_comp.unit.calibration_file import (
 from thermo_comp.unit.functions import CubicSpline, Exponential
 from thermo_comp.unit.provenance import GroupEvidence
 
-REPOSITORY = Path(__file__).parents[1]
 # The largest accepted bias is twice the full scale of 32767 counts.
 number = st.floats(-6.5e4, 6.5e4)
 # With coefficients up to 1e-6 a scale function is near 1 over 15 K.
@@ -247,7 +246,7 @@ def test_paths_that_are_no_regular_file_are_refused(tmp_path):
     ],
 )
 def test_impossible_curves_and_temperatures_are_refused(old, new, key, message):
-    text = (REPOSITORY / 'config' / 'calibration.example.yaml').read_text()
+    text = (Path(__file__).parents[1] / 'config' / 'calibration.example.yaml').read_text()
     text = text.replace('e_fold_k: [18.0]', 'e_fold_k: [1.0]')
     assert old in text
     with pytest.raises(CalibrationError, match=message) as caught:

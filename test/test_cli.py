@@ -123,26 +123,24 @@ class TestPlay:
         assert split_arguments(['info', '--', 'a']) == (['info', '--', 'a'], [])
 
 
-class TestSimulate:
-    def test_a_plan_simulates_a_whole_test(self, tmp_path, cli):
-        plan = ('--plan', 'tumble-1', '--unit', 'demo')
-        cli('simulate', *plan, '--rate-hz', '1', '-o', tmp_path / 'sim')
-        infos = [inspect_recording(path) for path in sorted((tmp_path / 'sim').iterdir())]
-        assert [round((info.end_ns - info.start_ns) / 6e10) for info in infos] == [*[20] * 18, 180]
-        assert {info.metadata['serial'] for info in infos} == {'demo-0001'}
-        assert json.loads(infos[0].metadata['truth'])['profile'] == 'tumble-1'
+def test_a_plan_simulates_a_whole_test(tmp_path, cli):
+    plan = ('--plan', 'tumble-1', '--unit', 'demo')
+    cli('simulate', *plan, '--rate-hz', '1', '-o', tmp_path / 'sim')
+    infos = [inspect_recording(path) for path in sorted((tmp_path / 'sim').iterdir())]
+    assert [round((info.end_ns - info.start_ns) / 6e10) for info in infos] == [*[20] * 18, 180]
+    assert {info.metadata['serial'] for info in infos} == {'demo-0001'}
+    assert json.loads(infos[0].metadata['truth'])['profile'] == 'tumble-1'
 
 
-class TestInfo:
-    def test_info_lists_nonlinear_terms(self, unit, cli, tmp_path):
-        square = NonlinearTerm('square', (1e-5, -2e-5, 0.0), (1e-7, 0.0, 0.0), 1e-4)
-        bent = Nonlinearity((9.8, 98.0), 1e-4, (square,))
-        known = replace(rich_calibration(), nonlinearity=bent, posterior=None)
-        save_calibration(known, tmp_path / 'unit.yaml')
-        printed = cli('info', tmp_path / 'unit.yaml').stdout
-        assert re.search(r'^K2 +µg/g² +10 +-20 +0$', printed, re.MULTILINE)
-        assert re.search(r'^K2 per kelvin +µg/g²/K +0\.1 +0 +0$', printed, re.MULTILINE)
-        assert 'nonlinearity' not in cli('info', unit).stdout
+def test_info_lists_nonlinear_terms(unit, cli, tmp_path):
+    square = NonlinearTerm('square', (1e-5, -2e-5, 0.0), (1e-7, 0.0, 0.0), 1e-4)
+    bent = Nonlinearity((9.8, 98.0), 1e-4, (square,))
+    known = replace(rich_calibration(), nonlinearity=bent, posterior=None)
+    save_calibration(known, tmp_path / 'unit.yaml')
+    printed = cli('info', tmp_path / 'unit.yaml').stdout
+    assert re.search(r'^K2 +µg/g² +10 +-20 +0$', printed, re.MULTILINE)
+    assert re.search(r'^K2 per kelvin +µg/g²/K +0\.1 +0 +0$', printed, re.MULTILINE)
+    assert 'nonlinearity' not in cli('info', unit).stdout
 
 
 class TestTopics:

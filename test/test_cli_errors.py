@@ -132,34 +132,32 @@ class TestBags:
         refused(cli, 1, r'is of unit T-1', 'evaluate', path, '-c', unit)
 
 
-class TestFits:
-    def test_unknown_groups_and_models_and_bags_of_two_units_are_refused(self, cli, tmp_path):
-        paths = [bag(tmp_path / f'{i}.mcap', serial=f'T-{i}') for i in range(2)]
-        given = 'fit', *paths, '-o', tmp_path / 'new.yaml', '--gravity', '9.8'
-        refused(cli, 2, r'--groups must be one of curve, .*memory', *given, '--groups', 'memory')
-        refused(cli, 2, r'quadratic', *given, '--model', 'quadratic')
-        refused(cli, 1, r'of different units: .*0.mcap of T-0, .*1.mcap of T-1', *given)
-        assert not (tmp_path / 'new.yaml').exists()
+def test_unknown_groups_and_models_and_bags_of_two_units_are_refused(cli, tmp_path):
+    paths = [bag(tmp_path / f'{i}.mcap', serial=f'T-{i}') for i in range(2)]
+    given = 'fit', *paths, '-o', tmp_path / 'new.yaml', '--gravity', '9.8'
+    refused(cli, 2, r'--groups must be one of curve, .*memory', *given, '--groups', 'memory')
+    refused(cli, 2, r'quadratic', *given, '--model', 'quadratic')
+    refused(cli, 1, r'of different units: .*0.mcap of T-0, .*1.mcap of T-1', *given)
+    assert not (tmp_path / 'new.yaml').exists()
 
 
-class TestEvaluations:
-    def test_a_calibration_that_is_not_valid_gives_exit_code_1(self, cli, tmp_path):
-        wrong = axis_set((0.0, 1.0), (1.0,), delta=150.0)
-        sets = regime_set(wrong, wrong, wrong)
-        save_calibration(calibration(static=sets, dynamic=sets), tmp_path / 'wrong.yaml')
-        path = bag(tmp_path / 'bag', case=False, n=3000, up=(0.0, 0.0, 0.980665))
-        finished = cli('evaluate', path, '-c', tmp_path / 'wrong.yaml', code=1)
-        assert 'no better than raw: 48 mg RMS of |f| - g, ' in finished.stdout
-        # The second calibration is right: its levels of +10 mg cancel its biases of -10 mg.
-        right = axis_set(delta=30.0)
-        sets = regime_set(right, right, right)
-        axes = equal_axes(300.0, -30.0)
-        valid = calibration(axes=axes, static=sets, dynamic=sets)
-        save_calibration(valid, tmp_path / 'right.yaml')
-        arguments = ('evaluate', path, '-c', tmp_path / 'right.yaml')
-        assert 'no claim: ' in cli(*arguments, code=1).stdout
-        assert 'valid: ' in cli(*arguments, '--tolerance', '1mg').stdout
-        assert 'recalibrate: ' in cli(*arguments, '--tolerance', '1e-5ug', code=1).stdout
+def test_a_calibration_that_is_not_valid_gives_exit_code_1(cli, tmp_path):
+    wrong = axis_set((0.0, 1.0), (1.0,), delta=150.0)
+    sets = regime_set(wrong, wrong, wrong)
+    save_calibration(calibration(static=sets, dynamic=sets), tmp_path / 'wrong.yaml')
+    path = bag(tmp_path / 'bag', case=False, n=3000, up=(0.0, 0.0, 0.980665))
+    finished = cli('evaluate', path, '-c', tmp_path / 'wrong.yaml', code=1)
+    assert 'no better than raw: 48 mg RMS of |f| - g, ' in finished.stdout
+    # The second calibration is right: its levels of +10 mg cancel its biases of -10 mg.
+    right = axis_set(delta=30.0)
+    sets = regime_set(right, right, right)
+    axes = equal_axes(300.0, -30.0)
+    valid = calibration(axes=axes, static=sets, dynamic=sets)
+    save_calibration(valid, tmp_path / 'right.yaml')
+    arguments = ('evaluate', path, '-c', tmp_path / 'right.yaml')
+    assert 'no claim: ' in cli(*arguments, code=1).stdout
+    assert 'valid: ' in cli(*arguments, '--tolerance', '1mg').stdout
+    assert 'recalibrate: ' in cli(*arguments, '--tolerance', '1e-5ug', code=1).stdout
 
 
 @pytest.mark.usefixtures('no_figures')

@@ -37,8 +37,7 @@ NOISE = 1e-4**2 / 0.01 + (1.0 / 6.0) / 300.0**2
 
 
 def test_the_offset_is_half_the_sum_of_signed_counts():
-    # From counts at +g and -g: offset = sum / 2, scale = difference / 2. Golovach's paper has sum
-    # and difference exchanged in its Eq. (3) and (4).
+    # Offset = sum / 2, scale = difference / 2; Golovach's Eq. (3) and (4) have them exchanged.
     plus, minus = 300.0 * GRAVITY + 12.0, -300.0 * GRAVITY + 12.0
     axis = AxisReference((plus - minus) / 2.0 / GRAVITY, (plus + minus) / 2.0)
     compensator = Compensator(calibration(axes=Axes(*[axis] * 3)))
@@ -48,7 +47,6 @@ def test_the_offset_is_half_the_sum_of_signed_counts():
 
 
 def test_a_corrected_sample_agrees_with_the_formula_of_the_static_set():
-    # Expected: the correction formula with the static curves at t = 10 K, gradient 0 and rate 0.
     axis = axis_set((0.0, 0.5, 0.01), (1.0, 1e-4), delta=2.0)
     unit = calibration(
         axes=equal_axes(300.0, 7.0),
@@ -110,7 +108,6 @@ def at_seconds(*events):
     ]
 
 
-# In the examples stamps fall below the stamp of a reading that is a day ahead, or already applied.
 # Only if stamps fall by over 5 s, earlier readings count as readings of another clock.
 @given(event_lists, st.integers(3, 30), st.sampled_from([0.0, 5.0]))
 @example(at_seconds('A', 3, 'A', 0, 'B', 2, 'B', 86_400, 'C', 0, 'A', 0), 5, 0.0)
@@ -220,7 +217,6 @@ def test_a_full_queue_has_4096_readings_and_keeps_the_newest(ahead_s):
 @pytest.mark.parametrize('n_before', [0, 3])
 @pytest.mark.parametrize('ahead_s', [0, 2])
 def test_all_readings_of_two_minutes_without_samples_are_applied(n_before, ahead_s):
-    """Readings at 20 Hz over 120 s, between which there is no sample, are applied in order."""
     first = [('accel', k * SECOND_NS // 100, (1.0, 2.0, 2930.0)) for k in range(1, 1 + n_before)]
     readings = [
         (name, k * SECOND_NS // 20, 20.0 + 1e-4 * k + 1e-3 * (k % 7))
@@ -271,7 +267,7 @@ def test_another_transition_time_during_a_transition_causes_no_step_of_the_outpu
     assert after == pytest.approx(before, abs=1e-9)
 
 
-def test_a_new_transition_time_does_not_restart_the_check_of_gravity(rng):
+def test_a_new_transition_time_does_not_restart_the_checks_of_gravity_and_sample_rate(rng):
     # WHY: after a change of any parameter samples with a wrong |f| were published for 13 s.
     compensator = Compensator(calibration(), CompensatorConfig())
 
@@ -295,9 +291,6 @@ def test_a_new_transition_time_does_not_restart_the_check_of_gravity(rng):
     other = replace(other, gravity_tolerance_m_s2=5.0)
     compensator.take_over(compensator.thermal.model, other)
     assert published(range(70, 75), 1.1 * count_per_g) > 0
-
-
-def test_a_new_transition_time_does_not_restart_the_check_of_the_sample_rate(rng):
     compensator = Compensator(calibration(), CompensatorConfig(gravity_tolerance_m_s2=0.0))
     warm(compensator, until_s=10)
     step_ns = round(0.25e9 * compensator.calibration.unit.cycle_time_s)
@@ -318,12 +311,10 @@ def test_a_new_transition_time_does_not_restart_the_check_of_the_sample_rate(rng
 
 @pytest.mark.parametrize('bad', [math.nan, math.inf, 1e200])
 def test_output_that_is_not_finite_is_never_published(monkeypatch, bad):
-    # `broken` gives output that is not finite, which no accepted calibration should give.
     line = Correction.line
 
     def broken(self, start, end, slow, excess):
         corrected = line(self, start, end, slow, excess)
-        # The correction is not finite while the board temperature is between 21 and 23 degC.
         at = np.asarray(start)[0]
         corrected[0] = np.where((at > 21.0) & (at < 23.0), bad, corrected[0])
         return corrected

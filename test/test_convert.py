@@ -107,8 +107,7 @@ def test_an_offset_of_raw_words_is_subtracted(tmp_path):
 
 @pytest.mark.parametrize('unit', ['ms', 'us'])
 def test_times_of_a_counter_of_32_bits_continue_after_its_overflow(tmp_path, unit):
-    # WHY: Arduino's micros() overflows to 0 after 71.6 min, and of a longer log the fit used only
-    # the part before the overflow.
+    # WHY: Arduino's micros() overflows after 71.6 min, and the fit used only the part before.
     path, _ = table(tmp_path / 'log.csv')
     lines = path.read_text().splitlines()
     ticks = [(2**32 - 2000 + 10 * k) % 2**32 for k in range(400)]
@@ -140,20 +139,7 @@ def test_readings_stay_among_samples_after_a_restart_of_the_clock(tmp_path):
     assert board.after.tolist() == list(range(0, 400, 40))
 
 
-def test_readings_of_minus_127_degc_are_left_out(tmp_path):
-    # WHY: 46 readings of -127 degC (DS18B20 without contact) increased a fit's error to 0.68 mg.
-    path, _ = table(tmp_path / 'log.csv')
-    lines = path.read_text().splitlines()
-    for k in (50, 51, 300):
-        lines[k] = lines[k].rpartition(',')[0] + ',-127'
-    path.write_text('\n'.join(lines))
-    report = write_log(table_log(path, column_map()), tmp_path / 'bag')
-    assert report.findings['impossible'].count == 2  # a reading repeated in two rows counts once
-    board = read_recording(tmp_path / 'bag').columns.temperatures['board']
-    assert board.celsius.min() == 25.0
-
-
-def test_every_row_with_a_fault_is_counted(tmp_path):
+def test_rows_with_faults_are_counted_and_readings_of_minus_127_degc_left_out(tmp_path):
     path, _ = table(tmp_path / 'log.csv')
     lines = path.read_text().splitlines()
     lines[11] = lines[11].replace(lines[11].split(',')[1], 'nan')
@@ -177,8 +163,17 @@ def test_every_row_with_a_fault_is_counted(tmp_path):
     # The bag contains clipped samples and samples in wrong order: the node rejects them.
     assert block.accel[:, 0].max() == 2.0 * STANDARD_GRAVITY
     assert (np.diff(block.accel_stamp_ns) < 0).sum() == 1
-    # Log times never fall from row to row, also where stamps fall.
     assert (np.diff(block.log_ns['accel']) >= 0).all()
+    # WHY: 46 readings of -127 degC (DS18B20 without contact) increased a fit's error to 0.68 mg.
+    path, _ = table(tmp_path / 'log.csv')
+    lines = path.read_text().splitlines()
+    for k in (50, 51, 300):
+        lines[k] = lines[k].rpartition(',')[0] + ',-127'
+    path.write_text('\n'.join(lines))
+    report = write_log(table_log(path, column_map()), tmp_path / 'cold')
+    assert report.findings['impossible'].count == 2  # a reading repeated in two rows counts once
+    board = read_recording(tmp_path / 'cold').columns.temperatures['board']
+    assert board.celsius.min() == 25.0
 
 
 def test_stamps_of_a_fixed_rate_do_not_accumulate_rounding(tmp_path):
@@ -304,25 +299,24 @@ class TestColumnMap:
                 load_column_map(path)
 
 
-class TestCommand:
-    def test_convert_reports_rows_rate_and_topics(self, tmp_path, cli):
-        path, _ = table(tmp_path / 'log.csv')
-        map_path = tmp_path / 'map.yaml'
-        map_path.write_text(
-            'stamp: {column: ms, unit: ms}\n'
-            'accel: {columns: [ax, ay, az], unit: g, output: imu}\n'
-            'board: {column: board}\n'
-        )
-        arguments = ('convert', path, '--columns', map_path, '-o', tmp_path / 'bag')
-        printed = cli(*arguments).stdout
-        assert '400 rows, 4.0 s at 100 Hz' in printed
-        assert '400 imu/uncompensated' in printed
-        text = f'thermo_comp: error: {tmp_path}/bag: exists already; --force overwrites it\n'
-        assert cli(*arguments, code=1).stderr == text
-        data = json.loads(cli(*arguments, '--force', '--json').stdout)
-        assert data['accel_messages'] == 400
-        assert data['stillness']['moving_ns'] == []
-        assert cli(*arguments, '--force', '-q').stdout == ''
+def test_convert_reports_rows_rate_and_topics(tmp_path, cli):
+    path, _ = table(tmp_path / 'log.csv')
+    map_path = tmp_path / 'map.yaml'
+    map_path.write_text(
+        'stamp: {column: ms, unit: ms}\n'
+        'accel: {columns: [ax, ay, az], unit: g, output: imu}\n'
+        'board: {column: board}\n'
+    )
+    arguments = ('convert', path, '--columns', map_path, '-o', tmp_path / 'bag')
+    printed = cli(*arguments).stdout
+    assert '400 rows, 4.0 s at 100 Hz' in printed
+    assert '400 imu/uncompensated' in printed
+    text = f'thermo_comp: error: {tmp_path}/bag: exists already; --force overwrites it\n'
+    assert cli(*arguments, code=1).stderr == text
+    data = json.loads(cli(*arguments, '--force', '--json').stdout)
+    assert data['accel_messages'] == 400
+    assert data['stillness']['moving_ns'] == []
+    assert cli(*arguments, '--force', '-q').stdout == ''
 
 
 class TestFreezer:
@@ -340,7 +334,6 @@ class TestFreezer:
         report = write_log(table_log(path, columns), tmp_path / 'bag')
         assert report.rows == report.messages['accel'] == 24514
         assert report.findings['clipped'].count == 7
-        # The log starts at 1.5 s; the unit was moved before 49 s and after 1944 s.
         first, last = report.stillness.moving_ns[0], report.stillness.moving_ns[-1]
         assert first[0] == report.log.stamp_ns[0]
         assert first[1] * 1e-9 == pytest.approx(49.0, abs=3.0)

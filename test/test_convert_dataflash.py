@@ -136,8 +136,7 @@ HALF_US = 2_000_000 + N // 2 * STEP_US
     [
         ([(0.0, 1000), (1.0, HALF_US)], slice(0, N // 2), 50),
         ([(1.0, 1000), (0.0, HALF_US)], slice(N // 2, N), 50),
-        # WHY: a log in which ArduPilot learns a temperature calibration was refused; at the end of
-        # learning INS_TCAL1_ENABLE changes from 2 to 1.
+        # WHY: a log in which ArduPilot learns (2), and then uses (1), the correction was refused.
         ([(2.0, 1000), (1.0, HALF_US + N // 4 * STEP_US)], slice(0, 3 * N // 4), 25),
     ],
 )
@@ -152,16 +151,27 @@ def test_samples_corrected_by_ardupilot_are_left_out(tmp_path, rng, course, kept
     assert len(read.temperatures['board'].celsius) > 1
 
 
-def test_a_torn_dataflash_log_is_read_up_to_the_cut(tmp_path, rng):
+def test_a_torn_log_and_a_log_with_impossible_stamps_lose_only_their_damaged_messages(
+    tmp_path, rng
+):
     path = tmp_path / 'torn.BIN'
     force = write_new(path, rng)
     whole = path.read_bytes()
-    # The cut is 40 bytes into the last message of the last IMU row.
     cut = whole.rindex(b'\xa3\x95\x81') + 40
     path.write_bytes(whole[:cut])
     log = read_autopilot(path, imu=1)
     assert log.short == [2 * N]
     np.testing.assert_array_equal(log.accel, force[1][: N - 1])
+    path = tmp_path / 'jump.BIN'
+    write_new(path, rng)
+    body = bytearray(path.read_bytes())
+    # Set all bits of the time of the first IMU message, a time of half a million years.
+    at = body.index(b'\xa3\x95\x81') + 3
+    body[at : at + 8] = b'\xff' * 8
+    path.write_bytes(body)
+    report = write_log(read_autopilot(path), tmp_path / 'bag.mcap')
+    assert report.messages['accel'] == N - 1
+    assert report.findings['non_numeric'].count == 1
 
 
 def test_absent_instances_and_files_of_other_kinds_are_refused(tmp_path, rng):
@@ -196,16 +206,3 @@ def test_damaged_formats_are_refused(tmp_path, rng, columns, message):
     path.write_bytes(body)
     with pytest.raises(RecordingError, match=message):
         read_autopilot(path)
-
-
-def test_messages_with_impossible_stamps_are_left_out(tmp_path, rng):
-    path = tmp_path / 'jump.BIN'
-    write_new(path, rng)
-    body = bytearray(path.read_bytes())
-    # Set all bits of the time of the first IMU message, a time of half a million years.
-    at = body.index(b'\xa3\x95\x81') + 3
-    body[at : at + 8] = b'\xff' * 8
-    path.write_bytes(body)
-    report = write_log(read_autopilot(path), tmp_path / 'bag.mcap')
-    assert report.messages['accel'] == N - 1
-    assert report.findings['non_numeric'].count == 1

@@ -47,7 +47,7 @@ def test_every_layout_of_a_table_gives_equal_values(tmp_path, delimiter, newline
     assert len(table.short) == 0
 
 
-def test_headings_are_optional_and_line_numbers_are_those_of_an_editor(tmp_path):
+def test_headings_are_optional_and_a_column_may_begin_late(tmp_path):
     path = write(tmp_path / 'log.txt', '1 2 3\n4 5 6\n')
     assert read_text(path, [2], ROWS_ALONE).values[2].tolist() == [3.0, 6.0]
     # 'nan' and 'inf' are numbers, unless the user states that the first line is a heading.
@@ -58,6 +58,13 @@ def test_headings_are_optional_and_line_numbers_are_those_of_an_editor(tmp_path)
     assert table.line.tolist() == [4, 5, 7]
     np.testing.assert_array_equal(table.values['a'], [1.0, np.nan, 5.0])
     assert [*table.short] == [6]
+    # WHY: a table was refused if the last column, a thermometer, is blank in the first rows.
+    rows = [f'{k},0.1,{"" if k < 20 else 20 + k}' for k in range(60)]
+    path = write(tmp_path / 'log.csv', '\n'.join(['t,ax,celsius', *rows]))
+    table = read_text(path, ['t', 'celsius'], ROWS_ALONE)
+    np.testing.assert_array_equal(table.values['t'], np.arange(60.0))
+    assert np.isnan(table.values['celsius'][:20]).all()
+    assert table.values['celsius'][20] == 40.0
 
 
 @pytest.mark.parametrize('separator', [',', ';', '\t', ' '])
@@ -71,16 +78,6 @@ def test_lines_before_the_table_of_a_logger_are_left_out(tmp_path, separator):
     np.testing.assert_array_equal(table.values['az'][1:], np.arange(60.0))
     assert table.line[1] == 9
     assert [*table.short] == [70]
-
-
-def test_a_column_of_a_table_may_begin_late(tmp_path):
-    # WHY: a table was refused if the last column, a thermometer, is blank in the first rows.
-    rows = [f'{k},0.1,{"" if k < 20 else 20 + k}' for k in range(60)]
-    path = write(tmp_path / 'log.csv', '\n'.join(['t,ax,celsius', *rows]))
-    table = read_text(path, ['t', 'celsius'], ROWS_ALONE)
-    np.testing.assert_array_equal(table.values['t'], np.arange(60.0))
-    assert np.isnan(table.values['celsius'][:20]).all()
-    assert table.values['celsius'][20] == 40.0
 
 
 def test_stamps_of_a_table_are_exact():
@@ -167,7 +164,6 @@ class TestParquet:
 @pytest.mark.parametrize('suffix', ['csv', 'parquet'])
 @pytest.mark.parametrize('unit', ['s', 'ns'])
 def test_stamps_that_ros_cannot_hold_are_left_out(tmp_path, suffix, unit):
-    """A row with a stamp outside 0 to 2^31 s is left out and counted."""
     scale = 10**9 if unit == 's' else 1
     good = [10**9 + k for k in range(40)] if unit == 's' else [10**18 + k for k in range(40)]
     bad = [-1, 2**31, 2 * 10**10, 2**62, 2**63] if unit == 's' else [-1, 2**31 * 10**9, 2**63]
@@ -317,7 +313,6 @@ def test_a_stated_unit_that_may_be_true_is_not_contradicted():
     # Any |a| at rest above 50 may be in counts, because converters differ in resolution.
     assert contradiction('counts', 2941.7, None) is None
     assert contradiction('counts', 2060.0, 2048.0) is None
-    # Without a rest |a| at rest is unknown, and no unit is refused.
     assert contradiction('g', float('nan'), None) is None
 
 

@@ -116,7 +116,7 @@ def test_the_gyroscope_of_an_instance_is_in_its_bag_unless_it_is_sparsely_logged
     assert read_autopilot(path).gyro is None
 
 
-def test_a_log_without_sample_times_is_read(tmp_path, rng):
+def test_logs_without_sample_times_or_a_thermometer_are_read(tmp_path, rng):
     force = still(rng)
     path = write_old(tmp_path / 'old.ulg', force, STEP_US)
     read = read_autopilot(path)
@@ -124,9 +124,6 @@ def test_a_log_without_sample_times_is_read(tmp_path, rng):
     assert 'case' not in read.temperatures
     # A constant temperature is written every 10 s, so once in this log of 6 s.
     np.testing.assert_array_equal(read.temperatures['board'].celsius, [31.5])
-
-
-def test_a_chip_without_a_thermometer_is_recognised(tmp_path, rng):
     log = UlogWriter(ACCEL)
     number = log.subscribe('sensor_accel', 0)
     for k, force in enumerate(still(rng)):
@@ -138,7 +135,7 @@ def test_a_chip_without_a_thermometer_is_recognised(tmp_path, rng):
     assert not read_autopilot(path).temperatures
 
 
-def test_a_torn_ulog_is_read_up_to_the_cut(flight):
+def test_a_torn_ulog_is_read_up_to_the_cut_and_other_files_are_refused(flight, tmp_path):
     path, truth = flight
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
@@ -146,12 +143,22 @@ def test_a_torn_ulog_is_read_up_to_the_cut(flight):
     n = len(read.stamp_ns)
     assert 250 < n < 350
     np.testing.assert_array_equal(read.accel, truth['force'][0][:n])
-
-
-def test_a_log_of_a_simulator_without_noise_is_refused(tmp_path):
     path = write_old(tmp_path / 'quiet.ulg', [(0.0, 0.0, -9.80665)] * N, STEP_US, 35.0)
     with pytest.raises(RecordingError, match=r'no noise at all.*simulator'):
         read_autopilot(path)
+    path, baro = tmp_path / 'refused.ulg', UlogWriter(BARO)
+    baro.data(baro.subscribe('sensor_baro', 0), struct.pack('<QQIffI', 1, 1, 9, 1e5, 20.0, 0))
+    unstamped = UlogWriter('sensor_accel:float x;float y;float z;')
+    number = unstamped.subscribe('sensor_accel', 0)
+    unstamped.data(number, struct.pack('<fff', 0.0, 0.0, 1.0))
+    for content, message in (
+        (baro.body, 'the log holds no IMU'),
+        (unstamped.body, r'not a ULog file|holds no IMU'),
+        *((text, 'not a ULog file') for text in (b'', b'ULog', b'time,x,y,z\n1,2,3,4\n' * 10)),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(RecordingError, match=message):
+            read_autopilot(path)
 
 
 COMBINED = 'sensor_combined:uint64_t timestamp;float[3] gyro_rad;uint32_t gyro_integral_dt;'
@@ -218,8 +225,7 @@ def test_samples_compensated_by_px4_are_left_out(tmp_path, rng, begin):
     force = write_combined(path, rng, {'TC_A_ENABLE': 1 - begin}, TC_A_ENABLE=begin)
     read = read_autopilot(path)
     assert 'TC_A_ENABLE was 1 for 50 % of the samples' in read.chosen
-    # In a log a changed parameter has the stamp of the message before it, so the sample at the
-    # change may be on the wrong side; `- 1` leaves this sample out of the comparison.
+    # A changed parameter has the stamp of the message before it: leave out the sample there.
     n = min(len(read.accel), N // 2) - 1
     part = slice(-n, None) if begin else slice(n)
     np.testing.assert_array_equal(read.accel[part], force[part])
@@ -230,19 +236,3 @@ def test_the_report_on_a_log_at_1_hz_names_fits_for_which_1_hz_is_sufficient(tmp
     printed = cli('convert', path, '-o', tmp_path / 'bag.mcap').stdout
     assert '1 Hz is sufficient for soaks of minutes' in printed
     assert 'sensor_accel at 10 Hz' in printed
-
-
-def test_logs_without_an_accelerometer_and_other_files_are_refused(tmp_path):
-    path, baro = tmp_path / 'refused.ulg', UlogWriter(BARO)
-    baro.data(baro.subscribe('sensor_baro', 0), struct.pack('<QQIffI', 1, 1, 9, 1e5, 20.0, 0))
-    unstamped = UlogWriter('sensor_accel:float x;float y;float z;')
-    number = unstamped.subscribe('sensor_accel', 0)
-    unstamped.data(number, struct.pack('<fff', 0.0, 0.0, 1.0))
-    for content, message in (
-        (baro.body, 'the log holds no IMU'),
-        (unstamped.body, r'not a ULog file|holds no IMU'),
-        *((text, 'not a ULog file') for text in (b'', b'ULog', b'time,x,y,z\n1,2,3,4\n' * 10)),
-    ):
-        path.write_bytes(content)
-        with pytest.raises(RecordingError, match=message):
-            read_autopilot(path)

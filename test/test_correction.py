@@ -126,7 +126,6 @@ def test_corrections_drawn_from_the_posterior_scatter_by_the_claimed_sd(rng):
     slow = SlowUncertainty(judged, Correction(judged))
     nobody = np.zeros((len(Correction(unit).memory.lags), 2))
     draws = rng.multivariate_normal(np.zeros(n), posterior.covariance(), size=300)
-    # Evaluate one state with a weight of the dynamic curves of 0 (static) and 0.3 (transition).
     weights = np.array([0.0, 0.3])
     pair = np.repeat(np.array([states[-1][1]]), 2, axis=0).T
     pair[3] = weights

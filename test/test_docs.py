@@ -69,7 +69,7 @@ def test_bash_accepts_the_completion_script():
     assert 'thermo_comp' in finished.stdout
 
 
-def test_every_page_is_in_the_site_s_menu_and_commands_are_found_on_pages():
+def test_pages_are_in_the_site_s_menu_and_their_tables_have_rows_of_equal_length():
     def listed(entry):
         if isinstance(entry, str):
             return [entry]
@@ -79,9 +79,6 @@ def test_every_page_is_in_the_site_s_menu_and_commands_are_found_on_pages():
     nav = yaml.safe_load((ROOT / 'mkdocs.yml').read_text())['nav']
     assert sorted(listed(nav)) == sorted(page.name for page in [*PAGES[1:], TUTORIAL])
     assert {page for page, _, _ in COMMANDS} >= {'README.md', 'integration.md', 'recording.md'}
-
-
-def test_rows_of_tables_have_as_many_cells_as_the_header():
     # WHY: the bars of |f| in a table were taken for borders of cells.
     for page in PAGES:
         text = re.sub(FENCE, '', page.read_text(encoding='utf-8'))

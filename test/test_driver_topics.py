@@ -143,10 +143,8 @@ def test_record_writes_number_fields_of_messages_as_temperatures(peer):
 
 
 def test_a_number_field_is_read_from_messages_that_rclpy_wrote():
-    message = ros.stamped(
-        BatteryState(temperature=25.0, cell_temperature=[1.0, 2.5]), ros.START_NS + 7
-    )
-    data = serialize_message(message)
+    message = BatteryState(temperature=25.0, cell_temperature=[1.0, 2.5])
+    data = serialize_message(ros.stamped(message, ros.START_NS + 7))
     for path, value in (('temperature', 25.0), ('cell_temperature[1]', 2.5)):
         field = LiveField('/pack', 'sensor_msgs/msg/BatteryState', path)
         assert field.read(data) == (ros.START_NS + 7, value)

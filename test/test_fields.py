@@ -136,10 +136,7 @@ def driver_bag(path, store, storage=StoragePlugin.MCAP):
     with Writer(path, version=9, storage_plugin=storage) as bag:
         kinds = {'/imu/data': 'sensor_msgs/msg/Imu', '/case': 'std_msgs/msg/Float64',
                  '/fmu/out/sensor_accel': 'px4_msgs/msg/SensorAccel'}  # fmt: skip
-        links = {
-            topic: bag.add_connection(topic, kind, typestore=store)
-            for topic, kind in kinds.items()
-        }
+        links = {name: bag.add_connection(name, kinds[name], typestore=store) for name in kinds}
 
         def write(topic, log_ns, message):
             bag.write(links[topic], log_ns, store.serialize_cdr(message, kinds[topic]))
@@ -148,7 +145,6 @@ def driver_bag(path, store, storage=StoragePlugin.MCAP):
         level = store.types['geometry_msgs/msg/Quaternion'](0, 0, 0, 1)
         for row in range(50):
             stamp_ns = START_NS + row * 10**7
-            # The recorder's clock is 1000 s ahead of the driver's clock.
             log_ns = stamp_ns + 10**12
             if row % 5 == 0:
                 accel = store.types['px4_msgs/msg/SensorAccel']

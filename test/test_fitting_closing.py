@@ -152,8 +152,7 @@ def score(drift, norms=(), by_thermometer=0.0):
 
 
 def test_few_norms_that_both_models_predict_do_not_select_the_model():
-    # WHY: only four left-out |f| could be predicted with and without a curve. The fit rejected the
-    # curve, as it reduced them by less than two standard errors: the force error was 7 mg.
+    # WHY: the fit rejected a curve because of only four left-out |f|: the force error was 7 mg.
     constants = score(20.0, [22.4, 457.7, 54.6, 26.1])
     curve = score(20.0, [16.8, 21.0, 22.5, 25.2])
     assert not is_better(constants, curve)
@@ -163,23 +162,19 @@ def test_few_norms_that_both_models_predict_do_not_select_the_model():
 
 
 def test_a_larger_model_must_not_explain_the_errors_of_a_coarse_thermometer():
-    # WHY: readings in steps of 1 K have equal errors in all bags of a program. A curve with knees
-    # halved the drift error in left-out bags of this program and doubled it in other programs.
+    # WHY: errors by steps of 1 K are equal in all bags: knees doubled the error in other programs.
     by_thermometer = 49.0
     curve, parts, bends = (score(drift, (), by_thermometer) for drift in (120.0, 46.0, 20.0))
     assert is_better(curve, parts)
     assert not is_better(parts, bends)
-    # A curve that reduces errors of |f| from 3000 to 60 ug is chosen; from 60 to 30 ug it is not.
     flat, curved = (score(46.0, size * np.ones(9), by_thermometer) for size in (3000.0, 60.0))
     assert is_better(flat, curved)
     assert not is_better(curved, score(20.0, 30.0 * np.ones(9), by_thermometer))
-    # With thermometer errors of only 5 ug, 20 ug of left-out drift are better than 46 ug.
     assert is_better(score(46.0, (), 5.0), score(20.0, (), 5.0))
 
 
 def test_a_fit_with_large_mounting_offsets_must_not_increase_left_out_norms():
-    # WHY: a fit with mounting offsets of 5 mg attributed a random walk of the bias (20 ug in an
-    # hour) to scale factors: the evidence of this fit was larger, but its force error was 5 mg.
+    # WHY: a fit with mounting offsets of 5 mg had a larger evidence, but a force error of 5 mg.
     def trial(norm, log_evidence):
         prior, layout = Parts(offset_scale=0.0, informative=None), Parts(pose=np.zeros(0))
         posterior = Parts(prior=prior, layout=layout, log_evidence=log_evidence)

@@ -117,7 +117,7 @@ def test_windows_are_means_of_their_samples_without_the_bad_samples(rng):
     assert sum(interval.count.sum() for interval in bag.intervals) == 2998
 
 
-def test_positions_in_one_bag_are_separated(rng):
+def test_positions_in_one_bag_are_separated_but_not_by_vibrations_of_a_compressor(rng):
     turn = np.linspace(UP, (3000.0, 0.0, 0.0), 3 * RATE_HZ)
     turn += 40.0 * rng.standard_normal(turn.shape)
     parts = still(rng, 40.0, UP), turn, still(rng, 30.0, (3000.0, 0.0, 0.0))
@@ -126,11 +126,7 @@ def test_positions_in_one_bag_are_separated(rng):
     np.testing.assert_allclose(second.mean[-1], (3000.0, 0.0, 0.0), atol=0.1)
     assert (first.end_ns - first.start_ns) * 1e-9 == pytest.approx(40.0, abs=1.6)
     assert (second.end_ns - second.start_ns) * 1e-9 == pytest.approx(30.0, abs=1.6)
-
-
-def test_vibrations_of_a_compressor_do_not_divide_a_position(rng):
-    # WHY: vibration by the compressor counted as motion: 18 bags had 1135 positions. Here twelve
-    # vibrations of three times the noise belong to one rest; a turn by 300 urad ends it.
+    # WHY: vibration counted as motion: 18 bags had 1135 positions. A turn by 300 urad ends a rest.
     accel = still(rng, 720.0, UP)
     for start in range(3000, 72000, 6000):
         accel[start : start + 3000] += 0.9 * rng.standard_normal((3000, 3))
@@ -176,7 +172,7 @@ def test_glitches_are_counted_and_end_no_rest(rng):
     assert '2000 samples' in finding.message
 
 
-def test_a_rest_is_found_in_samples_that_arrive_in_bursts(rng):
+def test_samples_in_bursts_are_a_rest_and_several_with_one_stamp_are_reported(rng):
     # WHY: without averages between bursts a unit at rest was reported as worn or driven.
     whole = block(still(rng, 600.0, UP))
     number = np.arange(len(whole.accel))
@@ -187,9 +183,6 @@ def test_a_rest_is_found_in_samples_that_arrive_in_bursts(rng):
         assert len(bag.intervals) == 1
         assert bag.cycle_s == pytest.approx(0.01, rel=0.1)
         assert bag.n_dropped == 0
-
-
-def test_several_samples_with_one_stamp_are_reported(rng):
     whole = block(still(rng, 600.0, UP))
     stamps = whole.accel_stamp_ns[np.arange(len(whole.accel)) // 10 * 10]
     bag = reduced([replace(whole, accel_stamp_ns=stamps)])
@@ -237,13 +230,37 @@ def test_a_last_window_is_kept_if_it_is_at_least_half_full(seconds, left, rng):
     assert interval.count.tolist() == [1000.0, 1000.0, *([float(left)] if left else [])]
 
 
-def test_fast_readings_are_averaged(rng):
+def test_fast_readings_are_averaged_but_each_change_of_a_wide_quantum_is_kept(rng):
     n = 60 * RATE_HZ
     at, celsius = stamps(n), 20.0 + 0.1 * rng.standard_normal(n)
     accel = still(rng, 60.0, UP)
     board = reduced([ArrayBlock(at, accel, at, celsius, at, celsius)]).board
     assert len(board.value) <= n / 19
     assert board.value.mean() == pytest.approx(celsius.mean(), abs=1e-3)
+    bag, noise = dense(rng, 0.05), ThermometerSettings(noise_sd_c=0.05)
+    bag.board.value[3000] = 85.0
+    detector = DetectorSettings(board=noise, case=noise)
+    means, settings = averaged(bag, detector, ('board', 'case'), 2.0)
+    for readings, sensor in ((means.board, settings.board), (means.case, settings.case)):
+        assert sensor.noise_sd_c == pytest.approx(0.05 / np.sqrt(20.0), rel=0.01)
+        is_mean = np.diff(readings.stamp_ns, prepend=0) > 1_500_000_000
+        error = readings.value - 20.0 - 1e-11 * (readings.stamp_ns - START_NS)
+        # An sd estimated from some 300 means has a relative sd of 1 / sqrt(2 * 300) = 4 %.
+        assert np.std(error[is_mean]) == pytest.approx(sensor.noise_sd_c, rel=0.16)
+    assert 85.0 in means.board.value
+    assert averaged(bag, detector, ('board', 'case'), 0.1) == (bag, detector)
+    bag = dense(rng, 0.05)
+    bag.board.value[:] = 20.1
+    means, _ = averaged(bag, DetectorSettings(), ('board', 'case'), 1.7)
+    assert set(means.board.value) == {20.1}
+    bag = dense(rng, 0.0, quantum=0.5)
+    wide = ThermometerSettings(quantum_c=0.5)
+    detector = DetectorSettings(board=wide, case=wide)
+    kept, settings = averaged(bag, detector, ('board', 'case'), 2.0)
+    assert settings == detector
+    changed = np.flatnonzero(np.diff(bag.board.value)) + 1
+    assert np.isin(bag.board.stamp_ns[changed], kept.board.stamp_ns).all()
+    assert len(kept.board.value) <= 301 + len(changed)
 
 
 def test_normal_gravity_agrees_with_published_values_and_impossible_places_are_refused():
@@ -257,12 +274,9 @@ def test_normal_gravity_agrees_with_published_values_and_impossible_places_are_r
     for latitude, height in ((91.0, 0.0), (np.nan, 0.0), (0.0, 2e4)):
         with pytest.raises(ValueError, match=r'`(latitude_deg|height_m)` must be within'):
             normal_gravity(latitude, height)
-
-
-@pytest.mark.parametrize('gravity', [98.1, -1.0, np.nan])
-def test_a_gravity_not_found_on_earth_is_refused(gravity):
-    with pytest.raises(FitError, match='not found on Earth'):
-        FitOptions(gravity=gravity)
+    for gravity in (98.1, -1.0, np.nan):
+        with pytest.raises(FitError, match='not found on Earth'):
+            FitOptions(gravity=gravity)
 
 
 def soak_ramp_soak(quantum, noise, rng):
@@ -293,8 +307,7 @@ def test_thermometer_settings_are_estimated_from_readings(quantum, noise, rng):
 @pytest.mark.parametrize(('noise', 'found'), [(0.02, 0.02), (0.05, 0.05), (0.09, 0.09), (0, 0.01)])
 def test_readings_that_alternate_at_edges_of_1_k_steps_show_their_noise(noise, found, rng):
     learned = learn_thermometer([soak_ramp_soak(1.0, noise, rng)], ThermometerSettings())
-    # The readings cross 30 rounding edges; noise shows only at the two slowest crossings. Readings
-    # that never alternate have a noise of 0.01 quanta.
+    # Noise shows only at the two slowest crossings of edges; without it 0.01 quanta are assumed.
     assert learned.noise_sd_c == pytest.approx(found, rel=0.3 if noise else 1e-6)
 
 
@@ -325,7 +338,6 @@ def test_the_detector_settings_follow_the_slowest_ramp(rng):
 
 @pytest.mark.parametrize('step', [1.0, 16.0, 1.0 / 300.0])
 def test_a_rest_is_found_at_any_quantum_of_the_samples(step, rng):
-    # Rounded samples are constant, or alternate between two values that differ by a quantum.
     slow = 0.6 * np.sin(np.arange(60 * RATE_HZ) / 900.0)
     accel = 2900.0 + slow[:, None] + 0.05 * rng.standard_normal((len(slow), 3))
     bag = reduced([block(np.round(accel) * step)], full_scale=None)
@@ -346,21 +358,19 @@ def test_the_rounding_sd_is_that_of_simulated_rounding_and_smaller_with_a_drift(
 
 
 @pytest.mark.parametrize('step', [1.0, 0.04])
-def test_steps_of_a_converter_after_a_constant_soak_do_not_divide_a_rest(rng, step):
+def test_steps_of_a_converter_after_a_constant_soak_do_not_divide_a_rest_but_a_turn_does(
+    rng, step
+):
     # WHY: after 20000 constant samples each change by a converter step began a new rest.
     rest = Rest(rng, duration_s=3600.0, sd=0.0)
     ramp = np.maximum(rest.time - 1800.0, 0.0) / 1800.0
     rest.accel = np.rint(rest.accel / 0.04 + 6.0 * np.outer(ramp, (1.0, -1.3, 0.7))) * step
     bag = reduce_source(rest.source(), full_scale=None)
     assert len(bag.intervals) == 1
-
-
-def test_a_turn_between_constant_samples_is_not_taken_for_a_step_of_the_converter(rng):
     # WHY: if samples changed only as the unit was turned, this change counted as an ADC step.
     rest = Rest(rng, sd=0.0)
     rest.accel[rest.time > 300.0] = (GRAVITY, 0.0, 0.0)
-    bag = reduce_source(rest.source(), full_scale=None)
-    assert len(bag.intervals) == 2
+    assert len(reduce_source(rest.source(), full_scale=None).intervals) == 2
 
 
 def dense(rng, noise_sd, quantum=0.0):
@@ -370,33 +380,3 @@ def dense(rng, noise_sd, quantum=0.0):
     celsius = np.rint(celsius / quantum) * quantum if quantum else celsius
     bag = reduced([block(still(rng, 30.0, UP))])
     return replace(bag, temperatures=dict.fromkeys(('board', 'case'), Readings(stamp, celsius)))
-
-
-def test_dense_readings_are_averaged_over_steps_and_have_the_noise_of_a_mean(rng):
-    bag, noise = dense(rng, 0.05), ThermometerSettings(noise_sd_c=0.05)
-    bag.board.value[3000] = 85.0
-    detector = DetectorSettings(board=noise, case=noise)
-    means, settings = averaged(bag, detector, ('board', 'case'), 2.0)
-    for readings, sensor in ((means.board, settings.board), (means.case, settings.case)):
-        assert sensor.noise_sd_c == pytest.approx(0.05 / np.sqrt(20.0), rel=0.01)
-        is_mean = np.diff(readings.stamp_ns, prepend=0) > 1_500_000_000
-        error = readings.value - 20.0 - 1e-11 * (readings.stamp_ns - START_NS)
-        # An sd estimated from some 300 means has a relative sd of 1 / sqrt(2 * 300) = 4 %.
-        assert np.std(error[is_mean]) == pytest.approx(sensor.noise_sd_c, rel=0.16)
-    assert 85.0 in means.board.value
-    assert averaged(bag, detector, ('board', 'case'), 0.1) == (bag, detector)
-    bag = dense(rng, 0.05)
-    bag.board.value[:] = 20.1
-    means, _ = averaged(bag, DetectorSettings(), ('board', 'case'), 1.7)
-    assert set(means.board.value) == {20.1}
-
-
-def test_of_dense_readings_with_a_wide_quantum_each_change_is_kept(rng):
-    bag = dense(rng, 0.0, quantum=0.5)
-    wide = ThermometerSettings(quantum_c=0.5)
-    detector = DetectorSettings(board=wide, case=wide)
-    kept, settings = averaged(bag, detector, ('board', 'case'), 2.0)
-    assert settings == detector
-    changed = np.flatnonzero(np.diff(bag.board.value)) + 1
-    assert np.isin(bag.board.stamp_ns[changed], kept.board.stamp_ns).all()
-    assert len(kept.board.value) <= 301 + len(changed)

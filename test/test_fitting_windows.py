@@ -56,8 +56,7 @@ def windows_of(bags):
 
 
 def test_a_rest_partly_in_the_range_of_the_model_is_used_there_only(bags):
-    # WHY: an update by positions 3 K beyond the range of the prior doubled the error; without
-    # the windows there it falls from 270 to 162 ug.
+    # WHY: positions 3 K beyond the range of the prior doubled the error of an update.
     everything = windows_of(bags)
     lower, upper = np.quantile(everything.temperature, (0.3, 0.7))
     for range_c, is_used in (((lower, upper), True), ((90.0, 95.0), False)):
@@ -85,7 +84,6 @@ def test_the_sets_differ_only_with_soaks_at_several_temperatures(bags):
 
 
 def test_columns_of_the_fit_equal_those_of_the_tracker(bags):
-    # The expected columns come from a tracker that gets readings and samples one by one.
     windows = windows_of(bags)
     spec = memory_of(bank())
     table = ColumnTable(bank(), spec, 20.0)
@@ -112,8 +110,7 @@ def test_columns_of_the_fit_equal_those_of_the_tracker(bags):
     mean = np.array([phi[np.abs(seconds - t) <= 30.0].mean(axis=0) for t in time])
     scale = np.sqrt(np.mean(phi**2, axis=0)) + 1e-9
     late = time > 300.0
-    # Lags in the fit follow readings, lags of the tracker follow temperature estimates, so play
-    # operators reverse at slightly different times.
+    # Lags of the tracker follow estimates, not readings: plays reverse at slightly other times.
     np.testing.assert_allclose(rows[late, n_sets:] / scale, mean[late] / scale, atol=0.05)
 
 
@@ -124,8 +121,7 @@ def test_columns_sections_and_initial_lag_states_agree_with_formulas(bags):
     assert data.groups[:6] == ('curve',) * 3 + ('set',) * 3
     np.testing.assert_allclose(data.columns[:, [0, 3]], np.column_stack((t, w)), atol=1e-9)
     assert data.in_scale[:6].tolist() == [True, True, True, False, True, True]
-    # The effect of an initial lag state decays as exp(-time / tau) in the column of the lag, and
-    # as t * exp(-time / tau) in the column of the product of lag and t.
+    # An initial lag state decays as exp(-time / tau), in a product of lag and t times t.
     taus = [lag.tau_s for lag in memory_of(bank()).lags]
     for k, column in enumerate(bank(), start=6):
         lag = data.lag[k]
@@ -175,7 +171,6 @@ def test_windows_with_a_silent_or_stuck_thermometer_are_left_out(bags, name, is_
 
 
 def test_the_derivative_of_a_column_by_its_lag_agrees_with_differences():
-    # Derivatives must equal differences of the columns for lags shifted by +-1 uK.
     columns = bank(span_k=(-4.0, 12.0))
     spec = memory_of(columns)
     layout, table = StateLayout(spec), ColumnTable(columns, spec, 20.0)
@@ -214,7 +209,6 @@ def test_curve_columns_of_a_fit_are_powers_of_temperature(
     weight = np.linspace(0.0, 1.0, 9)
     columns = sets.columns(t, weight)
     assert len(columns) == len(sets.groups) == sets.static.n_free + 1 + sets.dynamic.n_free
-    # At the reference temperature only the column for the dynamic set's level is not 0.
     nothing = sets.columns(np.zeros(3), np.array([0.0, 0.5, 1.0]))
     for k, column in enumerate(nothing):
         expected = [0.0, 0.5, 1.0] if k == sets.level else 0.0
@@ -265,7 +259,7 @@ def states_of(windows, calibration):
     return states.T
 
 
-def test_a_calibration_file_corrects_windows_like_the_regression(fitted):
+def test_a_calibration_file_corrects_windows_with_the_sd_of_the_regression(fitted):
     # In ramps of 1 K/min powers of means over 60 s differ from means of powers by some ppm.
     result, _ = fitted
     windows, calibration = result.fit.windows, result.calibration
@@ -280,9 +274,6 @@ def test_a_calibration_file_corrects_windows_like_the_regression(fitted):
     report = next(row for row in result.residuals if row.section == 'all')
     assert np.sqrt(np.mean(along**2)) < 1.3 * report.fitted.rms + 5e-6
     assert prior.sigma.min() > 0.0
-
-
-def test_the_posterior_of_a_file_has_the_sd_of_the_regression(fitted):
     result, claim = fitted
     calibration = result.calibration
     layout = parameter_layout(calibration)

@@ -89,13 +89,11 @@ def test_all_units_are_fitted_despite_a_killed_worker_and_only_once(client, flee
     assert again.n_done == 0
     assert again.rows == result.rows
     assert contents(out / 'units') == before
-    # A unit is fitted again if the modification time of a bag has changed.
     os.utime(fleet / 'A/good/01.mcap', ns=(0, 0))
     touched = fit_fleet(str(fleet), out, OPTIONS, scheduler=scheduler)
     assert touched.n_done == 1
     after = contents(out / 'units')
     assert {Path(name).parts[1] for name in before if before[name] != after[name]} == {'good'}
-    # A result whose calibration file was edited counts as missing.
     (out / 'units/B/exchanged').rename(out / 'units/B/other')
     (out / 'units/A/torn/calibration.yaml').write_text('edited')
     results = Results(out)
@@ -183,13 +181,12 @@ def test_ctrl_c_while_workers_start_prints_no_traceback(tmp_path):
 
 
 class TestScheduler:
-    def test_a_scheduler_that_does_not_answer_is_named(self, fleet, tmp_path, monkeypatch):
+    def test_a_scheduler_that_does_not_answer_or_has_no_worker_is_refused(
+        self, fleet, tmp_path, monkeypatch
+    ):
         monkeypatch.setattr('thermo_comp.fleet.work._WAIT_S', 0.2)
         with pytest.raises(ThermoCompError, match=r'127\.0\.0\.1:9: no Dask scheduler answers'):
             fit_fleet(str(fleet), tmp_path / 'out', OPTIONS, scheduler='tcp://127.0.0.1:9')
-
-    def test_a_scheduler_without_workers_is_refused(self, monkeypatch):
-        monkeypatch.setattr('thermo_comp.fleet.work._WAIT_S', 0.2)
         options = {'processes': False, 'protocol': 'tcp', 'dashboard_address': '127.0.0.1:0'}
         with (
             distributed.LocalCluster(n_workers=0, **options) as cluster,

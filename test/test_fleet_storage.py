@@ -186,9 +186,8 @@ class TestDiscovery:
             return scan(path)
 
         monkeypatch.setattr(os, 'scandir', refusing)
-        with pytest.raises(
-            ThermoCompError, match=r'cannot be listed: Permission denied in .*/u2$'
-        ):
+        reason = r'cannot be listed: Permission denied in .*/u2$'
+        with pytest.raises(ThermoCompError, match=reason):
             find_units(Storage(str(tmp_path)))
         (tmp_path / 'u2').rmdir()
         assert [unit.name for unit in find_units(Storage(str(tmp_path)))] == ['u1']

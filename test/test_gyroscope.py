@@ -67,7 +67,6 @@ def unit():
 def fitted(unit):
     """Fit a MEMS unit in nine positions; its gyroscope's drift is the sum of several effects."""
     records = arrays(unit, plan('chamber-9', 2), 2, rate_hz=RATE_HZ)
-    # A fit with only five groups of columns takes half the time of a fit with all groups.
     options = replace(OPTIONS, groups=('curve', 'gradient', 'board', 'gradient_lag', 'product'))
     return fit([source_of(record, unit.scale_factor) for record in records], options)
 
@@ -194,7 +193,6 @@ def test_a_gyroscope_is_read_back_from_a_file_and_messages_name_wrong_keys():
 
 
 def test_the_rate_at_the_reference_temperature_is_corrected_by_its_bias():
-    # The gyroscope's calibration subtracts a constant bias of the rate and does not change forces.
     triad = replace(rich_calibration().gyroscope, response=(), posterior=None)
     for gyroscope in (triad, None):
         compensator = Compensator(replace(calibration(), gyroscope=gyroscope))
@@ -218,11 +216,16 @@ def test_the_rate_at_the_reference_temperature_is_corrected_by_its_bias():
 
 
 @pytest.mark.slow
-def test_a_fit_with_a_prior_keeps_the_gyroscope_of_the_prior(unit, fitted):
+def test_after_a_tumble_the_gyroscope_of_the_prior_is_kept_and_gives_no_alarm(unit, fitted):
     record = arrays(unit, plan('tumble', 2)[:1], 5, rate_hz=RATE_HZ)[0]
     again = fit([source_of(record, unit.scale_factor)], replace(OPTIONS, prior=fitted.calibration))
     assert again.calibration.gyroscope == fitted.calibration.gyroscope
     assert again.rates == ()
+    bags = reduced(unit, arrays(unit, plan('tumble', 2)[:2], 3, rate_hz=RATE_HZ))
+    rate = judge_bags(bags, fitted.calibration).rate
+    section = rate.sections['all']
+    assert section.rms < section.raw_rms < 1.3 * section.rms
+    assert rate.kind is Verdict.WIDE
 
 
 def reduced(unit, records):
@@ -233,7 +236,6 @@ def reduced(unit, records):
 @pytest.mark.slow
 def test_the_changes_of_the_rate_are_compared_with_their_claimed_sd(unit, fitted, held_out):
     calibration, bags = fitted.calibration, reduced(unit, [held_out])
-    # The first third of the bag is sufficient to detect a wrong calibration, and saves time.
     thirds = [replace(interval, n_whole=interval.n_whole // 3) for interval in bags[0].intervals]
     short = [replace(bags[0], intervals=tuple(thirds))]
     judged = judge_bags(bags, calibration)
@@ -260,12 +262,3 @@ def test_the_changes_of_the_rate_are_compared_with_their_claimed_sd(unit, fitted
     assert unknown.rate.kind is Verdict.NO_CLAIM
     assert np.isnan(unknown.rate.sections['all'].claimed_rms)
     assert unknown.exit_code == 0
-
-
-@pytest.mark.slow
-def test_a_bag_without_temperature_change_gives_no_alarm(unit, fitted):
-    bags = reduced(unit, arrays(unit, plan('tumble', 2)[:2], 3, rate_hz=RATE_HZ))
-    rate = judge_bags(bags, fitted.calibration).rate
-    section = rate.sections['all']
-    assert section.rms < section.raw_rms < 1.3 * section.rms
-    assert rate.kind is Verdict.WIDE

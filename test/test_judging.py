@@ -189,7 +189,6 @@ class TestWindows:
         bags = [one, resting(tmp_path / 'two', 30.0, error=-0.3)]
         evaluation = evaluate(bags, [('it', CLAIMING)])
         whole = evaluation.judgements['it'].sections['all']
-        # Two bags with equal numbers of windows have residuals of +102 and -102 ug: the mean is 0.
         assert whole.n == sum(judged(bag, CLAIMING).sections['all'].n for bag in bags)
         assert whole.mean / MICRO_G == pytest.approx(0.0, abs=0.5)
         assert whole.rms == pytest.approx(0.3 / K, rel=1e-3)

@@ -135,7 +135,6 @@ def test_executable_parameters_topics_and_drivers_of_a_launch_file_exist():
     defaults = {arg.get('name'): arg.get('default') for arg in parse(OURS).findall('arg')}
     for remap in node.findall('remap'):
         topic = remap.get('from')
-        # The topic of a thermometer is temperature/NAME.
         assert topic in topics or topic.startswith('temperature/'), topic
         argument = re.fullmatch(r'\$\(var (\w+)\)', remap.get('to', ''))
         assert defaults[argument[1]] == topic

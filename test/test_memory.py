@@ -30,7 +30,7 @@ def test_the_lag_of_a_ramp_agrees_with_the_closed_formula(step_s):
     assert (max(extra) > 0.0) == (step_s > 6.0)
 
 
-def test_errors_of_a_lag_after_a_gap_a_jump_or_wrong_readings_agree_with_formulas():
+def test_errors_of_a_lag_after_a_gap_a_jump_wrong_or_stuck_readings_agree_with_formulas():
     bank = LagBank((100.0, 1000.0))
     bank.step(0, 0.0)
     # A gap above tau / 10 adds variance to a lag: a gap of 50 s if tau = 100 s, not if 1000 s.
@@ -52,9 +52,18 @@ def test_errors_of_a_lag_after_a_gap_a_jump_or_wrong_readings_agree_with_formula
     memory = ThermalMemory(MemorySpec(lags=(TWO_STAGES,)))
     memory.board_step(0, 0.0)
     memory.note_jump(2.0)
-    # The lag is a difference of two first-order lags: (900 * lag_900 - 150 * lag_150) / 750.
-    # Errors of +2 K in lag_900 and -2 K in lag_150 add up to 2 K * (900 + 150) / 750 = 2 K * 1.4.
+    # The lag is (900 * lag_900 - 150 * lag_150) / 750: errors of +-2 K add up to 2 K * 1.4.
     assert memory.at(0, 0.0, [0.0])[1] == pytest.approx((2.0 * 1.4) ** 2)
+    memory = ThermalMemory(MemorySpec(lags=(('board', 900.0), ('case', 600.0))))
+    memory.board_step(0, 20.0)
+    memory.banks['case'].step(0, 1.0)
+    at = (0, 20.0, [1.0])
+    stuck, right = (2.0, 300.0), (0.0, 0.0)
+    some = (), (stuck, right), (stuck, stuck)
+    moving, board, both = (np.array(memory.at(*at, still)[1::2]) for still in some)
+    share = 1.0 - np.exp(-300.0 / np.array([900.0, 600.0]))
+    np.testing.assert_allclose(board - moving, (2.0 * share) ** 2)
+    np.testing.assert_allclose(both - moving, (2.0 * share) ** 2 * [1.0, 2.0])
 
 
 def after_two_stages(times, board):
@@ -173,8 +182,7 @@ def test_the_prior_of_the_initial_state_of_two_stages_is_that_of_a_random_walk(r
 
 
 def test_the_hysteresis_loop_of_a_play_agrees_with_the_formula():
-    # The output of a play operator (half-width 1 K) is v - 1 while its input v rises, v + 1 while
-    # v falls, and constant after a reversal until v has changed by 2 K.
+    # The output is v - 1 while v rises, v + 1 while v falls, constant for 2 K after a reversal.
     memory = ThermalMemory(MemorySpec(plays=((0.0, 1.0),)))
     way = np.concatenate((np.linspace(0, 5, 51), np.linspace(5, 0, 51), np.linspace(0, 5, 51)))
     P = []
@@ -189,7 +197,7 @@ def test_the_hysteresis_loop_of_a_play_agrees_with_the_formula():
     assert memory.at(200, -9.0, [0.0]) == [1.0]
 
 
-def test_the_prior_of_initial_lag_states_is_that_of_a_random_walk(rng):
+def test_initial_lag_states_have_the_prior_of_a_random_walk_and_decay(rng):
     D = 0.005
     tau = np.array([60.0, 240.0, 960.0])
     n, step = 4000, 6.0
@@ -211,25 +219,9 @@ def test_the_prior_of_initial_lag_states_is_that_of_a_random_walk(rng):
     assert P[2, 3] == 0.0
     assert np.linalg.eigvalsh(P).min() > 0.0
     assert start_covariance(()).shape == (0, 0)
-
-
-def test_initial_lag_states_decay_with_their_time_constants():
     memory = ThermalMemory(MemorySpec(lags=(('board', 60.0), ('board', 600.0), ('case', 600.0))))
     assert memory.remaining_shares(5) == [1.0, 1.0, 1.0]
     memory.board_step(0, 20.0)
     memory.banks['case'].step(300 * SECOND_NS, 2.0)
     shares = memory.remaining_shares(600 * SECOND_NS)
     assert shares == pytest.approx([math.exp(-10.0), math.exp(-1.0), math.exp(-0.5)])
-
-
-def test_a_stuck_board_thermometer_adds_errors_to_the_lags_of_board_and_case():
-    memory = ThermalMemory(MemorySpec(lags=(('board', 900.0), ('case', 600.0))))
-    memory.board_step(0, 20.0)
-    memory.banks['case'].step(0, 1.0)
-    at = (0, 20.0, [1.0])
-    stuck, right = (2.0, 300.0), (0.0, 0.0)
-    some = (), (stuck, right), (stuck, stuck)
-    moving, board, both = (np.array(memory.at(*at, still)[1::2]) for still in some)
-    share = 1.0 - np.exp(-300.0 / np.array([900.0, 600.0]))
-    np.testing.assert_allclose(board - moving, (2.0 * share) ** 2)
-    np.testing.assert_allclose(both - moving, (2.0 * share) ** 2 * [1.0, 2.0])

@@ -48,7 +48,6 @@ def thermal_test(path, imu=False, has_case=True):
     case = np.interp(seconds, [0.0, 400.0, 800.0], [15.0, 15.0, 25.0])
     board = np.interp(seconds - 100.0, [0.0, 400.0, 800.0], [16.0, 16.0, 26.0])
     reading_ns = START_NS + (seconds * 1e9).astype(np.int64)
-    # The unit rests with z up; the counts follow from the scale factors of `rich_calibration`.
     accel = np.array([5.0, -3.0, 310.0 * 9.80665]) + rng.integers(-4, 5, (n, 3))
     with BagWriter(path) as writer:
         for topic, values, late_ns in (

@@ -135,7 +135,6 @@ def test_a_reload_while_samples_flow_loses_no_sample(peer, tmp_path):
         assert 'Traceback' not in node.said
     stamps = [stamp_of(message) for message in flow.heard]
     assert stamps == list(range(stamps[0], stamps[-1] + 1, CYCLE_NS))
-    # Each sample is corrected with one of the calibrations, in the order in which they were set.
     biases = [flow.bias(index) for index in range(len(stamps))]
     changes = [b for a, b in pairwise(biases) if a != b]
     assert (biases[0], changes) == (1.0, [2.0, 3.0])
@@ -199,7 +198,6 @@ def test_a_change_that_fails_at_any_line_is_not_applied(tmp_path):
                 sample = START_NS + k * CYCLE_NS, *standing(k)
                 assert running.compensator.process(*sample) == undisturbed.process(*sample)
                 k += 1
-        # Setting the parameters executes over 150 lines; an exception was raised at each line.
         assert number > 150
         for change in changes:
             assert node.node.get_parameter(change.name).value == change.value

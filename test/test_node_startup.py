@@ -15,7 +15,7 @@ pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
 
 from builders import calibration
 from node_process import NodeProcess
-from ros_helpers import TIMEOUT, Driver, Peer, node_in_thread, standing
+from ros_helpers import TIMEOUT, Driver, node_in_thread, standing
 from sensor_msgs.msg import Imu
 
 from thermo_comp.ros.node import main
@@ -82,16 +82,14 @@ def test_an_unusable_ros_environment_is_one_line(name, value, text, unit, monkey
     assert text in printed
 
 
-def test_a_node_with_closed_streams_runs(unit):
+def test_a_node_with_closed_streams_runs(unit, peer):
     # WHY: with stderr closed, the pipe for signals had descriptor 2, so log text became a signal.
-    peer = Peer()
     shell = ['sh', '-c', 'exec "$0" "$@" <&- >&- 2>&-', sys.executable]
     words = [*shell, '-m', 'thermo_comp.ros.node', *arguments(f'calibration_file:={unit}')[1:]]
     with subprocess.Popen(words, cwd=Path(__file__).parents[1]) as node:
         assert peer.describe('serial')[0].description
         node.terminate()
         assert node.wait(TIMEOUT) == 0
-    peer.close()
 
 
 @pytest.mark.parametrize(('sink', 'code'), [('> /dev/full', 1), ('| true', 0)])
@@ -123,7 +121,7 @@ def test_node_and_commands_without_ros_end_with_advice(tmp_path, monkeypatch):
     assert f'cannot import (No module named {absent}): source the setup' in finished.stderr
 
 
-def test_the_node_needs_only_ros_numpy_and_yaml(unit, tmp_path, monkeypatch):
+def test_the_node_needs_only_ros_numpy_and_yaml(unit, peer, tmp_path, monkeypatch):
     # Python imports sitecustomize at its start, in the node and in its child processes.
     (tmp_path / 'sitecustomize.py').write_text(
         'import sys\n'
@@ -138,7 +136,6 @@ def test_the_node_needs_only_ros_numpy_and_yaml(unit, tmp_path, monkeypatch):
     check += '    try: find_spec(name)\n    except ModuleNotFoundError: print(name)'
     finished = ran(sys.executable, '-c', check)
     assert tuple(finished.stdout.split()) == ABSENT
-    peer = Peer()
     heard = peer.listen(Imu, 'imu/data_raw')
     with NodeProcess('-p', f'calibration_file:={unit}') as node:
         driver = Driver(peer)
@@ -158,7 +155,6 @@ def test_the_node_needs_only_ros_numpy_and_yaml(unit, tmp_path, monkeypatch):
         peer.poll(is_heard, 'a sample after the reload')
         assert node.stop() == 0
         assert 'rror' not in node.said.replace('[ERROR]', '')
-    peer.close()
     finished = ran(sys.executable, '-m', 'thermo_comp', 'info', unit)
     assert finished.returncode == 1
     text = 'thermo_comp: error: the commands need typer: pip install thermo_comp\n'

@@ -25,25 +25,11 @@ KNOWN_KEYS = {
 }
 
 
-def setup_literals():
-    literals = {}
-    for node in ast.parse((ROOT / 'setup.py').read_text()).body:
-        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
-            try:
-                literals[node.targets[0].id] = ast.literal_eval(node.value)
-            except ValueError:
-                continue
-    return literals
-
-
-def test_the_version_is_equal_wherever_it_is_stated():
+def test_version_and_dependencies_are_equal_wherever_they_are_stated():
     assert MANIFEST.findtext('version') == thermo_comp.__version__
     assert re.fullmatch(r'\d+\.\d+\.\d+', thermo_comp.__version__)
     finished = ran(sys.executable, 'setup.py', '--version', check=True)
     assert finished.stdout.split()[-1] == thermo_comp.__version__
-
-
-def test_the_manifest_names_keys_that_exist_and_only_dependencies_of_the_node():
     assert MANIFEST.get('format') == '3'
     assert MANIFEST.findtext('name') == 'thermo_comp'
     assert MANIFEST.findtext('export/build_type') == 'ament_python'
@@ -54,7 +40,8 @@ def test_the_manifest_names_keys_that_exist_and_only_dependencies_of_the_node():
     keys = {node.text for node in MANIFEST.iter('exec_depend')}
     libraries = {key for key in keys if key.startswith('python3-')}
     assert libraries == {'python3-numpy', 'python3-yaml'}
-    install = setup_literals()['INSTALL']
+    install = re.search(r'^INSTALL = (\[.*?^\])', (ROOT / 'setup.py').read_text(), re.M | re.S)[1]
+    install = ast.literal_eval(install)
     assert isinstance(install, list)
     assert all('>=' in requirement for requirement in install), 'no floor'
 
@@ -98,7 +85,6 @@ def test_hosted_ci_installs_as_the_readme_describes():
 
 
 def test_the_installed_share_folder_contains_the_files_that_ros_needs(tmp_path):
-    # Install the data files into a folder with setup.py, as colcon does.
     words = (*('build', '--build-base', tmp_path / 'build'), 'install_data', '--install-dir')
     environment = {**os.environ, 'PYTHONWARNINGS': 'ignore'}
     command = (sys.executable, 'setup.py', '-q', *words, tmp_path / 'prefix')

@@ -19,7 +19,7 @@ from thermo_comp.ros.parameters import NodeConfig, ParameterError
 from thermo_comp.topics import OUTPUTS
 
 
-def test_every_parameter_is_described_with_its_default_and_in_table_and_help():
+def test_parameters_are_described_and_overrides_are_applied():
     with bare_node() as node:
         config = parameters.declare(node)
         for entry in fields(NodeConfig):
@@ -37,9 +37,6 @@ def test_every_parameter_is_described_with_its_default_and_in_table_and_help():
         assert f'| `{entry.name}` |' in table
         assert f'  {entry.name}:=' in text
     assert table.count('\n') == 2 + len(fields(NodeConfig))
-
-
-def test_overrides_are_applied_and_integers_are_accepted_for_floats():
     # WHY: rclpy refuses `-p transition_time:=5` for a float parameter, with a traceback.
     with bare_node('transition_time:=5', 'serial:=unit42', 'case_timeout:=2.5') as node:
         config = parameters.declare(node)

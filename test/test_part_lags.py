@@ -82,12 +82,19 @@ def judged(calibration, study):
     return strangers.score(outs, [minutes(bag) for bag in bags], is_drift=False)
 
 
-def test_the_fitted_lag_of_each_axis_is_that_of_its_part(parts):
+def test_the_fitted_lag_of_each_axis_is_that_of_its_part_and_is_printed(parts):
     unit, study, calibration, _ = parts
     # In a ramp a lag of 10 K changes the bias by 100 ug, an error of the lag of 1 % by 1 ug.
     assert np.array(taus_of(calibration)) == pytest.approx(unit.part_s[:, None], rel=0.01)
     # The noise of |f| in a mean over 60 s is 0.65 ug.
     assert judged(calibration, study).norm < 2.0
+    unit, *_, (text, content) = parts
+    (line,) = (line for line in text.splitlines() if 'one part, which' in line)
+    printed = [float(word) for word in line.split('by ')[1].split(' s')[0].split(', ')]
+    content = json.loads(content)
+    assert content['part_lags_s'] == pytest.approx(unit.part_s, rel=0.01)
+    assert printed == pytest.approx(content['part_lags_s'], abs=0.5)
+    assert content['part_case_shares'] == [0.0, 0.0, 0.0]
 
 
 @pytest.mark.slow
@@ -112,7 +119,6 @@ def test_lags_of_the_thermometers_themselves_are_fitted(sensors):
     given = {'part_s': PARTS_S, 'thermometer_s': 60.0, 'sensors': sensors}
     unit, study = study_of('slow thermometer', **given)
     calibration = strangers.fitted(study)
-    # The noise of |f| in a mean over 60 s is 0.65 ug.
     assert judged(calibration, study).norm < 2.0
     parts = {term.part for term in calibration.response if term.kind == 'board'}
     taus, _, shares, leads = np.array(sorted(parts)).T
@@ -159,7 +165,6 @@ def test_a_fit_to_equal_warm_ups_predicts_a_slower_warm_up():
     _, study = study_of('thaw', up=10, corners=thaw, **given)
     calibration = strangers.fitted(study)
     assert {term.group for term in calibration.response if any(term.bias)} == {'part'}
-    # The noise of |f| in a mean over 60 s is 0.65 ug.
     assert judged(calibration, study).norm < 2.0
 
 
@@ -202,7 +207,6 @@ def test_the_lags_of_parts_are_found_beside_an_effect_of_the_gradient():
 def test_a_bump_of_the_bias_over_temperature_is_fitted_by_knees():
     # The bump of the bias lasts for 2 min, and must not be taken for motion.
     _, study = study_of('bump', bump=np.array([450.0, -400.0, 500.0]), bump_c=17.0)
-    # The three stated groups of columns make the fit three times as fast as a choice of groups.
     calibration = strangers.fitted(study, groups=('curve', 'part', 'bend'))
     judgement = judged(calibration, study)
     # The bump of the bias, a bell curve (sd 0.85 K), is fitted by straight lines of 0.5 K each.
@@ -224,11 +228,8 @@ def test_two_lags_in_series_are_fitted_as_two_stages():
     for record in (*records, *tests):
         for name in ('board', 'case', 'board_stamp_ns', 'case_stamp_ns'):
             setattr(record, name, getattr(record, name)[::10])
-    # A fit with only the groups of columns that the simulated unit needs takes half the time.
     groups = ('curve', 'board', 'part', 'product', 'square')
-    result = fit_and_correct(
-        records, tests, full_scale=cases.FULL_SCALE['full_scale'], groups=groups
-    )
+    result = fit_and_correct(records, tests, **cases.FULL_SCALE, groups=groups)
     least, _ = second_simulator.floor_of(tests)
     assert errors(result.specific_force, result.sd, tests).norm < 2.0 * least
     terms = result.calibration.response
@@ -273,8 +274,7 @@ def test_six_faces_in_three_soaks_determine_the_curve_at_other_temperatures():
         # WHY: the lags fitted to warm-ups did not hold in a cool-down: the force error was 180 ug.
         ('only warm', {'up': 10, 'corners': program(5, 20, (35, 0.8, 40)), 'part_s': PARTS_S / 2.0,
                        'held': program(33, 20, (10, 0.8, 40))}, 'norm', 2.0),
-        # WHY: soaks at two temperatures do not determine a curve: the claimed sd was 1/8 of the
-        # error, as the covariance lacked the uncertainty of the curve's shape.
+        # WHY: soaks at two temperatures do not determine a curve: the claimed sd was 1/8.
         ('two soaks', {'up': 18, 'corners': SOAKS[::2], 'held': program(19.0, 90.0),
                        'grade': cases.consumer_grade}, 'ratio', 2.0),
         # WHY: with each axis vertical at one temperature only, force errors were 15 claimed sd.
@@ -320,26 +320,19 @@ def test_a_bias_decay_after_power_on_is_not_fitted_by_a_lag():
     assert judged(strangers.fitted(study), study).vector < np.sqrt(2.0) * 320.0
 
 
-def lags_of(calibration):
-    return {term.tau_s for term in calibration.response if term.kind == 'board'}
-
-
 @pytest.mark.slow
-def test_lags_of_a_unit_with_a_hidden_node_are_those_of_the_bank():
-    # The bias of each axis depends on its part and on a hidden node without a thermometer.
-    study = next(cases.third_node(0))
-    # The six stated groups of columns make the fit 1.5 times as fast as a choice of groups.
+def test_lags_of_a_unit_with_a_hidden_node_or_in_soaks_only_are_those_of_the_bank():
+    # The bias of each axis depends on its part and on a hidden node without a thermometer. The six
+    # stated groups of columns make the fit 1.5 times as fast as a choice of groups.
     groups = ('curve', 'part', 'board', 'gradient_lag', 'product', 'square')
-    calibration = strangers.fitted(replace(study, bags=study.bags[:8]), groups=groups)
-    assert lags_of(calibration) <= {*FINE_TAUS}
-
-
-@pytest.mark.slow
-def test_a_fit_to_soaks_has_no_fitted_lag_and_no_range_of_the_gradient():
+    for study, n, options in (
+        (next(cases.third_node(0)), 8, {'groups': groups}),
+        (next(cases.soaks(1)), 9, {}),
+    ):
+        calibration = strangers.fitted(replace(study, bags=study.bags[:n]), **options)
+        lags = {term.tau_s for term in calibration.response if term.kind == 'board'}
+        assert lags <= {*FINE_TAUS}
     # A large difference of case and board in a later ramp is not reported as a loose thermometer.
-    study = next(cases.soaks(1))
-    calibration = strangers.fitted(replace(study, bags=study.bags[:9]))
-    assert lags_of(calibration) <= {*FINE_TAUS}
     assert calibration.rest_gradient_range_k is None
 
 
@@ -358,13 +351,3 @@ def test_units_of_a_type_share_the_lags_of_the_bank(parts):
     off = strangers.corrected(mean, bag).force - strangers.corrected(calibration, bag).force
     # The effect of a lag is 200 ug (10 K, 20 ug/K), and differs by up to 7 % between the units.
     assert np.sqrt(np.mean(off**2)) < 5.0 * UG
-
-
-def test_fit_prints_the_fitted_lags_of_the_parts(parts):
-    unit, *_, (text, content) = parts
-    (line,) = (line for line in text.splitlines() if 'one part, which' in line)
-    printed = [float(word) for word in line.split('by ')[1].split(' s')[0].split(', ')]
-    content = json.loads(content)
-    assert content['part_lags_s'] == pytest.approx(unit.part_s, rel=0.01)
-    assert printed == pytest.approx(content['part_lags_s'], abs=0.5)
-    assert content['part_case_shares'] == [0.0, 0.0, 0.0]

@@ -122,19 +122,15 @@ def said(result):
     return next((finding.message for finding in result.findings if finding.name == 'unseen'), '')
 
 
-def test_six_faces_determine_attitudes_at_the_corners_of_a_cube_least(rng):
+def test_the_least_determined_attitude_is_found_and_printed_if_a_side_was_never_up(rng):
     result = fitted(rng, FACES)
     least = result.least_known
     assert least_known(replace(result.calibration, posterior=None), FACES) is None
     # Near a corner of the cube the variance changes little: the direction found may lie beside it.
     np.testing.assert_allclose(np.abs(least.up), 3.0**-0.5, atol=0.05)
     assert least.away_deg == pytest.approx(np.degrees(np.arccos(3.0**-0.5)), abs=4.0)
-    # Three misalignment angles (prior sd of a MEMS: 0.01 rad each) change |f|, each by g times the
-    # product of two components of gravity's direction: 1 / 3 at a corner of the cube.
+    # Each of three angles (sd 0.01 rad) changes |f| by g * product of two components, here 1 / 3.
     assert least.sd_m_s2 == pytest.approx(GRAVITY * 1e-2 / 3.0**0.5, rel=0.2)
-
-
-def test_the_least_determined_attitude_is_printed_if_a_side_was_never_up(rng):
     ups = positions(30, 4)
     result = fitted(rng, ups[ups[:, 2] > 0.2])
     np.testing.assert_allclose(result.least_known.up, (0.0, 0.0, -1.0), atol=0.06)

@@ -51,10 +51,7 @@ test_of.__test__ = False
 
 @cache
 def fitted(number):
-    """
-    Fit a sibling to nine of its twelve positions. Nine positions do not determine the sd of
-    mounting offsets, so this sd is stated.
-    """
+    """Fit a sibling to nine positions, which do not determine the sd of mounting offsets."""
     options = replace(OPTIONS, serial=f'unit-{number}', mounting_sd=1e-6 * STANDARD_GRAVITY)
     return fit([source(record) for record in test_of(number, 0, 9)], options)
 
@@ -88,9 +85,8 @@ def test_a_population_has_the_mean_of_its_units_and_their_scatter():
     variance = np.diag(prior.posterior.covariance())
     at = parameter_layout(prior).bias[0].static + 1
     sd = np.sqrt(variance[at]) / prior.axes.x.scale_factor
-    # Expected variance of a fourth unit: 4/3 of the variance of three units (mean over the axes)
-    # times 6 / (6 - 2), for Student's distribution with 6 degrees of freedom, plus the claimed
-    # variance of the three units.
+    # Expected variance of a fourth unit: 4/3 of the variance of three units, times 6 / (6 - 2) for
+    # Student's distribution with 6 degrees of freedom, plus the claimed variance.
     own = np.array(own) / K[:, 0] ** 2
     expected = np.var(slopes, axis=0, ddof=1).mean() * 4.0 / 3.0 * 6.0 / 4.0 + own.mean()
     assert sd == pytest.approx(np.sqrt(expected), rel=1e-3)
@@ -167,8 +163,7 @@ def helped():
 
 @pytest.mark.slow
 def test_a_fit_begins_with_the_widest_of_its_priors():
-    # WHY: a fit that began with the narrow prior of three units found mounting offsets of 190 ug,
-    # a local minimum. A fit begins with the prior of largest variance in all directions.
+    # WHY: a fit that began with a narrow prior found mounting offsets of 190 ug, a local minimum.
     *tried, widest = (prior.root.T @ prior.root for prior in helped())
     assert len(tried) > 2
     root = np.sqrt(np.diag(widest))
@@ -222,9 +217,8 @@ def test_rests_at_one_temperature_correct_a_bias_change_and_keep_the_response():
 
 def after(change, ups):
     """
-    Update the calibration of sibling 9 by rests of 10 min, whose counts are changed by a function
-    of counts and calibration. Return the change of the bias at 20 degC and the sd of the new
-    bias [m/s^2], the relative change of the scale factor and the new relative sd, shape (4, 3).
+    Update sibling 9 by rests of 10 min with changed counts; return the change of the bias at 20
+    degC, its new sd [m/s^2], and relative change and sd of the scale factor, shape (4, 3).
     """
     old, day = fitted(9).calibration, parse_cyclogram('20 10min')
     records = arrays(sibling(KIND, 9, 0.15), [Position(day, up) for up in ups], 999)

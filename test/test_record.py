@@ -84,7 +84,6 @@ def check_positions(result):
 
 def check_fit(result, cli, folder):
     """Run the fit that `record` printed, and compare its constants with the true constants."""
-    # The model `golovach` is sufficient for constants; a response takes ten times as long.
     given = '--gravity 9.80665 --model golovach'
     words = shlex.split(result['command'].replace('--gravity G', given))
     assert words.pop(0) == 'thermo_comp'
@@ -277,21 +276,15 @@ class TestLive:
         assert contents(numbered_bags(bags)) == contents([bag])
         assert sorted(bags.iterdir()) == numbered_bags(bags)
 
-    @pytest.mark.usefixtures('play')
     @pytest.mark.slow
-    def test_a_topic_of_a_wrong_type_is_named(self, tmp_path):
+    def test_a_topic_of_a_wrong_type_is_named(self, peer, tmp_path):
         from geometry_msgs.msg import PointStamped
-        from ros_helpers import Peer
 
-        peer = Peer()
-        try:
-            peer.node.create_publisher(PointStamped, 'accel/counts', 10)
-            recording = Recording('-o', tmp_path / 'bags', '--json')
-            recording.wait_for(
-                '/accel/counts has the type geometry_msgs/msg/PointStamped, '
-                'expected geometry_msgs/msg/Vector3Stamped'
-            )
-            code, result, _ = recording.end(signal.SIGINT)
-        finally:
-            peer.close()
+        peer.node.create_publisher(PointStamped, 'accel/counts', 10)
+        recording = Recording('-o', tmp_path / 'bags', '--json')
+        recording.wait_for(
+            '/accel/counts has the type geometry_msgs/msg/PointStamped, '
+            'expected geometry_msgs/msg/Vector3Stamped'
+        )
+        code, result, _ = recording.end(signal.SIGINT)
         assert (code, result['bags'], result['command']) == (0, [], None)

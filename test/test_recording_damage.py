@@ -253,7 +253,6 @@ def test_a_damaged_last_chunk_is_left_out(tmp_path):
     recording = read(path)
     assert str(recording.info.truncated).endswith('; its last chunk is damaged and left out')
     assert_columns(recording.columns, regular_messages(24)[: recording.info.n_messages])
-    # If the file ends inside the damaged chunk, the error names the cut.
     path.write_bytes(damaged[:-5])
     assert 'ends inside a chunk' in str(read(path).info.truncated)
 

@@ -113,7 +113,7 @@ def test_paths_that_are_not_a_bag_are_refused(tmp_path):
         refused(tmp_path / 'folder', reason)
 
 
-def test_absent_topics_and_topics_of_a_wrong_type_are_refused(tmp_path):
+def test_absent_empty_and_ambiguous_topics_and_topics_of_a_wrong_type_are_refused(tmp_path):
     path = tmp_path / 'bag.mcap'
     messages = rec.regular_messages(8)
     rec.write_mcap(path, messages)
@@ -132,10 +132,7 @@ def test_absent_topics_and_topics_of_a_wrong_type_are_refused(tmp_path):
     refused(path, 'the bag holds no messages')
     assert inspect_recording(path).input is None
     assert len(read(path).columns) == 0
-
-
-def test_empty_and_ambiguous_topics_are_refused(tmp_path):
-    path = tmp_path / 'bag.mcap'
+    path = tmp_path / 'empty.mcap'
     with BagWriter(path) as bag:
         bag.write_counts('accel/counts', [1, 2], np.zeros((2, 3)))
         bag.write_temperature('temperature/board', [1], [20.0])

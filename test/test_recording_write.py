@@ -54,20 +54,16 @@ def test_rosbags_and_mcap_read_the_written_messages(
                 bag.write_raw('regime/dynamic', BOOL, log_ns, flags)
                 bag.write_raw('diagnostics', 'std_msgs/msg/String', log_ns, raw)
                 bag.flush()
-                numbers = {
-                    rec.ACCEL: linear, rec.BOARD: np.column_stack((linear[:, 0], np.zeros(n))),
-                    rec.IMU_IN: np.hstack((*imu[:4], linear, covariance)),
-                }  # fmt: skip
+                readings = np.column_stack((linear[:, 0], np.zeros(n)))
+                columns = np.hstack((*imu[:4], linear, covariance))
+                times = list(zip(log_ns.tolist(), stamp_ns.tolist(), strict=True))
                 group = [
                     (log, topic, rec.serialize(rec.Message(topic, log, stamp, frame, tuple(row))))
-                    for topic, frame in (
-                        (rec.ACCEL, frame_id),
-                        (rec.BOARD, ''),
-                        (rec.IMU_IN, frame_id),
+                    for topic, frame, rows in (
+                        *((rec.ACCEL, frame_id, linear), (rec.BOARD, '', readings)),
+                        (rec.IMU_IN, frame_id, columns),
                     )
-                    for log, stamp, row in zip(
-                        log_ns.tolist(), stamp_ns.tolist(), numbers[topic].tolist(), strict=True
-                    )
+                    for (log, stamp), row in zip(times, rows.tolist(), strict=True)
                 ]
                 for topic, content in (('/regime/dynamic', flags), ('/diagnostics', raw)):
                     group += [(int(log), topic, c) for log, c in zip(log_ns, content, strict=True)]
@@ -150,20 +146,6 @@ def test_a_written_directory_equals_that_of_rosbag2_and_a_file_contains_its_name
     assert content['relative_file_paths'] == [content['files'][0]['path']] == ['bag.mcap']
 
 
-def test_a_raw_message_needs_a_definition(tmp_path):
-    with BagWriter(tmp_path / 'bag.mcap') as bag:
-        with pytest.raises(RecordingError, match='/x: the definition of message type a/msg/B is'):
-            bag.write_raw('x', 'a/msg/B', [1], [b'\0\1\0\0\7'])
-        bag.write_raw('x', 'a/msg/B', [1], [b'\0\1\0\0\7'], ('ros2msg', 'uint8 data\n'))
-        with pytest.raises(RecordingError, match='/x: already written with another type than std'):
-            bag.write_raw('x', BOOL, [1], [b''])
-    with AnyReader([tmp_path / 'bag.mcap']) as reader:
-        ((connection, _, data),) = reader.messages()
-        assert reader.deserialize(data, connection.msgtype).data == 7
-    with open_recording(tmp_path / 'bag.mcap', require=()) as ours:
-        assert ours.definitions['a/msg/B'] == ('ros2msg', 'uint8 data\n')
-
-
 @pytest.mark.parametrize('name', ['bag', 'bag.mcap'])
 def test_an_existing_output_stays_until_the_new_output_is_complete(tmp_path, name):
     path = tmp_path / name
@@ -211,7 +193,7 @@ def test_an_output_may_be_a_link_but_never_replaces_a_file_or_folder_that_is_no_
         assert float(columns.accel[0, 0]) == 2.0
 
 
-def test_arguments_of_wrong_shape_or_type_are_refused(tmp_path):
+def test_arguments_of_wrong_shape_or_type_and_messages_without_a_definition_are_refused(tmp_path):
     xyz = [[1, 2, 3]]
     with BagWriter(tmp_path / 'bag') as bag:
         for write, given, reason in (
@@ -229,6 +211,17 @@ def test_arguments_of_wrong_shape_or_type_are_refused(tmp_path):
                 write('a', *given)
     with pytest.raises(RecordingError, match='the bag is closed'):
         bag.write_raw('a', BOOL, [1], [b''])
+    with BagWriter(tmp_path / 'bag.mcap') as bag:
+        with pytest.raises(RecordingError, match='/x: the definition of message type a/msg/B is'):
+            bag.write_raw('x', 'a/msg/B', [1], [b'\0\1\0\0\7'])
+        bag.write_raw('x', 'a/msg/B', [1], [b'\0\1\0\0\7'], ('ros2msg', 'uint8 data\n'))
+        with pytest.raises(RecordingError, match='/x: already written with another type than std'):
+            bag.write_raw('x', BOOL, [1], [b''])
+    with AnyReader([tmp_path / 'bag.mcap']) as reader:
+        ((connection, _, data),) = reader.messages()
+        assert reader.deserialize(data, connection.msgtype).data == 7
+    with open_recording(tmp_path / 'bag.mcap', require=()) as ours:
+        assert ours.definitions['a/msg/B'] == ('ros2msg', 'uint8 data\n')
 
 
 @pytest.mark.parametrize('name', ['bag', 'bag.mcap'])

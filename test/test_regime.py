@@ -85,8 +85,7 @@ def test_the_onset_of_a_ramp_is_detected_early(sensor, median_s, late_s):
     ('sensor', 'threshold'), [('1 mK', 9.65), pytest.param('10 mK', 8.87, marks=pytest.mark.slow)]
 )
 def test_the_onset_delay_is_below_twice_that_of_a_cusum_test(sensor, threshold):
-    # A CUSUM test that knows ramp, baseline and noise has the shortest delay. `threshold`: log
-    # likelihood ratio at which this CUSUM gives one false alarm in 50 h.
+    # A CUSUM that knows the ramp is fastest. `threshold`: for one false alarm in 50 h.
     noise = SENSORS[sensor][0]
     rng = np.random.default_rng(4)
     k = np.arange(1.0, 121.0)
@@ -132,8 +131,7 @@ def test_each_ramp_switches_the_regime_to_dynamic_once(noise, quantum, rate_k_mi
     ],
 )
 def test_three_soaks_of_5_h_have_at_most_two_false_alarms(sensor):
-    # The default setting allows 0.02 false alarms per hour: more than two false alarms in 15 h
-    # have a probability of 0.4 %.
+    # At 0.02 false alarms per hour more than two in 15 h have a probability of 0.4 %.
     noise, quantum = SENSORS[sensor]
     n_openings = 0
     for seed in range(3):
@@ -151,9 +149,8 @@ def test_three_soaks_of_5_h_have_at_most_two_false_alarms(sensor):
 
 
 def test_the_rate_of_false_alarms_is_below_that_of_the_setting():
-    # The setting allows 20 false alarms per hour, 1000 in 50 h; the readings are noise only. The
-    # threshold is set by Rice's formula for crossings; as crossings come in groups, there are
-    # fewer separate alarms: 322. A threshold that is 10 % lower or higher gives 453 or 232.
+    # The setting allows 1000 false alarms in 50 h. As crossings of noise come in groups, there are
+    # fewer separate alarms: 322. A threshold 10 % lower or higher gives 453 or 232.
     settings = ThermometerSettings(0.01, lag_s=LAG_S)
     test = ChangeDetector(settings, 0.2 / 60.0, ripple=0.0, false_alarms=20.0 / 3600.0)
     rng = np.random.default_rng(6)
@@ -197,7 +194,7 @@ def gone(t, readings):
 RAMP = [(0.0, 0.5), (3600.0, 0.0)]
 
 
-def test_the_dynamic_regime_ends_below_the_relaxed_rate_of_the_board_or_else_of_the_case():
+def test_the_dynamic_regime_ends_when_the_board_or_else_the_case_has_the_relaxed_rate():
     # The regime ends when the board's rate has been below 0.05 K/min for the dwell time, 60 s.
     changes = run_once(RAMP)
     assert [regime for _, regime, _ in changes] == [STATIC, DYNAMIC, STATIC]
@@ -207,9 +204,6 @@ def test_the_dynamic_regime_ends_below_the_relaxed_rate_of_the_board_or_else_of_
     assert relaxed_at + 60.0 - 60.0 < changes[2][0] < relaxed_at + 60.0 + 120.0
     changes = run_once(RAMP, board=lambda t, celsius: np.where(t < 3600.0, celsius, np.nan))
     assert [regime for _, regime, _ in changes][-2:] == [DYNAMIC, STATIC]
-
-
-def test_the_relaxed_rate_sets_the_end_of_the_dynamic_regime():
     readings = recorded(RAMP, -1800.0, 9000.0)
     ends = [
         switches(detector_settings(0.001, relaxed_rate_k_min=rate), *readings)[-1][0]
@@ -240,8 +234,7 @@ def test_the_dynamic_regime_ends_by_the_case_or_the_board(sensor):
     assert [regime for _, regime, _ in early] == [STATIC, DYNAMIC, STATIC]
     assert early[1] == late[1]
     assert late[2][0] - early[2][0] == pytest.approx(earlier, abs=300.0)
-    # With the end condition 'case' the regime switches as without a board thermometer. Without a
-    # case thermometer both end conditions of the dynamic regime use the board thermometer.
+    # With 'case' the regime switches as without a board; without a case both settings are equal.
     assert early == switches(board_too, t, case, None)
     t, board = t[:3000], board[:3000]
     assert switches(case_alone, t, None, board) == switches(board_too, t, None, board)
@@ -289,14 +282,11 @@ def test_the_first_regime_is_unknown_and_then_dynamic_if_readings_begin_in_a_ram
 
 
 @pytest.mark.parametrize('quantum', [0.0, 0.0625])
-def test_switches_are_equal_in_heating_and_cooling(quantum):
+def test_switches_are_equal_in_heating_and_cooling_and_at_any_origin_of_time(quantum):
     settings = detector_settings(0.001, quantum)
     t, case, board = recorded(RAMP, -1800.0, 7500.0, quantum=quantum, start=0.0)
     up, down = switches(settings, t, case, board), switches(settings, t, -case, -board)
     assert [(at, regime, -direction) for at, regime, direction in up] == down
-
-
-def test_switches_do_not_depend_on_the_origin_of_time():
     t, *readings = recorded([(1500.0, 0.5)], 0.0, 3000.0)
     near, far = (switches(detector_settings(0.001), t + by, *readings) for by in (0.0, 1e6))
     assert [(at + 1e6, *rest) for at, *rest in near] == [(at, *rest) for at, *rest in far]

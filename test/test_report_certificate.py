@@ -133,7 +133,6 @@ def test_a_wrong_entry_in_the_statements_gives_a_message_of_one_line(tmp_path, t
 def test_the_example_of_statements_equals_the_documentation_and_other_files_are_refused(tmp_path):
     example = ROOT / 'config' / 'lab.example.yaml'
     info = load_certificate_info(example)
-    # The example file states all fields except the remarks and the serial of the unit.
     assert info.gravity.source == 'national gravity network'
     assert [instrument.name for instrument in info.instruments] == ['chamber', 'thermometers']
     page = (ROOT / 'docs' / 'recording.md').read_text(encoding='utf-8')
@@ -244,7 +243,6 @@ def test_values_and_deviations_have_equal_decimals_if_u_is_withheld(is_known, tm
                 text, expanded, deviation = cells[k : k + 3]
                 n_withheld += expanded == '–'
                 assert len(text.partition('.')[2]) == len(deviation.partition('.')[2])
-                # Values and deviations are equal, but for rounding, whether U is stated or not.
                 for value, place in ((text, k), (deviation, k + 2)):
                     half = 0.5 * 10.0 ** -len(value.partition('.')[2])
                     number, expected = map(float_of, (value, others[place]))

@@ -89,7 +89,7 @@ def check_blocks(stamps, samples, cuts, whole):
     assert np.allclose([row.mean for row in found], [row.mean for row in whole], atol=1e-9)
 
 
-def test_logged_windows_are_means_over_10_s_at_rest():
+def test_logged_windows_are_means_over_10_s_at_rest_with_a_mean_rate_if_none_is_missing():
     # A rest of 25 s and, after 1 s of handling, a rest of 21 s: each gives two windows of 10 s.
     first, second = standing(25 * RATE_HZ), standing(21 * RATE_HZ, 2)[:, [2, 1, 0]]
     handled = first[:RATE_HZ] + np.linspace(0.0, 900.0, RATE_HZ)[:, None]
@@ -101,11 +101,7 @@ def test_logged_windows_are_means_over_10_s_at_rest():
     for row, part in zip(whole, parts, strict=True):
         assert np.allclose(row.mean, part.mean(axis=0), atol=1e-9)
         assert np.allclose(row.sd, part.std(axis=0), rtol=0.05)
-    # Samples in blocks of any size give equal windows.
     check_blocks(stamps, samples, [7, 333, 334, 1201], whole)
-
-
-def test_a_rest_in_which_an_angular_rate_is_missing_has_no_mean_rate():
     # WHY: blocks of messages with and without rates had 6 and 3 columns, which ended the log.
     samples = np.hstack((standing(25 * RATE_HZ), np.full((25 * RATE_HZ, 3), 0.01)))
     samples[7, 3:] = np.nan
@@ -120,8 +116,7 @@ def test_a_rest_in_which_an_angular_rate_is_missing_has_no_mean_rate():
 
 @pytest.mark.parametrize('rate', [1.0, 2.0, 3.3, 5.0, 50.0, 2000.0])
 def test_rests_are_found_at_any_rate_of_samples(rate, rng):
-    # Rests of one minute in two attitudes, with jitter of the stamps. Samples at rates up to
-    # `RATE_HZ` have equal noise, at higher rates an equal noise density.
+    # Rests of one minute in two attitudes, with jitter; above `RATE_HZ` noise has equal density.
     n = round(120 * rate)
     cycles = np.arange(n) + 0.1 * rng.uniform(-1.0, 1.0, n)
     stamps = START_NS + np.rint(cycles * SECOND_NS / rate).astype(np.int64)
@@ -229,7 +224,6 @@ def test_the_size_of_a_rest_log_is_limited_per_day_and_in_total(tmp_path, monkey
     assert len(sizes) == 6
     assert max(sizes) <= 2000
     assert sum(sizes) <= 5000 + 2000
-    # The oldest file was thinned to less than half of the newest file, and no file was removed.
     assert sizes[0] < sizes[-1] / 2
     assert log.n_rests == len(logged(tmp_path))
     assert (log.n_days, log.n_lost, log.reason) == (6, 0, '')

@@ -47,7 +47,7 @@ def hover(rng, seconds, vibration):
     return accel, gyro + np.radians(2.0) + np.radians(0.5) * rng.standard_normal(gyro.shape)
 
 
-def test_no_rest_is_found_in_a_flight_with_much_or_little_vibration(rng):
+def test_of_a_flight_only_the_time_on_the_ground_is_a_rest(rng):
     accel, gyro = hover(rng, 120.0, vibration=1.0)
     for rate in (gyro, None):
         with pytest.raises(FitError, match=r'log: no still interval: .* scatter by at least 9\d'):
@@ -56,9 +56,6 @@ def test_no_rest_is_found_in_a_flight_with_much_or_little_vibration(rng):
     accel, gyro = hover(rng, 120.0, vibration=15.0 * MG)
     with pytest.raises(FitError, match='the angular rate mostly varies more than at rest'):
         reduce_bag(source(accel, gyro), OPTIONS)
-
-
-def test_only_the_time_on_the_ground_of_a_flight_is_a_rest(rng):
     parts = [ground(rng, 12.0), hover(rng, 240.0, 15.0 * MG), ground(rng, 12.0)]
     accel, gyro = (np.concatenate(each) for each in zip(*parts, strict=True))
     bag = reduce_bag(source(accel, gyro), OPTIONS)
@@ -120,7 +117,7 @@ def test_each_short_rest_of_a_hand_held_unit_is_found(rng, rest_s, shaky):
     assert result.residuals[-1].fitted.rms < 2.0 * MG
 
 
-def test_motion_is_not_taken_for_a_rest(rng):
+def test_motion_is_not_taken_for_a_rest_nor_a_drift_in_a_ramp_for_a_motion(rng):
     # For the last 10 s |f| is 1.04 g, with the noise of a shaky rest: the unit is accelerated.
     accel = by_hand(rng, 14, 6.0, (3,), misalignment=5e-3)
     time = time_of(10.0)
@@ -129,9 +126,6 @@ def test_motion_is_not_taken_for_a_rest(rng):
     result = fit([source(accel)], OPTIONS)
     assert 13 <= len(result.positions) <= 14
     assert result.residuals[-1].fitted.rms < 2.0 * MG
-
-
-def test_a_drift_in_a_ramp_is_not_taken_for_a_motion(rng):
     # A tilt by 0.1 mrad is a motion; a drift of 60 ug in 30 s (noise of a mean: 1 ug) is not.
     time = np.arange(7200.0)
     stamps = START_NS + np.rint(time * 1e9).astype(np.int64)

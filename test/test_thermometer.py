@@ -78,9 +78,8 @@ PARTS = {
 @pytest.mark.parametrize('part', PARTS)
 @pytest.mark.parametrize('sensor', SENSORS)
 def test_squared_errors_are_on_average_below_5_claimed_variances(errors, sensor, part):
-    # In soaks and ramps the claimed variance is a few times the mean squared error, because it
-    # allows for the onset or end of a ramp at any time. Readings with steps have few independent
-    # errors, so their mean square is uncertain by a factor of 2.
+    # The claimed variance of soaks and ramps allows for the onset or end of a ramp at any time.
+    # For readings with steps the mean squared error is uncertain by a factor of 2.
     begin, end = PARTS[part]
     rows = errors[sensor]
     rows = rows[(rows[:, 0] >= begin) & (rows[:, 0] < end)]
@@ -159,7 +158,7 @@ def drawn(rng):
     return rng.normal(size=3), root @ root.T
 
 
-def test_the_prediction_and_the_correction_step_equal_matrix_algebra():
+def test_prediction_correction_and_blend_equal_matrix_algebra():
     mean, covariance = drawn(np.random.default_rng(0))
     dt, lag, power = 1.7, 50.0, 0.3
     forward = np.array([[1.0, dt, dt**2 / 2.0], [0.0, 1.0, dt], [0.0, 0.0, 1 / (1.0 + dt / lag)]])
@@ -177,9 +176,6 @@ def test_the_prediction_and_the_correction_step_equal_matrix_algebra():
     np.testing.assert_allclose(out[3:], (covariance - np.outer(gain, covariance[0]))[UPPER])
     assert innovation == 5.0 - mean[0]
     assert spread == pytest.approx(covariance[0, 0] + 0.2)
-
-
-def test_a_blend_has_mean_and_covariance_of_the_mixture():
     rng = np.random.default_rng(2)
     states, samples = [], []
     for n in (300_000, 100_000):
@@ -241,8 +237,7 @@ def test_a_gap_increases_the_variance_or_restarts_the_estimate_and_changes_are_d
 
 
 def test_the_noise_is_estimated_if_the_setting_is_too_small():
-    # WHY: with the noise set to 5 mK all readings of a sensor with 0.1 K were taken for outliers.
-    # The ratio of true to set noise is estimated to 20 %; some noise is taken for rate changes.
+    # WHY: readings with a noise of 0.1 K, stated as 5 mK, were all taken for outliers.
     thermometer = Thermometer(ThermometerSettings(0.005))
     rng = np.random.default_rng(3)
     out = run(thermometer, np.arange(4000.0), read(np.full(4000, 20.0), 0.125, 0.0, rng))
