@@ -193,10 +193,7 @@ def batch(compensator, events):
 
 
 def assert_equal_bits(unit, config, events, chunk):
-    """
-    Check that a block of all events, blocks of `chunk` events and single events give equal bits.
-    Return the output rows of single events, the block of all events, and the three compensators.
-    """
+    """Check that blocks and single events give equal bits; return rows, block and compensators."""
     streamed, whole, cut = (Compensator(unit, config) for _ in range(3))
     rows, index = stream(streamed, events)
     block = batch(whole, events)

@@ -25,13 +25,11 @@ from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# On a busy machine several BLAS threads wait for each other, so use one. OpenBLAS reads the
-# variable OPENBLAS_NUM_THREADS when numpy is imported.
+# On a busy machine BLAS threads wait for each other: use one. OpenBLAS reads this variable early.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
-# Each worker of each test run uses a separate DDS domain, limited to this machine. The DDS domain
-# follows from the id of the run and the number of the worker. Domain 0 is for users, domains from
-# 81 are for the benchmarks.
+# Each worker of a test run uses a separate DDS domain, limited to this machine, which follows from
+# the id of the run and the number of the worker. Domains 0 and from 81 on have other users.
 _RUN = os.environ.get('PYTEST_XDIST_TESTRUNUID', str(os.getpid()))
 _WORKER = int(os.environ.get('PYTEST_XDIST_WORKER', 'gw0').removeprefix('gw'))
 os.environ['ROS_DOMAIN_ID'] = str(1 + (zlib.crc32(_RUN.encode()) % 20) * 4 + _WORKER % 4)
@@ -56,9 +54,9 @@ _LONG = (
     *('cli_help', 'record', 'fault_process', 'drivers', 'degenerate', 'unseen_axes', 'gyroscope'),
     *('report', 'node_defence', 'fitting_selection', 'fleet_storage', 'docs', 'fault_files'),
     *('real_data', 'field', 'node_parity', 'attacks', 'fitting_regression', 'fit_api', 'replay'),
-    *('fitting_windows', 'properties', 'judging', 'report_figures', 'correction', 'middleware'),
+    *('fitting_windows', 'properties', 'judging', 'report_figures', 'correction', 'waitloop'),
     *('judging_history', 'player', 'node_sources', 'fitting_closing', 'api', 'allow'),
-    *('acquisition', 'drift_watch', 'node_startup', 'third_thermometer', 'fitting_change'),
+    *('acquisition', 'node_startup', 'third_thermometer'),
 )
 
 

@@ -1,12 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the fault bench: it sends messages over DDS to a node process and collects the node's output.
-
-Messages are sent without pauses in lots of up to 400. After each lot the bench waits until the
-node's diagnostics have counted every sample. Because of the waits no message is lost between bench
-and node, at least one report contains each fault, and the result does not depend on the machine.
-"""
+"""Owns the bench that sends a bag to a node process, in lots, and waits for each to be counted."""
 
 import struct
 import threading
@@ -41,9 +35,8 @@ _REST = np.array([20.0])
 _STANDING = counts_of(force_at(np.array([STANDS_S])), _REST, _REST, 0.0 * _REST)[0]
 _HEAD = '<4siII7s5x'
 _COUNTS, _READING = struct.Struct(_HEAD + '3d'), struct.Struct(_HEAD + '2d')
-_IMU = np.dtype(
-    [('head', 'V4'), ('sec', '<i4'), ('nanosec', '<u4'), ('frame', 'V16'), ('values', '<f8', 37)]
-)
+_IMU = np.dtype('V4,<i4,<u4,V16,(37,)<f8')
+_IMU.names = 'head', 'sec', 'nanosec', 'frame', 'values'
 _TOPICS = {
     'counts': (Vector3Stamped, 'accel/counts'),
     'board': (Temperature, 'temperature/board'),
@@ -245,11 +238,7 @@ def lots(events):
 
 @contextmanager
 def bench(calibration, *parameters, **environment):
-    """
-    Start a node process and a peer, and wait until they have discovered each other.
-
-    `environment`: further environment variables of the node process
-    """
+    """Start a node process and a peer, and wait until they have discovered each other."""
     overrides = [f'calibration_file:={calibration}', *PARAMETERS, *parameters]
     arguments = [word for override in overrides for word in ('-p', override)]
     context = Context()

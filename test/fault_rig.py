@@ -1,12 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the simulated bag of the fault tests (a unit in a soak, a ramp and a soak) with its truth, and
-the functions that change its messages.
-
-The unit has only effects that its calibration contains, so that an error above the noise is caused
-by the fault. The lags are seconds instead of minutes, so that the bag is short.
-"""
+"""Owns the bag of the fault tests, of a unit with only effects of its calibration, and changes."""
 
 import math
 from collections.abc import Callable
@@ -227,11 +221,8 @@ def shuffled(topic, begin_s, end_s):
 
     def inject(events):
         result = list(events)
-        places = [
-            k
-            for k, event in enumerate(result)
-            if event[0] == topic and begin_s <= seconds_of(event[1]) < end_s
-        ]
+        inside = (e[0] == topic and begin_s <= seconds_of(e[1]) < end_s for e in result)
+        places = [k for k, is_inside in enumerate(inside) if is_inside]
         for place, other in zip(places[::2], places[1::2], strict=False):
             result[place], result[other] = result[other], result[place]
         return result
@@ -251,9 +242,6 @@ def chain(*steps):
 def shifted(begin_s, by_s):
     def inject(events):
         by_ns = round(by_s * 1e9)
-        return [
-            (topic, stamp + by_ns * (seconds_of(stamp) >= begin_s), v)
-            for topic, stamp, v in events
-        ]
+        return [(name, at + by_ns * (seconds_of(at) >= begin_s), v) for name, at, v in events]
 
     return inject

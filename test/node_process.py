@@ -11,17 +11,12 @@ from pathlib import Path
 
 _STOPPING_S = 10.0  # time for the node to end [s]
 
-#: Environment of processes that a test kills: Fast DDS without shared memory, as segments left by
-#: a killed process may crash other nodes.
+#: Environment of processes that a test kills: their shared memory may crash other nodes.
 OVER_UDP = {'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4'}
 
 
 class NodeProcess:
-    """
-    The node in a separate process, which ends at the end of the `with` block.
-
-    `environment`: environment variables in addition to those of the test
-    """
+    """The node in a process that ends with the `with` block; `environment`: added variables."""
 
     def __init__(self, *ros_args, **environment):
         self._ros_args = ros_args

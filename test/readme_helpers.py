@@ -1,11 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the command outputs shown in README and docs/cli.md, and their comparison with real outputs.
-
-``python test/readme_helpers.py`` runs the commands on docs/cli.md and writes their output into
-this page, and the picture of the demonstration into docs/images.
-"""
+"""Owns the outputs shown in README and docs/cli.md; run as a program it writes them anew."""
 
 import os
 import re

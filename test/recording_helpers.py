@@ -10,7 +10,6 @@ from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
-from rosbags.rosbag2 import Reader as Reader2
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
@@ -120,15 +119,6 @@ def write_rosbag1(path, messages):
 def imu_columns(rng, n):
     """Draw the columns of n Imu messages other than the linear acceleration."""
     return ImuColumns(*(rng.standard_normal((n, width)) for width in (4, 9, 3, 9, 9)))
-
-
-def read_with_rosbags(path):
-    """Return topic, log time and content of each message, in the order of `rosbags`."""
-    with Reader2(path) as reader:
-        return [
-            (c.topic, log_ns, typestore().deserialize_cdr(data, c.msgtype))
-            for c, log_ns, data in reader.messages()
-        ]
 
 
 def columns_of(messages):

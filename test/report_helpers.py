@@ -43,7 +43,6 @@ def fitted():
         number = position + 1
         keys = {'sha256': f'{number:064x}', 'serial': 'thermostatted-0001'}
         sources.append(source_of(*arrays_of(record), name=f'{number:02d}.mcap', **keys))
-    # Without the group `product` the fit has a third of the columns, and is faster.
     groups = ('curve', 'set', 'gradient', 'board')
     return fitting.fit(sources, FitOptions(gravity=STANDARD_GRAVITY, groups=groups))
 

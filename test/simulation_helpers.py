@@ -39,11 +39,7 @@ def rippled(program, seed=1, amplitude=0.1, period=300.0):
 
 
 def slow(bag):
-    """
-    Average the samples of a bag of benchmarks/strangers_units.py, and their times, over 4 s.
-
-    The correction of fewer samples is faster, and means over 60 s hardly change.
-    """
+    """Average samples and times over 4 s: this is faster, and means over 60 s hardly change."""
     n = round(4.0 / (bag.time_s[1] - bag.time_s[0]))
     whole = len(bag.time_s) // n * n
     time_s, samples = (

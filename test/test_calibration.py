@@ -26,7 +26,6 @@ from thermo_comp.unit.calibration_file import (
 from thermo_comp.unit.functions import CubicSpline, Exponential
 from thermo_comp.unit.provenance import GroupEvidence
 
-REPOSITORY = Path(__file__).parents[1]
 # The largest accepted bias is twice the full scale of 32767 counts.
 number = st.floats(-6.5e4, 6.5e4)
 # With coefficients up to 1e-6 a scale function is near 1 over 15 K.
@@ -88,16 +87,11 @@ def test_the_end_condition_of_the_dynamic_regime_is_in_the_file(end_condition):
 
 
 @pytest.mark.parametrize('serial', ['no', '1e5', '0x1F', '12', 'null', '~', 'a: b', '- x', '1:30'])
-def test_serials_like_numbers_or_dates_are_read_as_texts(serial):
-    value = calibration(unit=replace(calibration().unit, serial=serial))
-    assert parse_calibration(dump_calibration(value).encode()).unit.serial == serial
-
-
-def test_numbers_of_a_calibration_may_have_any_yaml_notation():
-    text = dump_calibration(calibration()).replace('full_scale: 32767.0', 'full_scale: 32767')
-    text = text.replace('cycle_time_s: 0.01', 'cycle_time_s: 1e-02')
-    unit = parse_calibration(text.encode()).unit
-    assert (unit.full_scale, unit.cycle_time_s) == (32767.0, 0.01)
+def test_serials_like_numbers_are_texts_and_numbers_may_have_any_yaml_notation(serial):
+    text = dump_calibration(calibration(unit=replace(calibration().unit, serial=serial)))
+    text = text.replace('full_scale: 32767.0', 'full_scale: 32767')
+    unit = parse_calibration(text.replace('time_s: 0.01', 'time_s: 1e-02').encode()).unit
+    assert (unit.serial, unit.full_scale, unit.cycle_time_s) == (serial, 32767.0, 0.01)
 
 
 TEXT = dump_calibration(RICH)
@@ -110,10 +104,8 @@ TEXT = dump_calibration(RICH)
         ('format_version: 2', 'format_version: 0', 'format_version', 'must be 2, got 0'),
         ('format_version: 2', 'format_version: 1\nmemory: 3', 'format_version', 'again'),
         ('format_version: 2', 'format_version: true', 'format_version', 'integer, got True'),
-        ('format_version: 2', 'format_version: 2.0', 'format_version', 'integer, got 2.0'),
         ('format_version: 2', '', 'format_version', 'missing'),
         ('full_scale: 32767.0', 'full_scale: .nan', 'unit.full_scale', 'finite number, got nan'),
-        ('full_scale: 32767.0', 'full_scale: .inf', 'unit.full_scale', 'finite'),
         ('full_scale: 32767.0', 'full_scale: true', 'unit.full_scale', 'valid number, got True'),
         ('full_scale: 32767.0', "full_scale: '9'", 'unit.full_scale', "valid number, got '9'"),
         ('full_scale: 32767.0', 'full_scale: -1.0', 'unit.full_scale', 'greater than 0, got -1'),
@@ -121,7 +113,6 @@ TEXT = dump_calibration(RICH)
         ('full_scale: 32767.0', '"full\\nscale": 1.0', r"unit.'full\nscale'", 'unknown key'),
         ('full_scale: 32767.0', f'{"x" * 999}: 1.0', "unit.'" + 'x' * 59, 'unknown key'),
         ('full_scale: 32767.0, ', '', 'unit.full_scale', 'missing'),
-        ('input: counts', 'input: volts', 'unit.input', "got 'volts'"),
         ('serial: T-1', "serial: ''", 'unit.serial', 'at least 1 character'),
         ('gravity_m_s2: 9.80665', 'gravity_m_s2: 1.0', 'gravity_m_s2', 'greater than 9'),
         ('  y: {scale_factor: -295.0', '  w: {scale_factor: -295.0', 'axes.w', 'unknown key'),
@@ -136,10 +127,8 @@ TEXT = dump_calibration(RICH)
         ('kind: polynomial', 'kind: fourier', 'static.x.bias_function.kind',
          "'exponential'.*, got 'fo"),
         ('      kind: polynomial\n', '', 'static.x.bias_function.kind', 'missing'),
-        ('  x: {scale_factor: 300.0, bias: 5.0}', '  x: 3', 'axes.x', 'mapping of keys, got 3'),
         ('[5.0, 35.0]', '[5.0]', 'static.temperature_range_c', 'must have 2 entries, got 1'),
         ('[5.0, 35.0]', '5.0', 'static.temperature_range_c', 'must be a list, got 5.0'),
-        ('[5.0, 35.0]', '{a: 1}', 'static.temperature_range_c', 'must be a list, got a dict'),
         ('[1.0, 7.0e-05]', '[1.0, -0.2]', 'static.x.scale_function', 'must stay above 0.1'),
         ('[5.0, 35.0]', '[35.0, 5.0]', 'static.temperature_range_c', 'must be'),
         ('- [1.0, 0.0, 0.0]', '- [1.0, 0.1, 0.0]', 'misalignment[0][1]', 'must be 0'),
@@ -156,7 +145,6 @@ TEXT = dump_calibration(RICH)
          'greater than 0 for gradient_even'),
         ('power: 1', 'power: 1.5', 'response[6].power', 'valid integer, got 1.5'),
         ('range: [-0.1, 0.1]', 'range: [1, 1]', 'response[2].range', r'lower < upper, got \[1'),
-        ('during: static', 'during: sometimes', 'response[2].during', "got 'sometimes'"),
         ('[2.0e-05, 2.0e-05, 2.0e-05]', '[2.0e-05]', 'response[0].scale', 'must have 3 entries'),
         ('scale: [2.0e-05', 'scale: [0.1', 'static.x.scale_function', 'above 0.1 .* reaches -4'),
         ('rank: ', 'rank: 9', 'posterior.factor', 'must hold 105 x 9105 numbers'),
@@ -258,17 +246,12 @@ def test_paths_that_are_no_regular_file_are_refused(tmp_path):
     ],
 )
 def test_impossible_curves_and_temperatures_are_refused(old, new, key, message):
-    text = (REPOSITORY / 'config' / 'calibration.example.yaml').read_text()
+    text = (Path(__file__).parents[1] / 'config' / 'calibration.example.yaml').read_text()
     text = text.replace('e_fold_k: [18.0]', 'e_fold_k: [1.0]')
     assert old in text
     with pytest.raises(CalibrationError, match=message) as caught:
         parse_calibration(text.replace(old, new, 1).encode())
     assert caught.value.key == key
-
-
-def test_a_calibration_that_the_reader_refuses_is_not_written():
-    with pytest.raises(CalibrationError, match='noise_density_m_s2_sqrt_hz'):
-        dump_calibration(calibration(noise_density_m_s2_sqrt_hz=(0.0, 1.0, 1.0)))
 
 
 @pytest.mark.parametrize(
@@ -282,18 +265,17 @@ def test_a_calibration_that_the_reader_refuses_is_not_written():
         ('diagonal', '', 'must hold 0 x'),
     ],
 )
-def test_a_posterior_with_wrong_numbers_is_refused(key, value, message):
+def test_wrong_numbers_are_neither_read_nor_written(key, value, message):
     old = getattr(RICH.posterior, key)
     assert old in TEXT
     with pytest.raises(CalibrationError, match=message) as caught:
         parse_calibration(TEXT.replace(old, f"'{value}'").encode())
     assert caught.value.key.startswith('posterior.')
-
-
-def test_a_posterior_with_fewer_variances_than_parameters_is_refused():
     n = parameter_layout(RICH).n_parameters
     with pytest.raises(ValueError, match=rf'`posterior.diagonal` .*eter \({n + 6}\), got {n}'):
         replace(RICH, response=(term('gradient'), *RICH.response))
+    with pytest.raises(CalibrationError, match='noise_density_m_s2_sqrt_hz'):
+        dump_calibration(calibration(noise_density_m_s2_sqrt_hz=(0.0, 1.0, 1.0)))
 
 
 def test_files_with_former_names_of_columns_and_keys_are_read():

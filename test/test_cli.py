@@ -8,6 +8,7 @@ import pty
 import re
 import subprocess
 import sys
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +22,7 @@ import thermo_comp
 from thermo_comp.cli import bags, output
 from thermo_comp.cli.app import split_arguments
 from thermo_comp.online.status import DROPPED
-from thermo_comp.recording.reader import inspect_recording, read_recording
+from thermo_comp.recording.reader import inspect_recording
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.nonlinearity import Nonlinearity, NonlinearTerm
@@ -84,24 +85,18 @@ def test_a_command_computes_in_one_thread():
 
 def on_a_terminal(*arguments, no_color=False):
     leader, follower = pty.openpty()
-    environment = {**os.environ, 'COLUMNS': '80', 'TERM': 'xterm-256color'}
-    environment.pop('NO_COLOR', None)
-    if no_color:
-        environment['NO_COLOR'] = '1'
+    environment = {**os.environ, 'COLUMNS': '80', 'TERM': 'xterm-256color', 'NO_COLOR': '1'}
+    if not no_color:
+        del environment['NO_COLOR']
     process = subprocess.Popen(
         [sys.executable, '-m', 'thermo_comp', *arguments], cwd=ROOT, env=environment,
         stdin=follower, stdout=follower, stderr=follower,
     )  # fmt: skip
     os.close(follower)
     shown = b''
-    while True:
-        try:
-            part = os.read(leader, 65536)
-        except OSError:  # the command has ended and closed its terminal
-            break
-        if not part:
-            break
-        shown += part
+    with suppress(OSError):  # the command has ended and closed its terminal
+        while part := os.read(leader, 65536):
+            shown += part
     os.close(leader)
     assert process.wait(timeout=60) == 0
     return shown.decode()
@@ -128,45 +123,24 @@ class TestPlay:
         assert split_arguments(['info', '--', 'a']) == (['info', '--', 'a'], [])
 
 
-class TestSimulate:
-    def test_simulate_writes_a_bag_per_position(self, tmp_path, cli):
-        program = ('--profile', '20 1min', '--rate-hz', '20', '--positions', '3')
-        cli('simulate', *program, '--unit', 'mems', '-o', tmp_path / 'sim')
-        paths = sorted((tmp_path / 'sim').iterdir())
-        assert [path.name for path in paths] == ['01.mcap', '02.mcap', '03.mcap']
-        ups = []
-        for path in paths:
-            info = inspect_recording(path)
-            assert info.metadata['serial'] == 'mems-0001'
-            truth = json.loads(info.metadata['truth'])
-            ups.append(truth['up'])
-            block = read_recording(path).columns
-            measured = block.accel.mean(axis=0) / truth['scale_factor']
-            # The bias of a MEMS unit and its drift are at most a few per cent of g.
-            np.testing.assert_allclose(measured / 9.80665, truth['up'], atol=0.05)
-            # Both thermometers have a reading before the first sample, so no sample is dropped.
-            assert [temperature.after[0] for temperature in block.temperatures.values()] == [0, 0]
-        assert len({tuple(up) for up in ups}) == 3
-
-    def test_a_plan_simulates_a_whole_test(self, tmp_path, cli):
-        plan = ('--plan', 'tumble-1', '--unit', 'demo')
-        cli('simulate', *plan, '--rate-hz', '1', '-o', tmp_path / 'sim')
-        infos = [inspect_recording(path) for path in sorted((tmp_path / 'sim').iterdir())]
-        assert [round((info.end_ns - info.start_ns) / 6e10) for info in infos] == [*[20] * 18, 180]
-        assert {info.metadata['serial'] for info in infos} == {'demo-0001'}
-        assert json.loads(infos[0].metadata['truth'])['profile'] == 'tumble-1'
+def test_a_plan_simulates_a_whole_test(tmp_path, cli):
+    plan = ('--plan', 'tumble-1', '--unit', 'demo')
+    cli('simulate', *plan, '--rate-hz', '1', '-o', tmp_path / 'sim')
+    infos = [inspect_recording(path) for path in sorted((tmp_path / 'sim').iterdir())]
+    assert [round((info.end_ns - info.start_ns) / 6e10) for info in infos] == [*[20] * 18, 180]
+    assert {info.metadata['serial'] for info in infos} == {'demo-0001'}
+    assert json.loads(infos[0].metadata['truth'])['profile'] == 'tumble-1'
 
 
-class TestInfo:
-    def test_info_lists_nonlinear_terms(self, unit, cli, tmp_path):
-        square = NonlinearTerm('square', (1e-5, -2e-5, 0.0), (1e-7, 0.0, 0.0), 1e-4)
-        bent = Nonlinearity((9.8, 98.0), 1e-4, (square,))
-        known = replace(rich_calibration(), nonlinearity=bent, posterior=None)
-        save_calibration(known, tmp_path / 'unit.yaml')
-        printed = cli('info', tmp_path / 'unit.yaml').stdout
-        assert re.search(r'^K2 +µg/g² +10 +-20 +0$', printed, re.MULTILINE)
-        assert re.search(r'^K2 per kelvin +µg/g²/K +0\.1 +0 +0$', printed, re.MULTILINE)
-        assert 'nonlinearity' not in cli('info', unit).stdout
+def test_info_lists_nonlinear_terms(unit, cli, tmp_path):
+    square = NonlinearTerm('square', (1e-5, -2e-5, 0.0), (1e-7, 0.0, 0.0), 1e-4)
+    bent = Nonlinearity((9.8, 98.0), 1e-4, (square,))
+    known = replace(rich_calibration(), nonlinearity=bent, posterior=None)
+    save_calibration(known, tmp_path / 'unit.yaml')
+    printed = cli('info', tmp_path / 'unit.yaml').stdout
+    assert re.search(r'^K2 +µg/g² +10 +-20 +0$', printed, re.MULTILINE)
+    assert re.search(r'^K2 per kelvin +µg/g²/K +0\.1 +0 +0$', printed, re.MULTILINE)
+    assert 'nonlinearity' not in cli('info', unit).stdout
 
 
 class TestTopics:
@@ -217,14 +191,12 @@ class TestCells:
     def test_cells_of_tables_have_the_expected_text(self, cell, text):
         assert output.text(cell) == text
 
-    def test_plain_values_are_json_without_nan(self):
-        data = {'a': np.array([1.0, np.nan]), 'b': (np.int64(3), Path('x')), 3: np.True_}
-        assert output.plain(data) == {'a': [1.0, None], 'b': [3, 'x'], '3': True}
-
-    def test_columns_of_tables_are_aligned(self):
+    def test_columns_of_tables_are_aligned_and_plain_values_are_json_without_nan(self):
         lines = list(output.aligned(('n', 'name'), [(1, 'a'), (10, 'bc')]))
         assert lines == [' n  name', ' 1  a', '10  bc']
         assert list(output.aligned(('n',), [], 'title')) == ['title', 'n']
+        data = {'a': np.array([1.0, np.nan]), 'b': (np.int64(3), Path('x')), 3: np.True_}
+        assert output.plain(data) == {'a': [1.0, None], 'b': [3, 'x'], '3': True}
 
 
 def test_findings_that_set_the_exit_code_are_printed_despite_quiet(capsys):

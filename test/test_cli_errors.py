@@ -118,62 +118,46 @@ class TestBags:
         assert not out.exists()
         assert not list(unit.parent.glob('.out*')), 'a partial output was left'
 
-    def test_a_missing_bag_is_refused(self, cli, unit, tmp_path):
-        self.replayed(cli, unit, tmp_path / 'absent', r'absent: no such file or directory')
-
-    def test_a_bag_without_board_temperature_is_refused(self, cli, unit, tmp_path):
+    def test_a_bag_without_board_temperature_or_of_another_unit_is_refused(
+        self, cli, unit, tmp_path
+    ):
         path = bag(tmp_path / 'bag', board=False)
         self.replayed(cli, unit, path, r'temperature/board.*no such topic.*--topic board=')
         refused(cli, 1, r'temperature/board', 'evaluate', path, '-c', unit)
         arguments = ('-o', tmp_path / 'new.yaml', '--gravity', '9.8')
         text = cli('fit', path, *arguments).stdout
         assert 'the bags have no thermometer of the board: the calibration holds' in text
-
-    def test_a_bag_of_another_unit_is_refused(self, cli, unit, tmp_path):
-        path = bag(tmp_path / 'bag', serial='T-2')
+        path = bag(tmp_path / 'other', serial='T-2')
         self.replayed(cli, unit, path, r'serial: this calibration is of unit T-1.*of unit T-2')
         refused(cli, 1, r'is of unit T-1', 'evaluate', path, '-c', unit)
 
 
-class TestFits:
-    def test_unknown_groups_and_models_are_refused(self, cli, tmp_path):
-        given = 'fit', bag(tmp_path / 'a.mcap'), '-o', tmp_path / 'new.yaml', '--gravity', '9.8'
-        refused(cli, 2, r'--groups must be one of curve, .*memory', *given, '--groups', 'memory')
-        refused(cli, 2, r'quadratic', *given, '--model', 'quadratic')
-        assert not (tmp_path / 'new.yaml').exists()
-
-    def test_bags_of_two_units_are_refused(self, cli, tmp_path):
-        paths = [bag(tmp_path / f'{i}.mcap', serial=f'T-{i}') for i in range(2)]
-        words = 'fit', *paths, '-o', tmp_path / 'new.yaml', '--gravity', '9.80665'
-        refused(cli, 1, r'of different units: .*0.mcap of T-0, .*1.mcap of T-1', *words)
+def test_unknown_groups_and_models_and_bags_of_two_units_are_refused(cli, tmp_path):
+    paths = [bag(tmp_path / f'{i}.mcap', serial=f'T-{i}') for i in range(2)]
+    given = 'fit', *paths, '-o', tmp_path / 'new.yaml', '--gravity', '9.8'
+    refused(cli, 2, r'--groups must be one of curve, .*memory', *given, '--groups', 'memory')
+    refused(cli, 2, r'quadratic', *given, '--model', 'quadratic')
+    refused(cli, 1, r'of different units: .*0.mcap of T-0, .*1.mcap of T-1', *given)
+    assert not (tmp_path / 'new.yaml').exists()
 
 
-class TestEvaluations:
-    def test_a_calibration_that_is_not_valid_gives_exit_code_1(self, cli, tmp_path):
-        # The unit reads exactly g; the calibration subtracts a wrong bias of 50 mg.
-        wrong = axis_set((0.0, 1.0), (1.0,), delta=150.0)
-        sets = regime_set(wrong, wrong, wrong)
-        save_calibration(calibration(static=sets, dynamic=sets), tmp_path / 'wrong.yaml')
-        path = tmp_path / 'bag'
-        stamps = START_NS + np.arange(3000) * 100_000_000
-        level = np.tile([0.0, 0.0, 300.0 * 9.80665], (3000, 1))
-        # Add noise to x and y, because the compensator rejects constant samples.
-        level[:, :2] += np.random.default_rng(2).integers(-1, 2, (3000, 2))
-        with BagWriter(path) as writer:
-            writer.write_temperature(TOPICS.board, stamps[::10], np.full(300, 20.0))
-            writer.write_counts(TOPICS.counts, stamps, level)
-        finished = cli('evaluate', path, '-c', tmp_path / 'wrong.yaml', code=1)
-        assert 'no better than raw: 48 mg RMS of |f| - g, ' in finished.stdout
-        # The second calibration is right: its levels of +10 mg cancel its biases of -10 mg.
-        right = axis_set(delta=30.0)
-        sets = regime_set(right, right, right)
-        axes = equal_axes(300.0, -30.0)
-        valid = calibration(axes=axes, static=sets, dynamic=sets)
-        save_calibration(valid, tmp_path / 'right.yaml')
-        arguments = ('evaluate', path, '-c', tmp_path / 'right.yaml')
-        assert 'no claim: ' in cli(*arguments, code=1).stdout
-        assert 'valid: ' in cli(*arguments, '--tolerance', '1mg').stdout
-        assert 'recalibrate: ' in cli(*arguments, '--tolerance', '1e-5ug', code=1).stdout
+def test_a_calibration_that_is_not_valid_gives_exit_code_1(cli, tmp_path):
+    wrong = axis_set((0.0, 1.0), (1.0,), delta=150.0)
+    sets = regime_set(wrong, wrong, wrong)
+    save_calibration(calibration(static=sets, dynamic=sets), tmp_path / 'wrong.yaml')
+    path = bag(tmp_path / 'bag', case=False, n=3000, up=(0.0, 0.0, 0.980665))
+    finished = cli('evaluate', path, '-c', tmp_path / 'wrong.yaml', code=1)
+    assert 'no better than raw: 48 mg RMS of |f| - g, ' in finished.stdout
+    # The second calibration is right: its levels of +10 mg cancel its biases of -10 mg.
+    right = axis_set(delta=30.0)
+    sets = regime_set(right, right, right)
+    axes = equal_axes(300.0, -30.0)
+    valid = calibration(axes=axes, static=sets, dynamic=sets)
+    save_calibration(valid, tmp_path / 'right.yaml')
+    arguments = ('evaluate', path, '-c', tmp_path / 'right.yaml')
+    assert 'no claim: ' in cli(*arguments, code=1).stdout
+    assert 'valid: ' in cli(*arguments, '--tolerance', '1mg').stdout
+    assert 'recalibrate: ' in cli(*arguments, '--tolerance', '1e-5ug', code=1).stdout
 
 
 @pytest.mark.usefixtures('no_figures')
@@ -186,6 +170,7 @@ def test_a_cut_bag_is_processed_and_gives_exit_code_1(cli, unit, tmp_path):
         ('info', torn),
         ('replay', torn, '-c', unit, '-o', output),
         ('evaluate', torn, '-c', unit),
+        ('fit', torn, '-o', tmp_path / 'new.yaml', '--gravity', '9.80665'),
         ('report', torn, '-c', unit, '-o', tmp_path / 'page.html', '--json'),
     ):
         finished = cli(*arguments, code=1)

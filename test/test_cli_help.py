@@ -37,11 +37,13 @@ WITH_JSON = {line.split()[1]: line for line in EXAMPLES if not TESTED.search(lin
 QUICK = [line for line in EXAMPLES if line.split()[1] in ('info', 'convert', 'export', 'import')]
 
 
-def test_every_command_has_an_example():
-    # An example of a command is in the help of this command.
+def test_every_command_has_an_example_and_every_option_a_help_text():
     for name, command in COMMANDS.items():
         assert any(example.startswith(f'thermo_comp {name} ') for example in EXAMPLES), name
         assert f'thermo_comp {name} ' in (command.help or ''), name
+        assert name == 'play' or any('--json' in option.opts for option in command.params), name
+        for parameter in command.params:
+            assert parameter.name == 'help' or getattr(parameter, 'help', ''), parameter.name
 
 
 @pytest.mark.parametrize('example', EXAMPLES)
@@ -66,11 +68,6 @@ def test_with_quiet_the_command_prints_nothing(example, desk):
     assert (finished.stdout, finished.stderr) == ('', '')
 
 
-def test_every_command_that_prints_figures_has_the_option_json():
-    for name, page in COMMANDS.items():
-        assert name == 'play' or any('--json' in option.opts for option in page.params), name
-
-
 @pytest.mark.parametrize('name', COMMANDS)
 def test_the_help_prints_complete_names(name, cli, monkeypatch):
     # WHY: a terminal of 80 columns showed `--reference-tempera…`, an incomplete option name.
@@ -85,13 +82,3 @@ def test_the_help_prints_complete_names(name, cli, monkeypatch):
     assert text == cli(*name.split(), '-h').stdout
     for parameter in COMMANDS[name].params:
         assert all(option in text for option in parameter.opts if option.startswith('-')), text
-
-
-def test_every_option_has_a_help_text():
-    bare = [
-        f'{name} {parameter.name}'
-        for name, command in COMMANDS.items()
-        for parameter in command.params
-        if parameter.name != 'help' and not getattr(parameter, 'help', '')
-    ]
-    assert bare == []

@@ -8,11 +8,8 @@ from collections import Counter
 import numpy as np
 import pytest
 from builders import SECOND_NS, calibration, term
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from thermo_comp.thermal.lags import Lag, MemorySpec
-from thermo_comp.thermal.settings import DetectorSettings
 from thermo_comp.thermal.state import BOARD, GRADIENT, Rate, StateLayout
 from thermo_comp.thermal.tracker import ThermalTracker
 from thermo_comp.unit.columns import (
@@ -35,19 +32,11 @@ def by_group(columns):
     return Counter(column.group for column in columns)
 
 
-def test_the_bank_of_columns_has_the_expected_number_per_group():
+def test_the_columns_of_the_bank_differ_and_bends_are_within_the_temperature_span():
     assert tuple(60.0 * 2.0**k for k in range(8)) == BANK_TAUS
     assert pytest.approx([60.0 * 2.0 ** (k / 2) for k in range(15)]) == FINE_TAUS
-    assert by_group(bank()) == {
-        'gradient': 1, 'board': 15, 'gradient_lag': 15, 'product': 16,
-        'gradient_x_temperature': 9, 'square': 24, 'gradient_even': 21, 'play': 20,
-    }  # fmt: skip
-    assert by_group(bank(('case', 'tip'))) == {
-        'gradient': 2, 'board': 15, 'gradient_lag': 30, 'product': 16,
-        'gradient_x_temperature': 18, 'square': 24, 'gradient_even': 42, 'play': 20,
-    }  # fmt: skip
+    assert by_group(bank()).keys() == by_group(bank(('case', 'tip'))).keys()
     assert len(set(bank(('case', 'tip')))) == len(bank(('case', 'tip')))
-    # Knees over any lagged temperature are within the temperature span of the bags.
     assert 'bend' not in by_group(bank(span_k=(-0.4, 0.4)))
     bends = [column for column in bank(span_k=(-10.0, 2.0)) if column.group == 'bend']
     assert len(bends) == 12 * len({column.tau_s for column in bends}) == 96
@@ -70,18 +59,19 @@ def test_gradient_even_about_rest_is_an_even_function_of_gradient_less_rest():
     np.testing.assert_allclose(slopes[:, 1], -slopes[:, 2])
 
 
-def test_the_memory_has_the_lags_and_plays_that_the_columns_need():
+def test_the_memory_has_the_lags_that_columns_need_and_ignores_other_time_constants():
     spec = memory_of(bank(('case', 'tip')), ('case', 'tip'))
-    assert spec.inputs == ('board', 'case', 'tip')
-    board, case, tip = (
-        tuple(lag.tau_s for lag in spec.lags if lag.input == name) for name in spec.inputs
-    )
-    assert board == tuple(sorted((*FINE_TAUS, 450.0, 900.0, 1800.0)))
-    assert case == tip == FINE_TAUS
+    taus = {x: tuple(lag.tau_s for lag in spec.lags if lag.input == x) for x in spec.inputs}
+    board = tuple(sorted((*FINE_TAUS, 450.0, 900.0, 1800.0)))
+    assert taus == {'board': board, 'case': FINE_TAUS, 'tip': FINE_TAUS}
     assert len(spec.plays) == 20
     assert memory_of(()) == MemorySpec()
     with pytest.raises(ValueError, match="one of \\('case',\\), got tip"):
         memory_of(bank(('tip',)))
+    columns = [Column('gradient', kind, tau_s=60.0, **WIDE) for kind in ('gradient', 'size')]
+    assert memory_of(columns) == MemorySpec()
+    state = np.array([[20.0, 0.0, 0.0, 0.0, 0.0, -1.5, 0.0]]).T
+    assert ColumnTable(columns, MemorySpec(), 20.0).values(state).tolist() == [[-1.5], [1.5]]
 
 
 def test_the_value_of_each_kind_of_column_agrees_with_hand_numbers():
@@ -122,7 +112,7 @@ def test_the_value_of_each_kind_of_column_agrees_with_hand_numbers():
     assert at_edge[2] == 0.5
 
 
-def test_a_bend_has_slopes_over_board_temperature_and_lag():
+def test_bends_have_slopes_and_go_on_along_their_tangent_beyond_the_range():
     columns = [Column('bend', 'bend', tau_s=tau, knee_k=2.0, **WIDE) for tau in (0.0, 60.0)]
     spec = memory_of(columns)
     table = ColumnTable(columns, spec, 20.0)
@@ -135,9 +125,6 @@ def test_a_bend_has_slopes_over_board_temperature_and_lag():
     assert not np.any(table.slopes(state))
     flow = ColumnTable([Column('gradient', 'gradient', **WIDE)], MemorySpec(), 20.0)
     assert flow.slopes(np.zeros((7, 1)))[1] is None
-
-
-def test_a_curve_of_bends_goes_on_along_its_tangent_beyond_the_range():
     # WHY: bends that ended at different temperatures turned the curve by 200 ug/K beyond them.
     columns = [Column('bend', 'bend', knee_k=k, range=(-12.0 - k, 8.0 - k)) for k in (2.0, 6.0)]
     table = ColumnTable(columns, MemorySpec(), 20.0)
@@ -172,40 +159,15 @@ def test_a_new_kind_of_column_needs_one_term_only(monkeypatch):
         calibration(response=(term('rate_square', (1e13, 0.0, 0.0), range=(0.0, 1e9)),))
 
 
-@given(st.lists(st.floats(-60.0, 60.0), min_size=5, max_size=5))
-@settings(max_examples=50, deadline=None)
-def test_columns_of_one_state_and_of_many_states_have_equal_bits(boards):
-    columns = bank(('case', 'tip'), span_k=(-10.0, 10.0))
-    tracker = ThermalTracker(DetectorSettings(), memory_of(columns, ('case', 'tip')))
-    rows = []
-    for second, celsius in enumerate(boards):
-        for name, ahead in (('board', 0.0), ('case', 1.0), ('tip', -3.0)):
-            tracker.read(name, second * SECOND_NS, celsius + ahead * second)
-        rows.append(tracker.sample(second * SECOND_NS + 300_000_000))
-    spec = tracker.spec
-    table, states = ColumnTable(columns, spec, 20.0, (-20.0, 30.0)), np.array(rows).T
-    many = table.values(states)
-    for k in range(len(rows)):
-        np.testing.assert_array_equal(table.values(states[:, [k]])[:, 0], many[:, k])
-
-
 @pytest.mark.parametrize(
     ('keys', 'message'),
     [
         ({'kind': 'pressure', **WIDE}, '`kind` must be one of .*, got pressure'),
         ({'range': (1.0, 1.0)}, '`range` must be .* got .1.0, 1.0.'),
-        ({'kind': 'board', **WIDE}, '`tau_s` must be greater than 0 for board'),
-        ({'kind': 'cube', **WIDE}, '`tau_s` must be greater than 0 for cube'),
-        ({'kind': 'play', **WIDE}, '`width_k` must be greater than 0 for play'),
+        *(({'kind': kind, **WIDE}, f'`{name}` must be greater than 0 for {kind}')
+          for kind, name in (('board', 'tau_s'), ('cube', 'tau_s'), ('play', 'width_k'))),
     ],
-)
+)  # fmt: skip
 def test_impossible_columns_are_refused(keys, message):
     with pytest.raises(ValueError, match=message):
         Column(**{'group': 'gradient', 'kind': 'gradient', **keys})
-
-
-def test_a_time_constant_beside_a_kind_without_lag_is_ignored():
-    columns = [Column('gradient', kind, tau_s=60.0, **WIDE) for kind in ('gradient', 'size')]
-    assert memory_of(columns) == MemorySpec()
-    state = np.array([[20.0, 0.0, 0.0, 0.0, 0.0, -1.5, 0.0]]).T
-    assert ColumnTable(columns, MemorySpec(), 20.0).values(state).tolist() == [[-1.5], [1.5]]

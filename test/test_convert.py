@@ -65,12 +65,10 @@ def test_a_bag_converted_from_a_table_has_the_values_of_the_table(tmp_path):
     # sensor_msgs/Imu: -1: no orientation, 0: unknown covariance of the angular rate.
     assert block.imu.orientation_covariance[:, 0].tolist() == [-1.0] * 400
     assert not block.imu.angular_velocity_covariance.any()
-    # A temperature becomes a message if it changes: 4 times for the case, 10 times for the board.
     case, board = block.temperatures['case'], block.temperatures['board']
     assert case.celsius.tolist() == [20.0, 20.5, 21.0, 21.5]
     assert case.stamp_ns.tolist() == [(1000 + 1000 * k) * 10**6 for k in range(4)]
     assert len(board.celsius) == report.messages['board'] == 10
-    # A reading precedes the sample with an equal stamp, so that it applies to this sample.
     assert case.after.tolist() == [0, 100, 200, 300]
     assert (report.rows, report.messages['accel']) == (400, 400)
     assert report.rate_hz == pytest.approx(100.0)
@@ -85,7 +83,6 @@ def test_counts_with_a_stated_sensitivity_become_imu_messages(tmp_path):
     write_log(table_log(path, right), tmp_path / 'bag')
     block = read_recording(tmp_path / 'bag').columns
     np.testing.assert_allclose(block.accel[:, 0], columns['ax'] * STANDARD_GRAVITY / 2048.0)
-    # A sensitivity that contradicts |a| at rest is refused.
     wrong = table_log(path, column_map(accel={**accel, 'counts_per_g': 16384.0}))
     with pytest.raises(RecordingError, match=r'16384 counts/g are stated$'):
         write_log(wrong, tmp_path / 'other')
@@ -110,8 +107,7 @@ def test_an_offset_of_raw_words_is_subtracted(tmp_path):
 
 @pytest.mark.parametrize('unit', ['ms', 'us'])
 def test_times_of_a_counter_of_32_bits_continue_after_its_overflow(tmp_path, unit):
-    # WHY: Arduino's micros() overflows to 0 after 71.6 min, and of a longer log the fit used only
-    # the part before the overflow.
+    # WHY: Arduino's micros() overflows after 71.6 min, and the fit used only the part before.
     path, _ = table(tmp_path / 'log.csv')
     lines = path.read_text().splitlines()
     ticks = [(2**32 - 2000 + 10 * k) % 2**32 for k in range(400)]
@@ -123,7 +119,6 @@ def test_times_of_a_counter_of_32_bits_continue_after_its_overflow(tmp_path, uni
     report = write_log(log, tmp_path / 'bag')
     assert (report.findings['continued'].count, report.findings['continued'].lines) == (1, (202,))
     assert report.findings['backwards'].count == 0
-    # A clock that falls from a value far below 2^32 is not taken for an overflow.
     lines[200] = lines[200].replace(lines[200].partition(',')[0], '1000.0')
     path.write_text('\n'.join(lines))
     report = write_log(table_log(path, column_map()), tmp_path / 'other')
@@ -144,20 +139,7 @@ def test_readings_stay_among_samples_after_a_restart_of_the_clock(tmp_path):
     assert board.after.tolist() == list(range(0, 400, 40))
 
 
-def test_readings_of_minus_127_degc_are_left_out(tmp_path):
-    # WHY: 46 readings of -127 degC (DS18B20 without contact) increased a fit's error to 0.68 mg.
-    path, _ = table(tmp_path / 'log.csv')
-    lines = path.read_text().splitlines()
-    for k in (50, 51, 300):
-        lines[k] = lines[k].rpartition(',')[0] + ',-127'
-    path.write_text('\n'.join(lines))
-    report = write_log(table_log(path, column_map()), tmp_path / 'bag')
-    assert report.findings['impossible'].count == 2  # a reading repeated in two rows counts once
-    board = read_recording(tmp_path / 'bag').columns.temperatures['board']
-    assert board.celsius.min() == 25.0
-
-
-def test_every_row_with_a_fault_is_counted(tmp_path):
+def test_rows_with_faults_are_counted_and_readings_of_minus_127_degc_left_out(tmp_path):
     path, _ = table(tmp_path / 'log.csv')
     lines = path.read_text().splitlines()
     lines[11] = lines[11].replace(lines[11].split(',')[1], 'nan')
@@ -181,8 +163,17 @@ def test_every_row_with_a_fault_is_counted(tmp_path):
     # The bag contains clipped samples and samples in wrong order: the node rejects them.
     assert block.accel[:, 0].max() == 2.0 * STANDARD_GRAVITY
     assert (np.diff(block.accel_stamp_ns) < 0).sum() == 1
-    # Log times never fall from row to row, also where stamps fall.
     assert (np.diff(block.log_ns['accel']) >= 0).all()
+    # WHY: 46 readings of -127 degC (DS18B20 without contact) increased a fit's error to 0.68 mg.
+    path, _ = table(tmp_path / 'log.csv')
+    lines = path.read_text().splitlines()
+    for k in (50, 51, 300):
+        lines[k] = lines[k].rpartition(',')[0] + ',-127'
+    path.write_text('\n'.join(lines))
+    report = write_log(table_log(path, column_map()), tmp_path / 'cold')
+    assert report.findings['impossible'].count == 2  # a reading repeated in two rows counts once
+    board = read_recording(tmp_path / 'cold').columns.temperatures['board']
+    assert board.celsius.min() == 25.0
 
 
 def test_stamps_of_a_fixed_rate_do_not_accumulate_rounding(tmp_path):
@@ -221,36 +212,28 @@ def test_temperatures_of_any_unit_become_degc(tmp_path, unit, reading, celsius):
     assert first == pytest.approx(celsius)
 
 
-def test_implausible_temperatures_are_refused(tmp_path):
+def test_kelvins_and_tables_without_numbers_are_refused(tmp_path):
     path, _ = table(tmp_path / 'log.csv')
     path.write_text(path.read_text().replace(',25.', ',298.'))
     with pytest.raises(RecordingError, match=r'board temperature is 29.* looks like kelvins'):
         write_log(table_log(path, column_map()), tmp_path / 'bag')
-
-
-def test_a_table_without_numbers_is_refused(tmp_path):
     path = tmp_path / 'log.csv'
     path.write_text('ms,ax,ay,az,board,case\n' + 'a,b,c,d,e,f\n' * 5)
     with pytest.raises(RecordingError, match='none of its 5 rows holds numbers'):
         write_log(table_log(path, column_map()), tmp_path / 'bag')
 
 
-class TestThinning:
-    def kept(self, values, step_s=1):
+def test_readings_are_kept_if_they_change_or_after_ten_seconds():
+    def kept(values, step_s=1):
         stamps = np.arange(len(values), dtype=np.int64) * step_s * 10**9
         return (Readings(stamps, np.array(values)).thinned().stamp_ns // 10**9).tolist()
 
-    def test_a_reading_is_kept_if_it_changes_or_after_ten_seconds(self):
-        assert self.kept([1, 1, 2, 2, 2, 1]) == [0, 2, 5]
-        assert self.kept([1] * 10, step_s=4) == [0, 12, 24, 36]
-
-    def test_missing_cells_are_not_kept_as_readings(self):
-        assert self.kept([float('nan'), 1, float('nan'), 1, 2]) == [1, 4]
-        assert self.kept([float('nan')] * 3) == []
-
-    def test_the_first_reading_after_a_clock_restart_is_kept(self):
-        readings = Readings(np.array([5, 6, 1, 2]) * 10**9, np.full(4, 20.0))
-        assert (readings.thinned().stamp_ns // 10**9).tolist() == [5, 1]
+    assert kept([1, 1, 2, 2, 2, 1]) == [0, 2, 5]
+    assert kept([1] * 10, step_s=4) == [0, 12, 24, 36]
+    assert kept([float('nan'), 1, float('nan'), 1, 2]) == [1, 4]
+    assert kept([float('nan')] * 3) == []
+    readings = Readings(np.array([5, 6, 1, 2]) * 10**9, np.full(4, 20.0))
+    assert (readings.thinned().stamp_ns // 10**9).tolist() == [5, 1]
 
 
 class TestColumnMap:
@@ -316,25 +299,24 @@ class TestColumnMap:
                 load_column_map(path)
 
 
-class TestCommand:
-    def test_convert_reports_rows_rate_and_topics(self, tmp_path, cli):
-        path, _ = table(tmp_path / 'log.csv')
-        map_path = tmp_path / 'map.yaml'
-        map_path.write_text(
-            'stamp: {column: ms, unit: ms}\n'
-            'accel: {columns: [ax, ay, az], unit: g, output: imu}\n'
-            'board: {column: board}\n'
-        )
-        arguments = ('convert', path, '--columns', map_path, '-o', tmp_path / 'bag')
-        printed = cli(*arguments).stdout
-        assert '400 rows, 4.0 s at 100 Hz' in printed
-        assert '400 imu/uncompensated' in printed
-        text = f'thermo_comp: error: {tmp_path}/bag: exists already; --force overwrites it\n'
-        assert cli(*arguments, code=1).stderr == text
-        data = json.loads(cli(*arguments, '--force', '--json').stdout)
-        assert data['accel_messages'] == 400
-        assert data['stillness']['moving_ns'] == []
-        assert cli(*arguments, '--force', '-q').stdout == ''
+def test_convert_reports_rows_rate_and_topics(tmp_path, cli):
+    path, _ = table(tmp_path / 'log.csv')
+    map_path = tmp_path / 'map.yaml'
+    map_path.write_text(
+        'stamp: {column: ms, unit: ms}\n'
+        'accel: {columns: [ax, ay, az], unit: g, output: imu}\n'
+        'board: {column: board}\n'
+    )
+    arguments = ('convert', path, '--columns', map_path, '-o', tmp_path / 'bag')
+    printed = cli(*arguments).stdout
+    assert '400 rows, 4.0 s at 100 Hz' in printed
+    assert '400 imu/uncompensated' in printed
+    text = f'thermo_comp: error: {tmp_path}/bag: exists already; --force overwrites it\n'
+    assert cli(*arguments, code=1).stderr == text
+    data = json.loads(cli(*arguments, '--force', '--json').stdout)
+    assert data['accel_messages'] == 400
+    assert data['stillness']['moving_ns'] == []
+    assert cli(*arguments, '--force', '-q').stdout == ''
 
 
 class TestFreezer:
@@ -352,7 +334,6 @@ class TestFreezer:
         report = write_log(table_log(path, columns), tmp_path / 'bag')
         assert report.rows == report.messages['accel'] == 24514
         assert report.findings['clipped'].count == 7
-        # The log starts at 1.5 s; the unit was moved before 49 s and after 1944 s.
         first, last = report.stillness.moving_ns[0], report.stillness.moving_ns[-1]
         assert first[0] == report.log.stamp_ns[0]
         assert first[1] * 1e-9 == pytest.approx(49.0, abs=3.0)
@@ -362,10 +343,8 @@ class TestFreezer:
         assert len(block) == 24514
         assert block.temperatures['case'].celsius.min() == pytest.approx(-17.8, abs=0.1)
         assert block.temperatures['board'].celsius.min() == pytest.approx(3.6, abs=0.5)
-        # The thermometers of board, case and barometer are in different places.
         assert block.temperatures['barometer'].celsius.min() == pytest.approx(-17.0, abs=0.1)
         n_barometer = len(block.temperatures['barometer'].celsius)
         assert report.messages['barometer'] == n_barometer
         assert report.messages.keys() == {'accel', 'board', 'case', 'barometer'}
-        # The air sensor repeats its value between readings, which gives fewer messages than rows.
         assert report.messages['case'] < 0.75 * report.rows

@@ -68,8 +68,7 @@ def write_new(path, rng, parameters=(('INS_TCAL1_ENABLE', 0.0),)):
     return force
 
 
-@pytest.mark.parametrize('imu', [0, 1])
-@pytest.mark.parametrize('baro', [0, 1])
+@pytest.mark.parametrize(('imu', 'baro'), [(0, 0), (1, 0), (0, 1)])
 def test_each_imu_of_a_log_in_the_new_format_can_be_converted(tmp_path, rng, imu, baro):
     path = tmp_path / 'new.BIN'
     force = write_new(path, rng)
@@ -80,10 +79,8 @@ def test_each_imu_of_a_log_in_the_new_format_can_be_converted(tmp_path, rng, imu
     np.testing.assert_array_equal(bag.accel, force[imu])
     # The log has numbers of single precision, so the rate 0.3 has a rounding error of 1e-7.
     np.testing.assert_allclose(bag.imu.angular_velocity[:, 2], 0.3 + imu, atol=1e-7)
-    # The chip temperature changes every ten samples, and each change is a message.
     celsius = 30.0 + imu + 0.25 * np.arange(N // 10)
     np.testing.assert_array_equal(bag.temperatures['board'].celsius, celsius)
-    # The log has the temperature of the barometer in units of 0.01 degC.
     hundredths = (2000 + np.arange(0, N, 10)) if baro == 0 else (1500 - np.arange(0, N, 10))
     np.testing.assert_allclose(bag.temperatures['case'].celsius, hundredths / 100, rtol=1e-15)
 
@@ -111,7 +108,6 @@ def test_each_imu_of_a_log_in_the_old_format_can_be_converted(tmp_path, rng):
 
 
 def test_a_temperature_of_0_means_no_thermometer(tmp_path, rng):
-    # ArduPilot writes 0 as temperature if the driver has no thermometer.
     log = DataflashWriter()
     log.define('IMU', *NEW_IMU)
     for k, force in enumerate(still(rng)):
@@ -121,13 +117,15 @@ def test_a_temperature_of_0_means_no_thermometer(tmp_path, rng):
     assert not read_autopilot(path).temperatures
 
 
-def test_a_log_corrected_by_ardupilot_is_refused(tmp_path, rng):
+def test_a_log_corrected_by_ardupilot_is_refused_and_a_simulated_log_reported(tmp_path, rng):
     path = tmp_path / 'corrected.BIN'
     write_new(path, rng, parameters=(('INS_TCAL1_ENABLE', 1.0),))
     with pytest.raises(RecordingError, match=r'INS_TCAL1_ENABLE was 1.*already'):
         read_autopilot(path)
     assert len(read_autopilot(path, allow_compensated=True).stamp_ns) == N
     assert len(read_autopilot(path, imu=1).stamp_ns) == N
+    write_new(path, rng, parameters=(('SIM_ACC1_RND', 0.1),))
+    assert 'SIM_' in read_autopilot(path).metadata['ardupilot_simulated']
 
 
 HALF_US = 2_000_000 + N // 2 * STEP_US
@@ -138,8 +136,7 @@ HALF_US = 2_000_000 + N // 2 * STEP_US
     [
         ([(0.0, 1000), (1.0, HALF_US)], slice(0, N // 2), 50),
         ([(1.0, 1000), (0.0, HALF_US)], slice(N // 2, N), 50),
-        # WHY: a log in which ArduPilot learns a temperature calibration was refused; at the end of
-        # learning INS_TCAL1_ENABLE changes from 2 to 1.
+        # WHY: a log in which ArduPilot learns (2), and then uses (1), the correction was refused.
         ([(2.0, 1000), (1.0, HALF_US + N // 4 * STEP_US)], slice(0, 3 * N // 4), 25),
     ],
 )
@@ -154,39 +151,40 @@ def test_samples_corrected_by_ardupilot_are_left_out(tmp_path, rng, course, kept
     assert len(read.temperatures['board'].celsius) > 1
 
 
-def test_a_log_of_a_simulator_with_noise_is_reported(tmp_path, rng):
-    path = tmp_path / 'noisy.BIN'
-    write_new(path, rng, parameters=(('SIM_ACC1_RND', 0.1),))
-    assert 'SIM_' in read_autopilot(path).metadata['ardupilot_simulated']
-
-
-def test_a_torn_dataflash_log_is_read_up_to_the_cut(tmp_path, rng):
+def test_a_torn_log_and_a_log_with_impossible_stamps_lose_only_their_damaged_messages(
+    tmp_path, rng
+):
     path = tmp_path / 'torn.BIN'
     force = write_new(path, rng)
     whole = path.read_bytes()
-    # The cut is 40 bytes into the last message of the last IMU row.
     cut = whole.rindex(b'\xa3\x95\x81') + 40
     path.write_bytes(whole[:cut])
     log = read_autopilot(path, imu=1)
     assert log.short == [2 * N]
     np.testing.assert_array_equal(log.accel, force[1][: N - 1])
+    path = tmp_path / 'jump.BIN'
+    write_new(path, rng)
+    body = bytearray(path.read_bytes())
+    # Set all bits of the time of the first IMU message, a time of half a million years.
+    at = body.index(b'\xa3\x95\x81') + 3
+    body[at : at + 8] = b'\xff' * 8
+    path.write_bytes(body)
+    report = write_log(read_autopilot(path), tmp_path / 'bag.mcap')
+    assert report.messages['accel'] == N - 1
+    assert report.findings['non_numeric'].count == 1
 
 
-def test_the_message_on_an_absent_instance_names_the_instances(tmp_path, rng):
+def test_absent_instances_and_files_of_other_kinds_are_refused(tmp_path, rng):
     path = tmp_path / 'new.BIN'
     write_new(path, rng)
     with pytest.raises(RecordingError, match='no IMU 2; there are: 0, 1'):
         read_autopilot(path, imu=2)
     with pytest.raises(RecordingError, match='no barometer 5; there are: 0, 1'):
         read_autopilot(path, baro=5)
-
-
-@pytest.mark.parametrize('content', [b'', b'time,x,y,z\n', b'\xa3\x95' + bytes(600)])
-def test_files_that_are_not_dataflash_logs_are_refused(tmp_path, content):
-    path = tmp_path / 'other.BIN'
-    path.write_bytes(content)
-    with pytest.raises(RecordingError, match=r'not a DataFlash log|holds no IMU'):
-        read_autopilot(path)
+    for content in (b'', b'time,x,y,z\n', b'\xa3\x95' + bytes(600)):
+        path.write_bytes(content)
+        with pytest.raises(RecordingError, match=r'not a DataFlash log|holds no IMU'):
+            read_autopilot(path)
 
 
 @pytest.mark.parametrize(
@@ -208,16 +206,3 @@ def test_damaged_formats_are_refused(tmp_path, rng, columns, message):
     path.write_bytes(body)
     with pytest.raises(RecordingError, match=message):
         read_autopilot(path)
-
-
-def test_messages_with_impossible_stamps_are_left_out(tmp_path, rng):
-    path = tmp_path / 'jump.BIN'
-    write_new(path, rng)
-    body = bytearray(path.read_bytes())
-    # Set all bits of the time of the first IMU message, a time of half a million years.
-    at = body.index(b'\xa3\x95\x81') + 3
-    body[at : at + 8] = b'\xff' * 8
-    path.write_bytes(body)
-    report = write_log(read_autopilot(path), tmp_path / 'bag.mcap')
-    assert report.messages['accel'] == N - 1
-    assert report.findings['non_numeric'].count == 1

@@ -121,10 +121,8 @@ def test_a_parquet_table_is_read_by_its_headings(tmp_path, rng, kind):
 
 
 def test_the_accelerometer_is_chosen_among_several_triads_of_a_table():
-    headings = (
-        'now[ms],magx,magy,magz,linear_acc_x,linear_acc_y,linear_acc_z,acc_x [mg],acc_y [mg],'
-    )
-    headings += 'acc_z [mg],gx[deg/s],gy[deg/s],gz[deg/s],gtemp,AHT_tmp[C],BMP_temp[K]'
+    headings = 'now[ms],magx,magy,magz,linear_acc_x,linear_acc_y,linear_acc_z,acc_x [mg],'
+    headings += 'acc_y [mg],acc_z [mg],gx[deg/s],gy[deg/s],gz[deg/s],gtemp,AHT_tmp[C],BMP_temp[K]'
     names = read_headings(headings.split(','))
     assert (names.time, names.time_unit, names.accel_unit) == ('now[ms]', 'ms', 'mg')
     assert names.accel == ('acc_x [mg]', 'acc_y [mg]', 'acc_z [mg]')
@@ -233,7 +231,6 @@ def test_headings_in_a_comment_are_read(tmp_path, comment, sign):
     columns = guess_columns(path)
     assert columns.board.column == 'temp'
     assert len(table_log(path, columns).accel) == 900
-    # A comment with as many words as the table has columns is not a row of headings.
     path.write_text('\n'.join(['# one two three four five', *rows]) + '\n')
     with pytest.raises(RecordingError, match='5 columns without headings'):
         guess_columns(path)
@@ -335,13 +332,22 @@ def write(path, rng, unit, **columns):
 
 
 @pytest.mark.parametrize(
-    ('unit', 'text'), [(9.80665, 'm/s^2'), (1.0, 'g'), (1000.0, 'mg'), (4096.0, 'counts')]
+    ('unit', 'text', 'step', 'time_unit', 'rate_hz'),
+    [
+        (9.80665, 'm/s^2', 0.01, 's', 100),
+        (1.0, 'g', 5.0, 'ms', 200),
+        (1000.0, 'mg', 10000.0, 'us', 100),
+        (4096.0, 'counts', 5e6, 'ns', 200),
+    ],
 )
-def test_the_unit_of_samples_follows_from_their_norm_at_rest(tmp_path, rng, unit, text):
-    path = write(tmp_path / 'log.txt', rng, unit, time=0.01 * np.arange(len(UP)))
+def test_the_norm_at_rest_and_a_plausible_sample_rate_show_the_units(
+    tmp_path, rng, unit, text, step, time_unit, rate_hz
+):
+    path = write(tmp_path / 'log.txt', rng, unit, time=step * np.arange(1, len(UP) + 1))
     columns = guess_columns(path)
-    assert column_map_text(columns) == f'time [s], x y z [{text}]'
+    assert column_map_text(columns) == f'time [{time_unit}], x y z [{text}]'
     log = table_log(path, columns)
+    np.testing.assert_array_equal(np.diff(log.stamp_ns), 10**9 // rate_hz)
     assert log.input == ('counts' if text == 'counts' else 'imu')
     write_log(log, tmp_path / 'bag.mcap')
     force = read_recording(tmp_path / 'bag.mcap', require=('accel',)).columns.accel
@@ -349,20 +355,8 @@ def test_the_unit_of_samples_follows_from_their_norm_at_rest(tmp_path, rng, unit
     np.testing.assert_allclose(np.linalg.norm(force, axis=1), expected, rtol=0.02)
 
 
-@pytest.mark.parametrize(
-    ('step', 'unit', 'rate_hz'),
-    [(0.01, 's', 100), (5.0, 'ms', 200), (10000.0, 'us', 100), (5e6, 'ns', 200)],
-)
-def test_the_unit_of_times_gives_a_plausible_sample_rate(tmp_path, rng, step, unit, rate_hz):
-    path = write(tmp_path / 'log.txt', rng, 9.8, time=step * np.arange(1, len(UP) + 1))
-    columns = guess_columns(path)
-    assert columns.stamp.unit == unit
-    np.testing.assert_array_equal(np.diff(table_log(path, columns).stamp_ns), 10**9 // rate_hz)
-
-
 def test_the_speed_of_a_turn_by_hand_shows_the_unit_of_times(tmp_path, rng):
-    # WHY: samples at 1 Hz were taken for samples at 1 kHz. A turn by 180 deg takes one interval at
-    # 1 Hz (1 s), and 800 intervals at 1 kHz (0.8 s).
+    # WHY: 1 Hz was taken for 1 kHz. A turn by 180 deg takes 1 s at 1 Hz, and 0.8 s at 1 kHz.
     angle = np.repeat([0.0, np.pi, 0.0], [400, 800, 400])
     ramp = np.clip((np.arange(1600) - 400) / 800, 0.0, 1.0) * np.pi
     for turned, unit in ((angle, 's'), (ramp, 'ms')):

@@ -47,12 +47,24 @@ def test_every_layout_of_a_table_gives_equal_values(tmp_path, delimiter, newline
     assert len(table.short) == 0
 
 
-def test_headings_of_a_table_are_optional(tmp_path):
+def test_headings_are_optional_and_a_column_may_begin_late(tmp_path):
     path = write(tmp_path / 'log.txt', '1 2 3\n4 5 6\n')
     assert read_text(path, [2], ROWS_ALONE).values[2].tolist() == [3.0, 6.0]
     # 'nan' and 'inf' are numbers, unless the user states that the first line is a heading.
     path = write(tmp_path / 'words.txt', 'nan inf\n1 2\n')
     assert read_text(path, [0], ROWS_ALONE, Format(header=True)).values[0].tolist() == [1.0]
+    path = write(tmp_path / 'log.csv', '# made by hand\na,b\n\n1,2\nx,3\n4\n5,6\n')
+    table = read_text(path, ['a', 'b'], ROWS_ALONE)
+    assert table.line.tolist() == [4, 5, 7]
+    np.testing.assert_array_equal(table.values['a'], [1.0, np.nan, 5.0])
+    assert [*table.short] == [6]
+    # WHY: a table was refused if the last column, a thermometer, is blank in the first rows.
+    rows = [f'{k},0.1,{"" if k < 20 else 20 + k}' for k in range(60)]
+    path = write(tmp_path / 'log.csv', '\n'.join(['t,ax,celsius', *rows]))
+    table = read_text(path, ['t', 'celsius'], ROWS_ALONE)
+    np.testing.assert_array_equal(table.values['t'], np.arange(60.0))
+    assert np.isnan(table.values['celsius'][:20]).all()
+    assert table.values['celsius'][20] == 40.0
 
 
 @pytest.mark.parametrize('separator', [',', ';', '\t', ' '])
@@ -66,25 +78,6 @@ def test_lines_before_the_table_of_a_logger_are_left_out(tmp_path, separator):
     np.testing.assert_array_equal(table.values['az'][1:], np.arange(60.0))
     assert table.line[1] == 9
     assert [*table.short] == [70]
-
-
-def test_a_column_of_a_table_may_begin_late(tmp_path):
-    # WHY: a table was refused if the last column, a thermometer, is blank in the first rows.
-    rows = [f'{k},0.1,{"" if k < 20 else 20 + k}' for k in range(60)]
-    path = write(tmp_path / 'log.csv', '\n'.join(['t,ax,celsius', *rows]))
-    table = read_text(path, ['t', 'celsius'], ROWS_ALONE)
-    np.testing.assert_array_equal(table.values['t'], np.arange(60.0))
-    assert np.isnan(table.values['celsius'][:20]).all()
-    assert table.values['celsius'][20] == 40.0
-
-
-def test_line_numbers_are_those_of_an_editor(tmp_path):
-    path = write(tmp_path / 'log.csv', '# made by hand\na,b\n\n1,2\nx,3\n4\n5,6\n')
-    table = read_text(path, ['a', 'b'], ROWS_ALONE)
-    assert table.line.tolist() == [4, 5, 7]
-    np.testing.assert_array_equal(table.values['a'], [1.0, np.nan, 5.0])
-    # The row with a single cell is counted and left out.
-    assert [*table.short] == [6]
 
 
 def test_stamps_of_a_table_are_exact():
@@ -121,27 +114,24 @@ def test_bad_tables_are_refused(tmp_path, text, column, message):
     assert str(path) in str(caught.value)
 
 
-@pytest.mark.parametrize('name', ['absent.csv', 'absent.ulg', 'absent.BIN'])
-def test_a_missing_file_is_refused(name, tmp_path):
-    with pytest.raises(RecordingError, match=f'{name}: No such file or directory$'):
-        read_log(tmp_path / name)
+def test_a_missing_file_is_refused(tmp_path):
+    for name in ('absent.csv', 'absent.ulg', 'absent.BIN'):
+        with pytest.raises(RecordingError, match=f'{name}: No such file or directory$'):
+            read_log(tmp_path / name)
+
+
+def parquet(folder, **columns):
+    pa = pytest.importorskip('pyarrow', reason='pyarrow is the extra `parquet`')
+    import pyarrow.parquet as pq
+
+    pq.write_table(pa.table(columns), folder / 'log.parquet')
+    return folder / 'log.parquet'
 
 
 class TestParquet:
-    @pytest.fixture(autouse=True)
-    def needs_pyarrow(self):
-        pytest.importorskip('pyarrow', reason='pyarrow is the extra `parquet`')
-
-    def table(self, tmp_path, **columns):
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
-        pq.write_table(pa.table(columns), tmp_path / 'log.parquet')
-        return tmp_path / 'log.parquet'
-
     def test_a_parquet_table_gives_the_values_of_the_text_table(self, tmp_path):
         t, a, _ = zip(*ROWS, strict=True)
-        path = self.table(tmp_path, t=t, a=a, b=[1, None, 3])
+        path = parquet(tmp_path, t=t, a=a, b=[1, None, 3])
         table = read_parquet(path, ['a', 'b'], Stamp('t', 'ms'))
         assert table.stamp_ns.tolist() == [1000 * 10**6, 1001 * 10**6, 1003 * 10**6]
         assert table.values['a'].tolist() == [*a]
@@ -155,17 +145,17 @@ class TestParquet:
         ],
     )
     def test_parquet_stamps_are_dates_or_fractional_seconds(self, tmp_path, stamps, expected):
-        path = self.table(tmp_path, t=stamps, a=[1.0, 2.0])
+        path = parquet(tmp_path, t=stamps, a=[1.0, 2.0])
         assert read_parquet(path, ['a'], Stamp('t', 's')).stamp_ns.tolist() == expected
 
     def test_unreadable_parquet_is_refused(self, tmp_path):
-        path = self.table(tmp_path, a=['one', 'two'])
+        path = parquet(tmp_path, a=['one', 'two'])
         with pytest.raises(RecordingError, match="column 'a' holds string"):
             read_parquet(path, ['a'], ROWS_ALONE)
         with pytest.raises(RecordingError, match="no column 'b'"):
             read_parquet(path, ['b'], ROWS_ALONE)
         with pytest.raises(RecordingError, match='the table is empty'):
-            read_parquet(self.table(tmp_path, a=np.array([], dtype=float)), ['a'], ROWS_ALONE)
+            read_parquet(parquet(tmp_path, a=np.array([], dtype=float)), ['a'], ROWS_ALONE)
         path.write_text('a,b\n')
         with pytest.raises(RecordingError, match='not a readable Parquet file'):
             read_parquet(path, ['a'], ROWS_ALONE)
@@ -174,7 +164,6 @@ class TestParquet:
 @pytest.mark.parametrize('suffix', ['csv', 'parquet'])
 @pytest.mark.parametrize('unit', ['s', 'ns'])
 def test_stamps_that_ros_cannot_hold_are_left_out(tmp_path, suffix, unit):
-    """A row with a stamp outside 0 to 2^31 s is left out and counted."""
     scale = 10**9 if unit == 's' else 1
     good = [10**9 + k for k in range(40)] if unit == 's' else [10**18 + k for k in range(40)]
     bad = [-1, 2**31, 2 * 10**10, 2**62, 2**63] if unit == 's' else [-1, 2**31 * 10**9, 2**63]
@@ -182,17 +171,12 @@ def test_stamps_that_ros_cannot_hold_are_left_out(tmp_path, suffix, unit):
 
     def written(stamps):
         path = tmp_path / f'log.{suffix}'
-        if suffix == 'csv':
-            path.write_text('\n'.join(['t,x,y,z', *(f'{at},5.66,5.66,5.66' for at in stamps)]))
-            return path
-        pytest.importorskip('pyarrow', reason='pyarrow is the extra `parquet`')
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
-        kind = pa.int64() if min(stamps) < 0 else pa.uint64()
-        stored = [min(stamp, 2**62) if min(stamps) < 0 else stamp for stamp in stamps]
-        columns = {'t': pa.array(stored, kind), **dict.fromkeys('xyz', [5.66] * len(stamps))}
-        pq.write_table(pa.table(columns), path)
+        if suffix == 'parquet':
+            is_signed = min(stamps) < 0
+            stamps = [min(stamp, 2**62) for stamp in stamps] if is_signed else stamps
+            stored = np.array(stamps, np.int64 if is_signed else np.uint64)
+            return parquet(tmp_path, t=stored, **dict.fromkeys('xyz', [5.66] * len(stamps)))
+        path.write_text('\n'.join(['t,x,y,z', *(f'{at},5.66,5.66,5.66' for at in stamps)]))
         return path
 
     accel = {'columns': ['x', 'y', 'z'], 'unit': 'm/s^2', 'output': 'imu'}
@@ -241,7 +225,6 @@ def test_topics_of_any_name_are_converted_to_the_default_topics(tmp_path, rng, r
     np.testing.assert_array_equal(columns.accel_stamp_ns, START_NS + 10_000_000 * np.arange(N))
     np.testing.assert_allclose(columns.accel.mean(axis=0), (0.0, 0.1 * G, G), atol=0.02)
     np.testing.assert_array_equal(columns.imu.angular_velocity[0], (0.01, 0.0, 0.5))
-    # The thermometer in the namespace of the Imu is the board thermometer.
     for name, topic in (('board', '/mpu/die'), ('case', '/baro/air')):
         celsius = columns.temperatures[name].celsius
         np.testing.assert_array_equal(celsius, len(topic) + np.arange(8))
@@ -330,7 +313,6 @@ def test_a_stated_unit_that_may_be_true_is_not_contradicted():
     # Any |a| at rest above 50 may be in counts, because converters differ in resolution.
     assert contradiction('counts', 2941.7, None) is None
     assert contradiction('counts', 2060.0, 2048.0) is None
-    # Without a rest |a| at rest is unknown, and no unit is refused.
     assert contradiction('g', float('nan'), None) is None
 
 
@@ -346,7 +328,6 @@ def test_movement_is_found_in_any_unit(rng, scale):
     n = 5000
     stamp_ns = np.arange(1, n + 1) * 10_000_000
     stillness = find_stillness(stamp_ns, shaken(rng, n, scale, 1e-3 * scale))
-    # The sensor is shaken from 20 to 30 s.
     assert np.array(stillness.moving_ns) * 1e-9 == pytest.approx(np.array([[20.01, 30.01]]))
     # A mean over 2 s at 100 Hz of samples with a noise of 0.1 % has a noise of 0.1 % / sqrt(200).
     assert stillness.magnitude == pytest.approx(scale, rel=3e-4)
@@ -354,16 +335,13 @@ def test_movement_is_found_in_any_unit(rng, scale):
     assert stillness.still_s == pytest.approx(40.0, abs=0.5)
 
 
-def test_rare_steps_of_a_coarse_sensor_are_not_taken_for_motion(rng):
+def test_steps_of_a_coarse_sensor_are_no_motion_and_five_samples_no_rest(rng):
     # If rounding steps are larger than the noise, samples at rest change by a step now and then.
     accel = np.tile([0.0, 0.0, 1.0], (1000, 1))
     accel[::97, 0] = 0.1
     stillness = find_stillness(np.arange(1000) * 10_000_000, accel)
     assert stillness.moving_ns == ()
     assert stillness.magnitude == pytest.approx(1.0, rel=1e-3)
-
-
-def test_the_stillness_of_five_samples_is_unknown():
     stillness = find_stillness(np.arange(5), np.ones((5, 3)))
     assert np.isnan(stillness.magnitude)
     assert stillness.moving_ns == ()

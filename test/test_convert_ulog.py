@@ -70,6 +70,17 @@ def write_two_imus(path, rng, gyro_every=1):
     return {'force': np.array(force), 'celsius': np.array(celsius)}
 
 
+def write_old(path, force, step_us, celsius=31.5, warming=0.0):
+    """Write samples in the format without times of samples, which has a single stamp."""
+    log = UlogWriter(OLD_ACCEL)
+    number = log.subscribe('sensor_accel', 0)
+    for k, row in enumerate(force):
+        now = 1_000_000 + k * step_us
+        log.data(number, struct.pack('<Qffff', now, *row, celsius + warming * k))
+    path.write_bytes(log.body)
+    return path
+
+
 @pytest.fixture
 def flight(tmp_path, rng):
     path = tmp_path / 'flight.ulg'
@@ -87,43 +98,32 @@ def test_each_imu_of_a_log_can_become_a_bag(flight, tmp_path, imu):
     expected_ns = (5_000_000 + np.arange(N) * STEP_US + imu) * 1000
     np.testing.assert_array_equal(bag.accel_stamp_ns, expected_ns)
     np.testing.assert_array_equal(bag.accel, truth['force'][imu])
-    # Each accelerometer sample has a board temperature; the barometer gives T_case.
     np.testing.assert_array_equal(bag.temperatures['board'].celsius, truth['celsius'][imu])
     np.testing.assert_array_equal(bag.temperatures['case'].celsius, 20 + 0.5 * np.arange(12))
     assert recording.info.metadata['serial'] == f'px4-accel-{77 + imu}'
 
 
-def test_the_gyroscope_of_an_instance_is_in_its_bag(flight, tmp_path):
+def test_the_gyroscope_of_an_instance_is_in_its_bag_unless_it_is_sparsely_logged(
+    flight, tmp_path, rng
+):
     path, _ = flight
     write_log(read_autopilot(path, imu=0), tmp_path / 'bag.mcap')
     rate = read_recording(tmp_path / 'bag.mcap').columns.imu.angular_velocity
     # Gyroscope and accelerometer have equal stamps; values are rounded to single precision.
     np.testing.assert_allclose(rate[:, 0], 0.001 * np.arange(N), atol=1e-6)
     assert read_autopilot(path, imu=1).gyro is None
-
-
-def test_a_sparsely_logged_gyroscope_is_left_out(tmp_path, rng):
-    path = tmp_path / 'flight.ulg'
     write_two_imus(path, rng, gyro_every=5)
     assert read_autopilot(path).gyro is None
 
 
-def test_a_log_without_sample_times_is_read(tmp_path, rng):
-    log = UlogWriter(OLD_ACCEL)
-    number = log.subscribe('sensor_accel', 0)
+def test_logs_without_sample_times_or_a_thermometer_are_read(tmp_path, rng):
     force = still(rng)
-    for k in range(N):
-        log.data(number, struct.pack('<Qffff', 1_000_000 + k * STEP_US, *force[k], 31.5))
-    path = tmp_path / 'old.ulg'
-    path.write_bytes(log.body)
+    path = write_old(tmp_path / 'old.ulg', force, STEP_US)
     read = read_autopilot(path)
     np.testing.assert_array_equal(read.accel, force)
     assert 'case' not in read.temperatures
     # A constant temperature is written every 10 s, so once in this log of 6 s.
     np.testing.assert_array_equal(read.temperatures['board'].celsius, [31.5])
-
-
-def test_a_chip_without_a_thermometer_is_recognised(tmp_path, rng):
     log = UlogWriter(ACCEL)
     number = log.subscribe('sensor_accel', 0)
     for k, force in enumerate(still(rng)):
@@ -135,7 +135,7 @@ def test_a_chip_without_a_thermometer_is_recognised(tmp_path, rng):
     assert not read_autopilot(path).temperatures
 
 
-def test_a_torn_ulog_is_read_up_to_the_cut(flight):
+def test_a_torn_ulog_is_read_up_to_the_cut_and_other_files_are_refused(flight, tmp_path):
     path, truth = flight
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
@@ -143,20 +143,22 @@ def test_a_torn_ulog_is_read_up_to_the_cut(flight):
     n = len(read.stamp_ns)
     assert 250 < n < 350
     np.testing.assert_array_equal(read.accel, truth['force'][0][:n])
-
-
-def refused(folder, content, message):
-    (folder / 'refused.ulg').write_bytes(content)
-    with pytest.raises(RecordingError, match=message):
-        read_autopilot(folder / 'refused.ulg')
-
-
-def test_a_log_of_a_simulator_without_noise_is_refused(tmp_path):
-    log = UlogWriter(OLD_ACCEL)
-    number = log.subscribe('sensor_accel', 0)
-    for k in range(N):
-        log.data(number, struct.pack('<Qffff', 1_000_000 + k * STEP_US, 0.0, 0.0, -9.80665, 35.0))
-    refused(tmp_path, log.body, r'no noise at all.*simulator')
+    path = write_old(tmp_path / 'quiet.ulg', [(0.0, 0.0, -9.80665)] * N, STEP_US, 35.0)
+    with pytest.raises(RecordingError, match=r'no noise at all.*simulator'):
+        read_autopilot(path)
+    path, baro = tmp_path / 'refused.ulg', UlogWriter(BARO)
+    baro.data(baro.subscribe('sensor_baro', 0), struct.pack('<QQIffI', 1, 1, 9, 1e5, 20.0, 0))
+    unstamped = UlogWriter('sensor_accel:float x;float y;float z;')
+    number = unstamped.subscribe('sensor_accel', 0)
+    unstamped.data(number, struct.pack('<fff', 0.0, 0.0, 1.0))
+    for content, message in (
+        (baro.body, 'the log holds no IMU'),
+        (unstamped.body, r'not a ULog file|holds no IMU'),
+        *((text, 'not a ULog file') for text in (b'', b'ULog', b'time,x,y,z\n1,2,3,4\n' * 10)),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(RecordingError, match=message):
+            read_autopilot(path)
 
 
 COMBINED = 'sensor_combined:uint64_t timestamp;float[3] gyro_rad;uint32_t gyro_integral_dt;'
@@ -202,7 +204,6 @@ def test_sensor_combined_replaces_a_missing_sensor_accel(tmp_path, rng, cli):
     np.testing.assert_array_equal(read.accel, force)
     np.testing.assert_array_equal(read.stamp_ns, (7_000_000 - 200 + np.arange(N) * STEP_US) * 1000)
     np.testing.assert_allclose(read.gyro, np.tile([0.1, 0.2, 0.3], (N, 1)), rtol=1e-6)
-    # The only thermometer in the log, in the barometer, is taken as the board thermometer.
     np.testing.assert_array_equal(read.temperatures['board'].celsius, 40.0 + np.arange(6))
     assert 'case' not in read.temperatures
     printed = cli('convert', path, '-o', tmp_path / 'bag.mcap').stdout
@@ -224,34 +225,14 @@ def test_samples_compensated_by_px4_are_left_out(tmp_path, rng, begin):
     force = write_combined(path, rng, {'TC_A_ENABLE': 1 - begin}, TC_A_ENABLE=begin)
     read = read_autopilot(path)
     assert 'TC_A_ENABLE was 1 for 50 % of the samples' in read.chosen
-    # In a log a changed parameter has the stamp of the message before it, so the sample at the
-    # change may be on the wrong side; `- 1` leaves this sample out of the comparison.
+    # A changed parameter has the stamp of the message before it: leave out the sample there.
     n = min(len(read.accel), N // 2) - 1
     part = slice(-n, None) if begin else slice(n)
     np.testing.assert_array_equal(read.accel[part], force[part])
 
 
 def test_the_report_on_a_log_at_1_hz_names_fits_for_which_1_hz_is_sufficient(tmp_path, rng, cli):
-    log = UlogWriter(OLD_ACCEL)
-    number = log.subscribe('sensor_accel', 0)
-    for k, force in enumerate(still(rng)):
-        log.data(number, struct.pack('<Qffff', (1 + k) * 1_000_000, *force, 31.5 + 0.01 * k))
-    path = tmp_path / 'slow.ulg'
-    path.write_bytes(log.body)
+    path = write_old(tmp_path / 'slow.ulg', still(rng), 1_000_000, warming=0.01)
     printed = cli('convert', path, '-o', tmp_path / 'bag.mcap').stdout
     assert '1 Hz is sufficient for soaks of minutes' in printed
     assert 'sensor_accel at 10 Hz' in printed
-
-
-def test_a_log_without_an_accelerometer_and_other_files_are_refused(tmp_path):
-    log = UlogWriter(BARO)
-    log.data(log.subscribe('sensor_baro', 0), struct.pack('<QQIffI', 1, 1, 9, 1e5, 20.0, 0))
-    refused(tmp_path, log.body, 'the log holds no IMU')
-    for content in (b'', b'ULog', b'time,x,y,z\n1,2,3,4\n' * 10):
-        refused(tmp_path, content, 'not a ULog file')
-
-
-def test_a_format_without_a_time_stamp_is_left_out(tmp_path):
-    log = UlogWriter('sensor_accel:float x;float y;float z;')
-    log.data(log.subscribe('sensor_accel', 0), struct.pack('<fff', 0.0, 0.0, 1.0))
-    refused(tmp_path, log.body, r'not a ULog file|holds no IMU')

@@ -52,8 +52,6 @@ LAYOUTS = {
     'realsense': {'/camera/camera/accel/sample': IMU, '/camera/camera/gyro/sample': IMU},
     'mpu6050': {'/imu': IMU},
 }  # fmt: skip
-#: Drivers that publish no temperature.
-LACKS = {'ardupilot', 'realsense', 'mpu6050'}
 #: Drivers whose bags are fitted: one for each type of temperature message, one without readings.
 FITTED = {'mavros', 'px4', 'phidgets', 'ardupilot'}
 #: Seven rests of REST_S [s]: six faces, the first again; the board warms by WARMING [K/s].
@@ -109,7 +107,6 @@ def bag(request, tmp_path, store):
             force += NOISE * noise.standard_normal(3)
             for link, kind in links.values():
                 if kind == IMU or row % RATE == 0:
-                    # The barometer is 2 K colder than the board.
                     celsius = 20.0 + warmer - (2.0 if 'baro' in link.topic else 0.0)
                     sent = message(store, kind, stamp_ns, celsius, force)
                     writer.write(link, stamp_ns + 1, store.serialize_cdr(sent, kind))
@@ -128,7 +125,7 @@ def test_every_driver_has_a_layout_and_a_line_in_the_page():
 @pytest.mark.parametrize(('path', 'bag'), [(file, file.stem) for file in FILES], indirect=['bag'])
 def test_every_command_reads_a_bag_with_the_topics_of_the_driver(path, bag, tmp_path, cli):
     names, topics = read_names(path), ('--topics', path)
-    has_board = path.stem not in LACKS
+    has_board = path.stem not in {'ardupilot', 'realsense', 'mpu6050'}
     printed = cli('info', bag, *topics).stdout
     assert f'{SECONDS * RATE} samples of imu, {RATE} Hz' in printed
     assert f'{len(UPS)} still intervals' in printed
@@ -171,9 +168,8 @@ def warming_unit():
 
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: path.stem)
-def test_the_node_uses_the_topics_of_the_driver_s_file(path, tmp_path):
-    pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
-    from ros_helpers import Peer, node_arguments, node_in_thread, stamped
+def test_the_node_uses_the_topics_of_the_driver_s_file(path, tmp_path, peer):
+    from ros_helpers import node_arguments, node_in_thread, stamped
     from sensor_msgs.msg import Imu, Temperature
     from std_msgs.msg import Float64
 
@@ -194,23 +190,19 @@ def test_the_node_uses_the_topics_of_the_driver_s_file(path, tmp_path):
                 LiveField(board, layout[board], field)
             return
         assert topics <= heard_topics | {board}
-        peer = Peer()
-        try:
-            heard = peer.listen(Imu, names.get('output', 'imu/data_raw'))
-            is_bare = layout.get(board) == FLOAT
-            reading = Float64(data=30.0) if is_bare else Temperature(temperature=30.0)
-            thermometer = peer.publisher(type(reading), board)
-            samples = peer.publisher(Imu, names['imu'])
-            peer.join(node)
-            for k in range(40):
-                message = stamped(Imu(), START_NS + k * 10**9 // RATE, 'imu_link')
-                message.linear_acceleration.x = 0.01 * (k % 3)
-                message.linear_acceleration.z = GRAVITY
-                if not is_bare:
-                    stamped(reading, START_NS + k * 10**9 // RATE)
-                thermometer.publish(reading)
-                samples.publish(message)
-            peer.wait_for(lambda: heard and abs(heard[-1].linear_acceleration.z - GRAVITY) > 5e-3)
-        finally:
-            peer.close()
+        heard = peer.listen(Imu, names.get('output', 'imu/data_raw'))
+        is_bare = layout.get(board) == FLOAT
+        reading = Float64(data=30.0) if is_bare else Temperature(temperature=30.0)
+        thermometer = peer.publisher(type(reading), board)
+        samples = peer.publisher(Imu, names['imu'])
+        peer.join(node)
+        for k in range(40):
+            message = stamped(Imu(), START_NS + k * 10**9 // RATE, 'imu_link')
+            message.linear_acceleration.x = 0.01 * (k % 3)
+            message.linear_acceleration.z = GRAVITY
+            if not is_bare:
+                stamped(reading, START_NS + k * 10**9 // RATE)
+            thermometer.publish(reading)
+            samples.publish(message)
+        peer.wait_for(lambda: heard and abs(heard[-1].linear_acceleration.z - GRAVITY) > 5e-3)
         assert heard[-1].linear_acceleration.z == pytest.approx(GRAVITY - 0.01, abs=1e-6)

@@ -51,9 +51,10 @@ def cubic():
     return calibration_of([Polynomial(curve) for curve in curves])
 
 
-@pytest.mark.parametrize('to', TOOLS)
+@pytest.mark.parametrize('to', get_args(Tool))
 def test_a_serial_with_line_breaks_adds_no_line_to_an_export(cubic, to):
     # WHY: a serial with a line break added a parameter to the parameter file of a vehicle.
+    assert get_args(Tool) == tuple(TOOLS)
     clean = export_calibration(cubic, to).text
     unit = replace(cubic.unit)
     forged = '7\nINS_TCAL1_ENABLE,0\r1\t1\tTC_A_ENABLE\t0\t6\x1b[2J\u2028x,1'
@@ -90,7 +91,7 @@ def test_the_formula_of_px4_gives_the_bias_of_the_calibration(cubic):
             assert offset == pytest.approx(bias_at(cubic, axis, celsius), rel=1e-8, abs=1e-9)
 
 
-def test_the_formula_of_ardupilot_gives_the_bias_changes_of_the_calibration(cubic):
+def test_ardupilot_files_have_the_bias_changes_of_the_calibration(cubic):
     p = numbers(export_calibration(cubic, 'ardupilot', number=3).text, ',')
 
     def polynomial(axis, celsius):
@@ -102,9 +103,6 @@ def test_the_formula_of_ardupilot_gives_the_bias_changes_of_the_calibration(cubi
             change = polynomial(axis, celsius) - polynomial(axis, 20.0)
             ours = bias_at(cubic, number, celsius) - bias_at(cubic, number, 20.0)
             assert change == pytest.approx(ours, rel=1e-7, abs=1e-9)
-
-
-def test_an_imported_ardupilot_bias_is_0_at_its_calibration_temperature(cubic):
     text = export_calibration(cubic, 'ardupilot').text.replace(',', '=')
     back = import_calibration(text + 'INS_ACC1_CALTEMP=28.0\n', serial='7')
     for axis in range(3):
@@ -156,19 +154,34 @@ def test_the_bias_of_a_gyroscope_is_exported_and_imported(cubic):
         import_calibration(px4.text.replace('TC_G0_X3_1', 'TC_G0_Y3_1'), serial='7')
 
 
-def test_an_export_of_counts_to_px4_is_divided_by_the_scale_factor(cubic):
+def test_exports_of_counts_and_of_m_s2_to_px4_have_the_offset_in_m_s2(cubic):
     axes = Axes(*(AxisReference(300.0, 300.0 * bias) for bias in (0.1, -0.2, 0.3)))
     scaled = []
     for axis in cubic.static.axes():
         bias = Polynomial(tuple(300.0 * c for c in axis.bias_function.coefficients))
         scaled.append(replace(axis, bias_function=bias))
     regime = RegimeSet((5.0, 45.0), (-2.0, 2.0), *scaled)
-    unit = Unit('7', 'counts', 32767.0, 0.005)
-    counts = replace(cubic, unit=unit, axes=axes, static=regime, dynamic=regime)
+    counts = replace(cubic, unit=Unit('7', 'counts', 32767.0, 0.005), axes=axes)
+    counts = replace(counts, static=regime, dynamic=regime)
     ours, expected = export_calibration(counts, 'px4'), export_calibration(cubic, 'px4')
     assert any('the driver must divide counts by K' in note for note in ours.notes)
     for name, value in numbers(expected.text, '\t').items():
         assert numbers(ours.text, '\t')[name] == pytest.approx(value, rel=1e-8, abs=1e-12)
+    # WHY: PX4 takes readings as m/s^2. For a stated attitude the offset contains the scale error.
+    axes = Axes(*(AxisReference(0.995, bias) for bias in (0.1, -0.2, 0.3)))
+    calibration = replace(cubic, axes=axes)
+    plain = export_calibration(calibration, 'px4')
+    for name, value in numbers(expected.text, '\t').items():
+        assert numbers(plain.text, '\t')[name] == pytest.approx(value, rel=1e-8, abs=1e-12)
+    assert any('constant scale is lost' in n and '5000 ppm' in n for n in plain.notes)
+    up = (0.6, 0.0, 0.8)
+    level = numbers(export_calibration(calibration, 'px4', up=up).text, '\t')
+    for axis in range(3):
+        # In the attitude `up` at the reference temperature, reading - offset must be gravity.
+        d = 20.0 - level['TC_A0_TREF']
+        reading = 0.995 * 9.81 * up[axis] + (0.1, -0.2, 0.3)[axis]
+        offset = sum(level[f'TC_A0_X{power}_{axis}'] * d**power for power in range(4))
+        assert reading - offset == pytest.approx(9.81 * up[axis], abs=1e-7)
 
 
 def test_an_export_for_a_stated_attitude_contains_the_scale_drift(cubic):
@@ -183,25 +196,6 @@ def test_an_export_for_a_stated_attitude_contains_the_scale_drift(cubic):
     slope = [numbers(export.text, '\t')['TC_A0_X1_2'] for export in (plain, level)]
     assert slope[1] - slope[0] == pytest.approx(9.81e-4, rel=1e-5)
     assert numbers(plain.text, '\t')['TC_A0_X1_0'] == numbers(level.text, '\t')['TC_A0_X1_0']
-
-
-def test_an_export_to_px4_contains_the_offset_in_m_s2(cubic):
-    # WHY: PX4 subtracts the offset from readings that it takes as m/s^2. The offset for a
-    # stated attitude must contain the effect of a scale error of 0.5 %, up to 5 mg at rest.
-    axes = Axes(*(AxisReference(0.995, bias) for bias in (0.1, -0.2, 0.3)))
-    calibration = replace(cubic, axes=axes)
-    plain = export_calibration(calibration, 'px4')
-    for name, value in numbers(export_calibration(cubic, 'px4').text, '\t').items():
-        assert numbers(plain.text, '\t')[name] == pytest.approx(value, rel=1e-8, abs=1e-12)
-    assert any('constant scale is lost' in n and '5000 ppm' in n for n in plain.notes)
-    up = (0.6, 0.0, 0.8)
-    level = numbers(export_calibration(calibration, 'px4', up=up).text, '\t')
-    for axis in range(3):
-        # In the attitude `up` at the reference temperature, reading - offset must be gravity.
-        d = 20.0 - level['TC_A0_TREF']
-        reading = 0.995 * 9.81 * up[axis] + (0.1, -0.2, 0.3)[axis]
-        offset = sum(level[f'TC_A0_X{power}_{axis}'] * d**power for power in range(4))
-        assert reading - offset == pytest.approx(9.81 * up[axis], abs=1e-7)
 
 
 def test_losses_of_an_export_are_noted(cubic):
@@ -246,16 +240,13 @@ def test_files_that_are_no_calibrations_are_refused(text, message):
         import_calibration(text, serial='7')
 
 
-def test_import_refuses_a_missing_parameter_set_and_an_empty_temperature_range(cubic):
+def test_impossible_arguments_of_import_and_export_are_refused(cubic):
     text = export_calibration(cubic, 'px4').text
     with pytest.raises(CalibrationError, match='no set of parameters 1'):
         import_calibration(text, serial='7', number=1)
     empty = re.sub(r'TMAX\t45', 'TMAX\t5', text)
     with pytest.raises(CalibrationError, match=r'range 5\.\.5 degC is empty'):
         import_calibration(empty, serial='7')
-
-
-def test_wrong_arguments_of_export_are_refused(cubic):
     for to, given, reason in (
         ('px4', {'number': 4}, r'`number` must be 0\.\.3, got 4'),
         ('ardupilot', {'number': 0}, r'`number` must be 1\.\.3, got 0'),
@@ -323,13 +314,12 @@ def test_constants_are_unchanged_by_export_and_import(tumbled, to):
     file = export_calibration(tumbled, to)
     back = import_calibration(file.text, serial='7')
     assert back.unit.input == 'counts'
-    # The export to imu_tk rotates the frame of the axes, and the import rotates the frame back.
     np.testing.assert_allclose(ours(back, RAW), ours(tumbled, RAW), rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(back.misalignment, tumbled.misalignment, atol=1e-12)
     assert any('hold at 20 degC' in note for note in file.notes)
 
 
-def test_a_file_that_imu_tk_saved_is_read():
+def test_imported_matrices_become_a_triangular_matrix_and_a_rotation():
     # The text is a file that imu_tk wrote; `theirs` is the formula of imu_tk, written by hand.
     text = (
         '          1 -0.00354989 -0.00890444\n          0           1 -0.0213032\n'
@@ -344,9 +334,6 @@ def test_a_file_that_imu_tk_saved_is_read():
                            [0.0, 0.0, 1.0]]).T  # fmt: skip
     rotation = turn(back.provenance.notes)
     np.testing.assert_allclose(ours(back, RAW) @ rotation.T, theirs, atol=1e-4)
-
-
-def test_an_imported_full_matrix_becomes_a_triangular_matrix_and_a_rotation():
     SM = np.array([[1.02, 0.03, -0.01], [-0.02, 0.99, 0.02], [0.01, -0.03, 1.01]])
     text = f'SM: {SM.ravel().tolist()}\nbias: [0.12, -0.05, 0.2]\n'
     back = import_calibration(text, serial='7')
@@ -356,7 +343,7 @@ def test_an_imported_full_matrix_becomes_a_triangular_matrix_and_a_rotation():
     assert not np.triu(back.misalignment, 1).any()
 
 
-def test_kalibr_files_without_bias_and_with_several_imus_are_read():
+def test_kalibr_files_without_bias_with_rates_and_with_several_imus_are_read():
     imu = '  accelerometers:\n    M: [[1.01, 0, 0], [0.01, 0.99, 0], [0.02, -0.01, 1.02]]\n'
     back = import_calibration(f'imu0:\n{imu}  update_rate: 200.0\n', serial='7')
     assert back.unit.input == 'm/s^2'
@@ -365,9 +352,6 @@ def test_kalibr_files_without_bias_and_with_several_imus_are_read():
     np.testing.assert_allclose(ours(back, np.array([[1.01, 1.99, 3.06]])), [[1, 2, 3]], rtol=1e-12)
     with pytest.raises(CalibrationError, match='an IMU with --number: the file has imu0, imu1'):
         import_calibration(f'imu0:\n{imu}imu1:\n{imu}', serial='7')
-
-
-def test_rate_and_noise_that_a_kalibr_file_states_are_imported():
     # WHY: the calibration of a file with 400 Hz had 200 Hz, at which the node drops samples.
     imu = 'imu0:\n  accelerometers:\n    M: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n'
     text = f'{imu}  update_rate: 400.0\n  accelerometer_noise_density: 0.0025\n'
@@ -392,7 +376,3 @@ def test_px4_rate_polynomials_of_different_degree_are_imported(cubic):
             theirs = sum(c * (celsius - 31.0) ** p for p, c in enumerate(row))
             ours = back.gyroscope.bias_rad_s[axis] + curve.value(celsius - 20.0)
             assert ours == pytest.approx(theirs, abs=1e-12)
-
-
-def test_the_command_export_has_every_tool_as_a_choice():
-    assert get_args(Tool) == tuple(TOOLS)

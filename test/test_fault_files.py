@@ -17,18 +17,18 @@ from fleet_helpers import write_unit
 
 from thermo_comp.recording.reader import read_recording
 from thermo_comp.recording.writer import BagWriter
-from thermo_comp.unit.calibration_file import load_calibration, save_calibration
+from thermo_comp.unit.calibration_file import save_calibration
 
 #: Bags in the working folder, whose fit takes 0.5 s.
 FIT = ('bags/01.mcap', 'bags/02.mcap')
 HELD_OUT = ROOT / 'bags' / 'held_out.mcap'
 GRAVITY = ('--gravity', '9.80665', '--model', 'golovach')
-#: For each output the arguments of its command, before and after the path of the output.
+#: For each output the arguments of its command before the path of the output.
 COMMANDS = {
-    'unit.yaml': (('fit', *FIT, *GRAVITY, '-f', '-o'), ()),
-    'page.html': (('report', '-c', 'unit.yaml', '-f', '-o'), ()),
-    'bag.mcap': (('replay', HELD_OUT, '-c', 'unit.yaml', '--serial', 'T-1', '-f', '-o'), ()),
-    'bag': (('replay', HELD_OUT, '-c', 'unit.yaml', '--serial', 'T-1', '-f', '-o'), ()),
+    'unit.yaml': ('fit', *FIT, *GRAVITY, '-f', '-o'),
+    'page.html': ('report', '-c', 'unit.yaml', '-f', '-o'),
+    'bag.mcap': ('replay', HELD_OUT, '-c', 'unit.yaml', '--serial', 'T-1', '-f', '-o'),
+    'bag': ('replay', HELD_OUT, '-c', 'unit.yaml', '--serial', 'T-1', '-f', '-o'),
 }
 
 
@@ -41,9 +41,8 @@ def folder(tmp_path):
 
 @pytest.mark.parametrize('name', COMMANDS)
 def test_a_command_on_a_full_disk_fails_in_one_line(small_disk, folder, cli, name):
-    before, _ = COMMANDS[name]
     output = small_disk / name
-    finished = cli(*before, output, code=1, cwd=folder)
+    finished = cli(*COMMANDS[name], output, code=1, cwd=folder)
     (line,) = finished.stderr.strip().splitlines()[-1:]
     assert line.startswith('thermo_comp: error: ')
     assert str(output) in line
@@ -57,14 +56,7 @@ def test_a_conversion_on_a_full_disk_leaves_no_file(small_disk, tmp_path, cli):
     samples = np.random.default_rng(3).normal((0.0, 0.0, 9.8), 0.1, (9000, 3))
     rows = [f'{k / 100},{x},{y},{z},20.0' for k, (x, y, z) in enumerate(samples)]
     table.write_text('\n'.join(['time_s,x,y,z,board', *rows]))
-    columns = tmp_path / 'columns.yaml'
-    columns.write_text(
-        'stamp: {rate_hz: 100.0, start_s: 1.0}\n'
-        'accel: {columns: [x, y, z], unit: m/s^2, output: imu}\n'
-        'board: {column: board, unit: degC}\n'
-    )
-    finished = cli('convert', table, '--columns', columns, '-o', small_disk / 'log', code=None)
-    assert finished.returncode == 1, finished.stderr
+    finished = cli('convert', table, '-o', small_disk / 'log', code=1)
     assert 'No space left on device' in finished.stderr
     assert not list(small_disk.rglob('*.partial*'))
 
@@ -97,8 +89,7 @@ def test_output_into_a_read_only_folder_fails_in_one_line(folder, cli, name):
     # Not even root can write in /proc.
     locked = folder / 'locked' if os.geteuid() else Path('/proc')
     locked.mkdir(mode=0o500, exist_ok=True)
-    before, _ = COMMANDS[name]
-    finished = cli(*before, locked / name, code=1, cwd=folder)
+    finished = cli(*COMMANDS[name], locked / name, code=1, cwd=folder)
     (line,) = finished.stderr.strip().splitlines()[-1:]
     assert line.startswith(f'thermo_comp: error: {locked / name}: ')
 
@@ -132,70 +123,28 @@ def run(script, *arguments, cwd):
     return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, check=False)
 
 
-@pytest.mark.parametrize(
-    ('name', 'point'),
-    [
-        pytest.param('unit.yaml', 'before', marks=pytest.mark.slow),
-        pytest.param('page.html', 'before', marks=pytest.mark.slow),
-        *(('bag.mcap', 'before'), ('bag.mcap', 'writing')),
-    ],
-)
-def test_a_killed_command_leaves_the_old_file(folder, name, point):
-    output = folder / name
-    if not output.exists():
-        output.write_bytes(b'<!doctype html>old' if name == 'page.html' else b'\x89MCAP old')
-    old = output.read_bytes()
+@pytest.mark.parametrize('point', ['before', 'writing'])
+def test_a_killed_command_leaves_the_old_file(folder, point):
+    output = folder / 'bag.mcap'
+    output.write_bytes(b'\x89MCAP old')
     listed = set(folder.iterdir())
-    arguments = [str(word) for word in COMMANDS[name][0]]
-    killed = run(KILLED, point, name, *arguments, name, cwd=folder)
+    arguments = [str(word) for word in COMMANDS['bag.mcap']]
+    killed = run(KILLED, point, output.name, *arguments, output.name, cwd=folder)
     assert killed.returncode == -signal.SIGKILL, killed.stderr
-    assert output.read_bytes() == old
+    assert output.read_bytes() == b'\x89MCAP old'
     (rest,) = set(folder.iterdir()) - listed
-    # A killed command leaves a file with a hidden name.
     assert rest.name.startswith('.')
     if point == 'before':
-        # Before the rename the hidden file is complete.
-        if name == 'unit.yaml':
-            assert load_calibration(rest).unit.serial
-        elif name == 'bag.mcap':
-            assert len(read_recording(rest, require=()).columns) == 0
-            assert read_recording(rest, require=()).info.truncated is None
-        else:
-            assert rest.read_bytes().rstrip().endswith(b'</html>')
+        assert len(read_recording(rest, require=()).columns) == 0
+        assert read_recording(rest, require=()).info.truncated is None
 
 
 @pytest.mark.parametrize('name', ['bag.mcap', 'rows.csv'])
 def test_a_command_ended_by_sigterm_leaves_no_file(folder, name):
     # WHY: a command that was ended by SIGTERM left a hidden file as large as the bag.
     listed = set(folder.iterdir())
-    arguments = [str(word) for word in COMMANDS['bag.mcap'][0]]
+    arguments = [str(word) for word in COMMANDS['bag.mcap']]
     script = KILLED.replace('SIGKILL', 'SIGTERM')
     ended = run(script, 'writing', name, *arguments, name, cwd=folder)
     assert (ended.returncode, ended.stderr) == (143, b'')
     assert set(folder.iterdir()) == listed
-
-
-def rewritten(torn, whole):
-    columns = read_recording(torn).columns
-    with BagWriter(whole) as bag:
-        bag.write_temperature('temperature/board', *columns.temperatures['board'][:2])
-        bag.write_temperature('temperature/case', *columns.temperatures['case'][:2])
-        bag.write_counts('accel/counts', columns.accel_stamp_ns, columns.accel, columns.frame_id)
-
-
-def test_a_fit_uses_the_readable_part_of_torn_bags_and_reports_it(folder, cli):
-    torn, whole = folder / 'torn.mcap', folder / 'whole.mcap'
-    content = (folder / FIT[0]).read_bytes()
-    torn.write_bytes(content[: len(content) // 2])
-    rewritten(torn, whole)
-    results = []
-    for bag, code in ((torn, 1), (whole, 0)):
-        output = folder / f'{bag.stem}.yaml'
-        finished = cli('fit', bag, FIT[1], *GRAVITY, '-o', output, code=code, cwd=folder)
-        results.append((finished.stderr, load_calibration(output)))
-    (text, from_torn), (nothing, from_whole) = results
-    assert f'torn.mcap: the file is cut off at byte {len(content) // 2}: ' in text
-    assert 'torn.mcap' not in nothing
-    assert 'Traceback' not in text
-    for name in ('axes', 'misalignment', 'static', 'dynamic'):
-        assert getattr(from_torn, name) == getattr(from_whole, name)

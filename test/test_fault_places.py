@@ -1,12 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The published covariance covers faults at any time of a ramp (tested without DDS).
-
-WHY: the covariance covered faults in the middle of a ramp, but not faults at its start, and no
-faults during which the temperature of the sensor changed.
-Every published sample must have an error below five claimed standard deviations.
-"""
+"""The published covariance covers faults at any time of a ramp (tested without DDS)."""
 
 import math
 import re

@@ -102,10 +102,6 @@ def unreadable(path):
         path.symlink_to('/proc/self/mem')
 
 
-def huge(path):
-    os.truncate(path, 1 << 30)
-
-
 def aliases(path):
     lines = ['a0: &a0 [x, x, x, x, x, x, x, x, x]']
     lines += [f'a{k}: &a{k} [{", ".join([f"*a{k - 1}"] * 9)}]' for k in range(1, 30)]
@@ -125,8 +121,9 @@ def fifo(path):
 DAMAGES = {
     replaced: "unit.serial: must be 'F-1'", truncated: 'the file is cut',
     cut_between_keys: 'the file is cut', unreadable: 'cannot be read: ',
-    huge: f'at most {SIZE_LIMIT} are accepted', aliases: 'YAML aliases are not accepted',
-    directory: 'cannot be read: ', fifo: 'cannot be read: not a regular file',
+    lambda path: os.truncate(path, 1 << 30): f'at most {SIZE_LIMIT} are accepted',
+    aliases: 'YAML aliases are not accepted', directory: 'cannot be read: ',
+    fifo: 'cannot be read: not a regular file',
     Path.unlink: 'cannot be read: No such file or directory',
 }  # fmt: skip
 
@@ -176,7 +173,6 @@ def test_many_reloads_at_1_khz_lose_no_sample(tmp_path):
         asked = [ask() for _ in range(20)]
         begin, n, n_samples = time.monotonic(), 0, 0
         while len(answers) < n_reloads and n < len(events):
-            # Samples are sent in real time, as a driver does.
             while n < len(events) and seconds_of(events[n][1]) < time.monotonic() - begin:
                 n_samples += node.send([events[n]])
                 n += 1
@@ -185,7 +181,6 @@ def test_many_reloads_at_1_khz_lose_no_sample(tmp_path):
             asked = [future for future in asked if future not in answered]
             asked += [ask() for _ in answered]
             if n < len(events):
-                # Wait until the next sample is due, or an answer arrives.
                 news.wait(max(0.0, begin + seconds_of(events[n][1]) - time.monotonic()))
                 news.clear()
         node.settle()

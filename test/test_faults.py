@@ -1,10 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-For each row of the fault table the output of compensator and diagnostics is compared with the
-truth. Rows that depend on the order of arrival of messages are also sent over DDS to a node
-process, whose output must equal the output without DDS.
-"""
+"""The output for each row of the fault table agrees with the truth, also some rows over DDS."""
 
 from copy import deepcopy
 from dataclasses import asdict, fields
@@ -121,7 +117,6 @@ def test_fault_row_without_dds(row, reference):
         assert not ((begin <= seconds) & (seconds < end)).any(), (begin, end)
     for level, text in row.says:
         assert heard.says(text, level), (level, text, sorted(set(heard.reports)))
-    # Forces must be finite and covariances positive definite also in the span `blind`.
     assert np.isfinite(heard.force).all()
     if len(seconds):
         assert np.linalg.eigvalsh(heard.covariance).min() > 0.0

@@ -48,13 +48,9 @@ def left_by(pair, **options):
 @pytest.mark.slow
 def test_two_positions_determine_the_thermal_response():
     # Noise of 9 ug/sqrt(Hz) is 1.2 ug in means over 60 s; 128 means determine this sd to 6 %, and
-    # superfluous columns of a fit may increase it by 10 %. Over all 36 pairs of the nine sample
-    # bags the sd of 60 s means in a third position has a median of 1.3 ug.
+    # superfluous columns of a fit may increase it by 10 %.
     assert left_by((1, 2)) == pytest.approx([1.2] * 3, rel=0.3)
-
-
-@pytest.mark.slow
-def test_a_model_without_lags_leaves_a_drift_in_a_third_position():
+    # A model without lags leaves a drift in the third position.
     assert (left_by((1, 2), model='golovach') > 10.0).all()
 
 
@@ -72,23 +68,8 @@ def one_position():
     return fit([rest.source()], OPTIONS)
 
 
-def test_a_full_scale_that_the_bags_do_not_show_is_named(one_position):
-    # WHY: the node dropped all samples above 2 g of a sensor of 16 g, and no command had said so.
-    text = findings_of(one_position)['full-scale']
-    assert text.startswith('samples of 19.613 m/s^2 (2 times gravity) or more')
-    reduced = [reduce_bag(Rest(np.random.default_rng(1)).source(), OPTIONS)]
-    stated = replace(OPTIONS, full_scale=156.9)
-    assert not any(f.name == 'full-scale' for f in judge_bags(reduced, stated))
-    wide = one_position.calibration
-    wide = replace(wide, unit=replace(wide.unit, full_scale=156.9))
-    assert full_scale_of(reduced, replace(OPTIONS, prior=wide)) == 156.9
-
-
 def turned(rng, ups, rest_s=20.0):
-    """
-    Record a triad with bias (0.1, -0.2, 0.3) m/s^2: a rest in each attitude of `ups`, followed by
-    1 s of motion.
-    """
+    """Record a triad with bias (0.1, -0.2, 0.3) m/s^2; after each rest it moves for 1 s."""
     n = round(100 * rest_s)
     parts = []
     for up in ups:
@@ -122,15 +103,12 @@ def findings_of(result):
     return {finding.name: finding.message for finding in result.findings}
 
 
-def test_one_position_gives_bias_over_temperature_on_three_axes(one_position):
+def test_one_position_gives_bias_over_temperature_and_leaves_the_scale_at_its_prior(one_position):
     at = np.array([-3.0, 12.0])
     for axis, slope in zip(one_position.calibration.static.axes(), SLOPE, strict=True):
         fitted = np.diff(axis.bias_function.value(at))[0] / 15.0 / MG
         # 15000 samples (noise 3 mg) over 19 K determine a slope to 0.01 mg/K.
         assert fitted == pytest.approx(slope, abs=0.2)
-
-
-def test_one_position_leaves_the_scale_at_its_prior(one_position):
     calibration = one_position.calibration
     for axis in calibration.static.axes():
         # The scale's slope has the prior mean 0 and the prior sd 67 ppm/K, a third of 200 ppm/K.
@@ -143,9 +121,20 @@ def test_one_position_leaves_the_scale_at_its_prior(one_position):
     assert 'keep their prior' in findings_of(one_position)['positions']
 
 
+def test_a_full_scale_that_the_bags_do_not_show_is_named(one_position):
+    # WHY: the node dropped all samples above 2 g of a sensor of 16 g, and no command had said so.
+    text = findings_of(one_position)['full-scale']
+    assert text.startswith('samples of 19.613 m/s^2 (2 times gravity) or more')
+    reduced = [reduce_bag(Rest(np.random.default_rng(1)).source(), OPTIONS)]
+    stated = replace(OPTIONS, full_scale=156.9)
+    assert not any(f.name == 'full-scale' for f in judge_bags(reduced, stated))
+    wide = one_position.calibration
+    wide = replace(wide, unit=replace(wide.unit, full_scale=156.9))
+    assert full_scale_of(reduced, replace(OPTIONS, prior=wide)) == 156.9
+
+
 def test_after_soaks_in_one_position_the_drift_error_is_within_three_claimed_sd(rng):
-    # WHY: |f| in one attitude does not separate bias and scale. The fit attributed the drift of
-    # |f| to the scale, and stated a wrong bias slope of two axes with an sd of 0.
+    # WHY: |f| in one attitude does not separate bias and scale: a wrong bias slope had an sd of 0.
     slope = 0.1 * SLOPE
     bags = []
     for celsius in (5.0, 20.0, 35.0):
@@ -158,8 +147,7 @@ def test_after_soaks_in_one_position_the_drift_error_is_within_three_claimed_sd(
 
 @pytest.mark.slow
 def test_rests_at_three_temperatures_give_the_bias_slope_despite_a_warm_up_of_the_board(rng):
-    # WHY: as the bias did not change while the board warmed up, the fit found a bias slope of 0,
-    # and attributed differences of |f| between rests to mounting offsets.
+    # WHY: as the bias did not change while the board warmed up, the fit found a bias slope of 0.
     bags = []
     for celsius in (5.0, 20.0, 35.0):
         for up in positions(8, 3):
@@ -170,12 +158,10 @@ def test_rests_at_three_temperatures_give_the_bias_slope_despite_a_warm_up_of_th
     calibration, at = result.calibration, np.array([6.0, 36.0])
     curves = [axis.bias_function for axis in calibration.static.axes()]
     slopes = np.array([np.diff(curve.value(at))[0] / 30.0 for curve in curves])
-    # The mean |f| of a rest has a noise of 1 ug. As the board warms up by 1 K, the temperature of
-    # the sensor in a rest is uncertain by 0.1 K.
+    # |f| of a rest has a noise of 1 ug; its temperature is uncertain by 0.1 K due to the warm-up.
     np.testing.assert_allclose(slopes, 0.1 * MG * SLOPE, atol=0.002 * MG)
     assert 'misfit' not in findings_of(result)
-    # Soaks do not determine the weights of lags, which can be as large as the bias slope: the
-    # root of the sum of their claimed variances is 0.5 to 1 bias slope.
+    # Soaks do not determine weights of lags: the root of their summed variances is 0.5 to 1 slope.
     variance, layout = np.diag(calibration.posterior.covariance()), parameter_layout(calibration)
     of_lags = [variance[block.response : block.end].sum() for block in layout.bias]
     assert 0.5 < np.sqrt(np.mean(of_lags) / np.mean(slopes**2)) < 1.0
@@ -183,8 +169,7 @@ def test_rests_at_three_temperatures_give_the_bias_slope_despite_a_warm_up_of_th
 
 @pytest.mark.slow
 def test_the_drift_error_of_a_sensor_that_follows_half_of_a_warm_up_is_within_three_claimed_sd():
-    # WHY: a curve fitted to the drifts within rests was wrong by 7 claimed sd over the range of
-    # temperatures. With seed 2 the error of the drift exceeds its claimed sd.
+    # WHY: a curve fitted to the drifts within rests was wrong by 7 claimed sd over the range.
     rng, slopes, bags = np.random.default_rng(2), 0.1 * MG * SLOPE, []
     for celsius in (5.0, 20.0, 35.0):
         for up in positions(6, 3):
@@ -199,8 +184,7 @@ def test_the_drift_error_of_a_sensor_that_follows_half_of_a_warm_up_is_within_th
 
 
 def test_tilts_of_two_supports_are_not_taken_for_a_scale_slope_of_a_level_axis(rng):
-    # WHY: without tilts in the model, a support tilt of 4 urad/K was fitted as a slope of 137
-    # ppm/K of the scale factor of an axis with a force of 0.03 g.
+    # WHY: a support tilt of 4 urad/K was fitted as a slope of 137 ppm/K of the scale factor.
     bags = []
     for up, tilt in (((1.0, 0.0, 0.03), 4e-6), ((0.0, 1.0, -0.03), -4e-6)):
         rest = Rest(rng, level=tuple(GRAVITY * np.array(up)), sd=0.1 * MG)
@@ -211,8 +195,7 @@ def test_tilts_of_two_supports_are_not_taken_for_a_scale_slope_of_a_level_axis(r
     at = np.array([0.0, 10.0])
     # 15000 samples (noise 0.1 mg) determine the mean bias slope of the two rests to 1 ug/K.
     assert np.diff(z.bias_function.value(at))[0] == pytest.approx(MG, abs=0.01 * MG)
-    # At 0.03 g a drift error of 1 ug/K is a scale slope of 33 ppm/K; the errors of two rests give
-    # sqrt(2) * 33 = 47 ppm/K. Limit of the scale's change over 10 K: 10 K * 47 ppm/K.
+    # At 0.03 g 1 ug/K is a scale slope of 33 ppm/K; two rests give sqrt(2) * 33 = 47 ppm/K.
     assert abs(np.diff(z.scale_function.value(at))[0]) < 10.0 * 47e-6
 
 
@@ -282,8 +265,7 @@ def test_the_bias_sd_of_one_recording_contains_the_sd_of_a_turn_on(rng):
 
 @pytest.mark.slow
 def test_the_claimed_variance_of_a_curve_contains_that_of_turn_ons_at_each_temperature(rng):
-    # WHY: turn-on offsets at three temperatures were taken for errors of the mean bias, not of the
-    # curve: the claimed variance was only 1.6 to 1.9 times the variance of a turn-on.
+    # WHY: turn-ons at three temperatures counted as errors of the mean bias, not of the curve.
     turn_on, ups, dwell = 5e-3, positions(9, 3), 600
     bags = []
     for celsius in (-15.0, 20.0, 55.0):
@@ -296,9 +278,8 @@ def test_the_claimed_variance_of_a_curve_contains_that_of_turn_ons_at_each_tempe
     unit = tc.fit(bags, gravity=GRAVITY, input='m/s^2', mounting_sd=turn_on)
     for bag in (bags[0], bags[2]):
         out = unit.correct(bag.time_s, bag.counts, board=bag.temperatures['board'])
-        # If turn-ons have a variance of V, a line fitted to three equidistant temperatures has a
-        # variance of 5/6 V at its ends, a parabola V; the next turn-on adds V. Nine mountings of
-        # variance V add V/3 by the error of the bias, and V/3 by the error of the scale.
+        # For turn-ons of variance V a line fitted to three temperatures has 5/6 V at its ends, a
+        # parabola V; the next turn-on adds V, nine mountings V/3 for bias and V/3 for scale.
         variance = np.diagonal(out.covariance[-dwell:].mean(axis=0)) - 1e-3**2
         assert ((1.0 + 5.0 / 6.0) * turn_on**2 < variance).all()
         assert (variance < (1.0 + 1.0 + 2.0 / 3.0) * turn_on**2).all()
@@ -337,7 +318,7 @@ def test_two_bags_without_a_pause_between_them_count_as_one_turn_on(rng):
     assert sd_cut == pytest.approx(sd, rel=0.1)
 
 
-def test_a_calibration_has_the_date_of_its_test(rng):
+def test_stamps_give_the_date_and_samples_after_a_clock_that_was_set_back_are_counted(rng):
     # WHY: a calibration fitted to old bags had the date of the fit, so no ageing was assumed.
     source = turned(rng, positions(9, 3))
     provenance = tumbled(9).calibration.provenance
@@ -347,6 +328,15 @@ def test_a_calibration_has_the_date_of_its_test(rng):
     blocks = [replace(b, accel_stamp_ns=b.accel_stamp_ns - START_NS) for b in source.blocks()]
     undated = fit([replace(source, blocks=lambda: blocks)], OPTIONS).calibration.provenance
     assert (undated.tested, undated.date) == ('', undated.created)
+    source = turned(rng, positions(12, 3))
+    assert 'dropped' not in findings_of(tumbled(12))
+    (block,) = source.blocks()
+    stamps = block.accel_stamp_ns
+    n = len(stamps)
+    stamps[n // 2 :] -= stamps[n // 4] - stamps[0]
+    blocks = (replace(block, accel_stamp_ns=stamps),)
+    back = fit([replace(source, blocks=lambda: iter(blocks))], OPTIONS)
+    assert f'({n // 4}, 25 % of all)' in findings_of(back)['dropped']
 
 
 def test_the_sd_of_turn_ons_in_a_prior_is_used_for_six_positions(rng):
@@ -374,22 +364,19 @@ def test_an_update_by_three_positions_has_errors_near_the_claimed_sd(rng):
         ups = positions(3, 10 + seed) * scale + bias / GRAVITY
         few = replace(OPTIONS, serial='1', prior=known, allow=('prior',))
         aged = fit([turned(rng, ups)], few).calibration
-        # All recordings are without a thermometer, so the correction must not need a temperature.
         assert not aged.needs_temperature
         reading = GRAVITY * corners * scale + bias + (0.1, -0.2, 0.3)
         out = aged.correct(np.arange(1.0, len(reading) + 1.0), reading)
         variance = np.diagonal(out.covariance, axis1=1, axis2=2) - 0.02**2
         ratios.append((out.specific_force - GRAVITY * corners) ** 2 / variance)
-    # The scales and biases of the unit have six random changes: the mean square of six normal
-    # numbers is uncertain by 60 %.
+    # The mean square of six random changes of scales and biases is uncertain by 60 %.
     assert np.mean(ratios) < 3.0
 
 
 @pytest.mark.parametrize('size', [1, 6])
 def test_turn_ons_between_six_faces_are_not_taken_for_a_misalignment(rng, size):
     # WHY: with a turn-on (sd 1 mg) in each of six faces the fit found misalignments of 20 mrad.
-    # With three turn-ons of six faces each the fit assumed 18 independent offsets, so the claimed
-    # sd of the misalignments was 5 to 12 mrad.
+    # For three turn-ons it assumed 18 offsets, so the claimed sd of M was 5 to 12 mrad.
     M = np.array([[1.0, 0.0, 0.0], [2e-3, 1.0, 0.0], [-2e-3, 1e-3, 1.0]])
     sensed = np.linalg.inv(M)
     ups = np.tile(FACES, (3, 1)) + 0.03 * rng.standard_normal((18, 3))
@@ -424,8 +411,7 @@ def test_the_claimed_sd_from_six_faces_contains_the_cross_axis_sensitivity_of_a_
 
 
 def test_left_out_norms_of_faces_laid_by_hand_show_a_misalignment_of_20_mrad():
-    # WHY: with the sd of M reduced to 2.5 mrad the fit estimated one element as 10 mrad, and in
-    # other bags the error in other attitudes was 2 to 6 times as large.
+    # WHY: with an sd of M of 2.5 mrad the fit estimated one element of 20 mrad as 10 mrad.
     rng = np.random.default_rng(2)
     up = np.tile(FACES, (2, 1)) + np.radians(2.0) * rng.standard_normal((12, 3))
     up /= np.linalg.norm(up, axis=1)[:, np.newaxis]
@@ -447,27 +433,11 @@ def test_six_attitudes_that_hardly_determine_the_scale_factors_give_scale_factor
     np.testing.assert_allclose([axis.bias for axis in axes], (0.1, -0.2, 0.3), atol=0.5)
 
 
-def test_samples_after_a_clock_that_was_set_back_are_counted(rng):
-    source = turned(rng, positions(12, 3))
-    assert 'dropped' not in findings_of(tumbled(12))
-    (block,) = source.blocks()
-    stamps = block.accel_stamp_ns
-    # In the middle of the recording the clock is set back by a quarter of the recording's length.
-    n = len(stamps)
-    stamps[n // 2 :] -= stamps[n // 4] - stamps[0]
-    blocks = (replace(block, accel_stamp_ns=stamps),)
-    back = fit([replace(source, blocks=lambda: iter(blocks))], OPTIONS)
-    assert f'({n // 4}, 25 % of all)' in findings_of(back)['dropped']
-
-
-def test_rests_of_5_s_determine_the_white_noise(rng):
+def test_rests_of_5_s_determine_the_white_noise_which_is_never_0(rng):
     # WHY: with rests of one window of 5 s no residual was left, and the noise was estimated as 0.
     calibration = fit([turned(rng, positions(12, 3), rest_s=5.0)], OPTIONS).calibration
     # A noise of 0.02 m/s^2 per sample at 100 Hz has a density of 0.002 m/s^2/sqrt(Hz).
     np.testing.assert_allclose(calibration.noise_density_m_s2_sqrt_hz, 0.002, rtol=0.3)
-
-
-def test_a_fit_with_readings_that_never_change_has_a_positive_noise(rng):
     rest = Rest(rng)
     rest.accel[:] = GRAVITY * UP
     noise = fit([rest.source()], OPTIONS).calibration.noise_density_m_s2_sqrt_hz

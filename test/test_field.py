@@ -2,18 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Calibrations updated by rests agree with true parameters, a Kalman filter, closed forms."""
 
-import sys
 from dataclasses import replace
 
+import field_units
 import numpy as np
 import pytest
 from builders import rich_calibration
 from conftest import ROOT, parsed
 from field_helpers import in_any_attitude, jump_of, known, no_error, rests, upright, write_log
-
-sys.path.insert(0, str(ROOT / 'benchmarks'))
-
-import field_units
 
 from thermo_comp.errors import FitError
 from thermo_comp.field.ageing import Ageing, Model, learn, rows_of, solve
@@ -39,8 +35,7 @@ def test_derivatives_of_a_rest_by_all_parameters_agree_with_finite_differences()
     layout = parameter_layout(unit)
     levels = {level for block in layout.scale for level in (block.static, block.dynamic)}
     levels |= {block.static for block in layout.bias}
-    # Test the derivatives by every second parameter. A bias or a scale has an odd number of
-    # parameters, so each kind of parameter is tested either in the bias or in the scale.
+    # Every second parameter: each kind of parameter is tested either in the bias or in the scale.
     for k in range(0, layout.n_parameters, 2):
         step = 1e-7
         moved = values.copy()
@@ -141,7 +136,6 @@ def test_an_update_does_not_change_the_constants_of_axes_that_no_rest_observes()
     # In one attitude a shock of the bias and a change of gravity cause equal changes of |f| - g.
     assert [change.may_be_gravity for change in updated.changes] == [True]
     assert 'or gravity changed' in ' '.join(change_texts(updated))
-    # The jump of the z reading is 300 ug; turn-on offsets (sd 20 ug) leave an error below 15 ug.
     assert updated.axis_changes[2].reading == pytest.approx(300.0 * MICRO_G, abs=15.0 * MICRO_G)
     layout = parameter_layout(unit)
     old, aged = (np.diag(each.posterior.covariance()) for each in (unit, new))
@@ -173,8 +167,7 @@ def test_the_sd_of_an_old_calibration_aged_to_the_last_rest_includes_the_random_
     residual = unit.static.x.residual_sd_m_s2
     assert x.claimed_sd == pytest.approx(np.hypot(10.0 * MICRO_G, residual), rel=0.01)
     assert z.claimed_sd == pytest.approx(np.hypot(np.sqrt(200.0) * MICRO_G, residual), rel=0.01)
-    # Rests in one attitude do not separate bias and scale: the ageing model attributes between
-    # half and all of the variance of the random walk to the biases of x and y.
+    # Between half and all of the variance is attributed to the biases of x and y.
     for axis in (x, y):
         assert 0.5 < axis.present_sd / (329.0 * MICRO_G) < 1.5
     # At the last rest the force sd of z must equal |random walk of z| within two turn-on sd.
@@ -206,7 +199,6 @@ def test_a_change_of_gravity_is_not_taken_for_a_change_of_three_scales(day):
     (text,) = (line for line in change_texts(result) if 'as if gravity' in line)
     assert text.startswith('from 2026-')
     assert 'as if gravity differed from the stated 9.80665 m/s^2: no scale was changed' in text
-    # If gravity is stated as certain, the update explains the step of |f| by three scale changes.
     certain = update(series_of(stepped(history, size, day), unit), unit, is_gravity_certain=True)
     assert certain.solution.gravity == ()
     assert all(axis.scale > 150e-6 for axis in certain.axis_changes)
@@ -227,8 +219,7 @@ def test_ageing_is_not_taken_for_a_change_of_gravity_or_of_the_unit(kind):
 
 @pytest.mark.parametrize('first', [0, 10])
 def test_samples_of_another_unit_are_refused(first):
-    # All rests, or those after half of the days, are from a second unit, whose scales differ by 1
-    # to 2 % and whose biases differ by 0.3 to 1.4 mg.
+    # The second unit has other scales by 1 to 2 % and other biases by 0.3 to 1.4 mg.
     unit = field_units.calibration()
     history = field_units.live('carried', 3, 20, field_units.Process())
     mixed = [
@@ -241,18 +232,14 @@ def test_samples_of_another_unit_are_refused(first):
         refuse_another_unit(result)
 
 
-def known_with_curves():
-    unit = field_units.calibration()
-    return known(static=unit.static, dynamic=unit.dynamic)
-
-
 def on_z(rest, counts):
     return replace(rest, mean=(*rest.mean[:2], rest.mean[2] + counts))
 
 
-def test_a_changed_curve_is_detected_and_corrected():
+def test_a_changed_curve_is_corrected_and_the_sd_of_an_unobserved_slope_grows():
     # The slope of the z bias changes by 5 ug/K; the rests are at 15 to 25 degC.
-    unit = known_with_curves()
+    curved = field_units.calibration()
+    unit = known(static=curved.static, dynamic=curved.dynamic)
     logged = rests(unit, upright, no_error, days=30)
     bent = [(s, on_z(r, 300.0 * 5 * MICRO_G * (r.state[0] - 20.0))) for s, r in logged]
     result = update(series_of(bent, unit), unit)
@@ -260,11 +247,7 @@ def test_a_changed_curve_is_detected_and_corrected():
     both = (unit, result.calibration)
     before, after = (each.static.z.bias_function.coefficients[1] / 300.0 for each in both)
     assert after - before == pytest.approx(5.0 * MICRO_G, abs=1.5 * MICRO_G)
-
-
-def test_the_sd_of_a_bias_slope_that_no_rest_observes_grows_by_1_ug_per_k_and_root_year():
     # Upright rests do not observe x: the sd of its bias slope grows by 1 ug/K per root year.
-    unit = known_with_curves()
     series = series_of(rests(unit, upright, no_error), unit)
     result, n = update(series, unit), len(series) // 10
     span = np.sort(series.temperature)[[n, -1 - n]]
@@ -273,7 +256,7 @@ def test_the_sd_of_a_bias_slope_that_no_rest_observes_grows_by_1_ug_per_k_and_ro
     assert 0.0 < result.axis_changes[2].curve_sd < expected
 
 
-def test_a_turn_on_that_contradicts_all_other_turn_ons_is_left_out():
+def test_a_contradicting_turn_on_is_left_out_and_stamps_may_be_in_wrong_order(rng):
     unit = known()
     logged = rests(unit, upright, jump_of(100.0, 8.0), days=15)
     wrong = logged[80][0]
@@ -281,32 +264,6 @@ def test_a_turn_on_that_contradicts_all_other_turn_ons_is_left_out():
     result = update(series_of(bad, unit), unit)
     assert result.n_outliers == 1
     assert result.axis_changes[2].reading == pytest.approx(100.0 * MICRO_G, abs=20.0 * MICRO_G)
-
-
-def test_a_wrong_clock_at_the_start_of_the_node_does_not_change_the_update(tmp_path, rng):
-    # A computer without a battery clock starts with the date of its disk image; sample stamps are
-    # right. Start times of no start, of all starts, or of the last start are wrong.
-    unit = known()
-    logged = rests(unit, upright, jump_of(300.0, 10.0))
-    image = {start.start_ns: int(1.6e18 + 5e8 * rng.standard_normal()) for start, _ in logged}
-    last = logged[-1][0].start_ns
-    expected = None
-    for number, wrong in enumerate(({}, image, {last: 30 * 10**9})):
-        begins = [wrong.get(s.start_ns, s.start_ns) for s, _ in logged]
-        of_image = [
-            (replace(s, start_ns=at), r) for at, (s, r) in zip(begins, logged, strict=True)
-        ]
-        read, source, _ = read_rests([write_log(tmp_path / str(number), of_image)], unit)
-        assert source.name.startswith('rests until 2030-01-20T23:12:40')
-        updated = update(series_of(read, unit), unit)
-        expected = expected or updated
-        assert updated.calibration == expected.calibration
-        assert updated.judged == expected.judged
-
-
-def test_rests_with_stamps_in_wrong_order_give_a_valid_covariance(rng):
-    # Stamps of a third of the turn-ons are wrong by up to 10 days: rests change their order.
-    unit = known()
     logged = rests(unit, upright, no_error)
     wrong = {s.start_ns: int(rng.choice((0, 0, 864e12 * rng.uniform(-1, 1)))) for s, _ in logged}
     moved = [(s, replace(r, stamp_ns=r.stamp_ns + wrong[s.start_ns])) for s, r in logged]
@@ -315,11 +272,22 @@ def test_rests_with_stamps_in_wrong_order_give_a_valid_covariance(rng):
         assert np.linalg.eigvalsh(covariance).min() > -1e-9 * np.trace(covariance)
 
 
-def test_an_update_with_fewer_than_three_turn_ons_is_refused():
+def test_a_wrong_clock_at_the_start_of_the_node_does_not_change_the_update(tmp_path, rng):
+    # Sample stamps are right; start times of no start, of all starts or of the last are wrong.
     unit = known()
-    logged = rests(unit, upright, no_error, days=1)[:8]
-    with pytest.raises(FitError, match='rests of 2 starts of the node, at least 3 are needed'):
-        update(series_of(logged, unit), unit)
+    logged = rests(unit, upright, jump_of(300.0, 10.0))
+    image = {start.start_ns: int(1.6e18 + 5e8 * rng.standard_normal()) for start, _ in logged}
+    last = logged[-1][0].start_ns
+    expected = None
+    for number, wrong in enumerate(({}, image, {last: 30 * 10**9})):
+        begins = [wrong.get(s.start_ns, s.start_ns) for s, _ in logged]
+        of_image = [(replace(s, start_ns=t), r) for t, (s, r) in zip(begins, logged, strict=True)]
+        read, source, _ = read_rests([write_log(tmp_path / str(number), of_image)], unit)
+        assert source.name.startswith('rests until 2030-01-20T23:12:40')
+        updated = update(series_of(read, unit), unit)
+        expected = expected or updated
+        assert updated.calibration == expected.calibration
+        assert updated.judged == expected.judged
 
 
 @pytest.fixture
@@ -341,10 +309,8 @@ def test_the_command_update_writes_a_better_calibration(tmp_path, unit_file, cli
     written = load_calibration(new)
     assert written.provenance.sources[-1].name == 'rests until 2030-01-20T23:12:40, claim aged 1 d'
     assert 'before: 2029-12-31' in written.provenance.notes[-1]
-    # The new calibration file has the date of its last rest, not of the command.
     assert written.provenance.date == '2030-01-20T23:12:40Z'
     assert 'from 0 bags and 1 rest log, ' in cli('info', new).stdout
-    # The log judges the old calibration, which was made without the rests of the log.
     assert parsed(cli('evaluate', log, '-c', unit_file, '--json', code=1).stdout)['left']
     history = cli('report', '-c', unit_file, '-c', new, '-o', tmp_path / 'page.html', '--json')
     assert [change['constant'] for change in parsed(history.stdout)['history']][2] == 'bias z'
@@ -423,8 +389,7 @@ def test_derivatives_of_a_rest_by_initial_lag_states_agree_with_finite_differenc
 
 
 def test_an_unknown_regime_after_a_turn_on_does_not_increase_the_noise_of_a_rest():
-    # The ageing model estimates the scatter of turn-ons, which is the residual sd of a
-    # calibration, so the noise of a rest must not contain the residual sd.
+    # The scatter of turn-ons is estimated, so the noise of a rest must not contain it.
     unit = field_units.calibration()
     logged = field_units.live('level', 1, 3, field_units.Process()).rests
     unknown = [(s, replace(r, state=(*r.state[:4], 1.0, *r.state[5:]))) for s, r in logged]
@@ -453,8 +418,7 @@ def test_unknown_initial_lag_states_are_not_taken_for_scatter_of_rests(rng, lags
     residual += np.sqrt(series.noise + (3.0 * MICRO_G) ** 2) * rng.standard_normal(3 * n)
     ageing, _, used = learn(replace(series, residual=residual), unit, float(series.time[0]))
     assert len(used) == 3 * n
-    # In six simulations the estimated sd scattered by 20 % (walk of the bias), 30 % (walk of the
-    # scale) and 15 % (turn-on).
+    # In six simulations the estimated sd scattered by 20 % (bias), 30 % (scale), 15 % (turn-on).
     assert ageing.bias == pytest.approx(15.0 * MICRO_G, rel=0.5)
     assert ageing.scale == pytest.approx(10.0 * MICRO_G, rel=0.7)
     assert ageing.turn_on == pytest.approx(20.0 * MICRO_G, rel=0.35)
@@ -462,10 +426,13 @@ def test_unknown_initial_lag_states_are_not_taken_for_scatter_of_rests(rng, lags
     assert ageing.lags == pytest.approx(lags, abs=0.25)
 
 
-def test_of_too_many_turn_ons_the_newest_are_used(monkeypatch):
+def test_of_too_many_turn_ons_the_newest_are_used_and_fewer_than_three_are_refused(monkeypatch):
     unit = known()
     series = series_of(rests(unit, upright, no_error), unit)
     everything = rows_of(series, MICRO_G)
     monkeypatch.setattr('thermo_comp.field.ageing._MOST_ROWS', 25)
     newest = rows_of(series, MICRO_G)
     assert set(newest.start) == set(everything.start[-24:])
+    logged = rests(unit, upright, no_error, days=1)[:8]
+    with pytest.raises(FitError, match='rests of 2 starts of the node, at least 3 are needed'):
+        update(series_of(logged, unit), unit)

@@ -136,10 +136,7 @@ def driver_bag(path, store, storage=StoragePlugin.MCAP):
     with Writer(path, version=9, storage_plugin=storage) as bag:
         kinds = {'/imu/data': 'sensor_msgs/msg/Imu', '/case': 'std_msgs/msg/Float64',
                  '/fmu/out/sensor_accel': 'px4_msgs/msg/SensorAccel'}  # fmt: skip
-        links = {
-            topic: bag.add_connection(topic, kind, typestore=store)
-            for topic, kind in kinds.items()
-        }
+        links = {name: bag.add_connection(name, kinds[name], typestore=store) for name in kinds}
 
         def write(topic, log_ns, message):
             bag.write(links[topic], log_ns, store.serialize_cdr(message, kinds[topic]))
@@ -148,7 +145,6 @@ def driver_bag(path, store, storage=StoragePlugin.MCAP):
         level = store.types['geometry_msgs/msg/Quaternion'](0, 0, 0, 1)
         for row in range(50):
             stamp_ns = START_NS + row * 10**7
-            # The recorder's clock is 1000 s ahead of the driver's clock.
             log_ns = stamp_ns + 10**12
             if row % 5 == 0:
                 accel = store.types['px4_msgs/msg/SensorAccel']
@@ -178,7 +174,7 @@ def test_a_bag_with_a_message_type_of_the_driver_is_read(tmp_path, store, storag
     assert case.stamp_ns.tolist() == [START_NS + row * 10**7 for row in range(0, 50, 5)]
 
 
-def test_two_fields_of_one_message_are_two_inputs(tmp_path, store):
+def test_two_fields_of_a_message_are_two_inputs_and_info_names_further_fields(tmp_path, store):
     driver_bag(tmp_path / 'bag', store)
     topic = '/fmu/out/sensor_accel'
     names = {'board': f'{topic}:temperature', 'case': f'{topic}:z'}
@@ -193,10 +189,6 @@ def test_two_fields_of_one_message_are_two_inputs(tmp_path, store):
         open_recording(tmp_path / 'bag', Topics.named({'board': f'{topic}:temp'}), require=())
     with pytest.raises(ValueError, match='`imu` takes whole messages'):
         Topics.named({'imu': '/imu/data:linear_acceleration'})
-
-
-def test_info_names_topics_that_could_be_a_second_thermometer(tmp_path, store):
-    driver_bag(tmp_path / 'bag', store)
     topics = Topics.named({'board': '/case'})
     findings = survey_recording(tmp_path / 'bag', topics).findings
     message = next(text for text in findings if 'no case' in text)

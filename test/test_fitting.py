@@ -1,16 +1,20 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fits to simulated units agree with the true parameters."""
+"""Fits to simulated units agree with the true parameters, also for effects even in a gradient."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from builders import ArrayBlock, arrays_of, source_of
+from scipy.signal import lfilter
 from triads import triad
 
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, fit
+from thermo_comp.fitting.reduction import reduce_source
+from thermo_comp.fitting.sensors import gradients_at_rest
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.simulation.campaign import Position, parse_cyclogram, plan, positions
@@ -111,10 +115,8 @@ def test_the_paper_s_model_fits_a_unit_of_the_paper_s_physics(golovach):
         # Golovach's model has a curve per regime; residuals of a single curve are not computed.
         assert not row.one_set.n
         assert row.two_sets.rms < row.raw.rms, row.section
-    # In Golovach's model the bias is linear in the static set, quadratic in the dynamic set.
     assert calibration.static.x.bias_function.n_free == 1
     assert calibration.dynamic.x.bias_function.n_free == 2
-    # The errors of the biases are below the largest residual of Golovach's model.
     left = golovach.residuals[-1].fitted
     bias, scale, M = constants(calibration)
     error = (bias - PAPER.bias_at_reference) / np.array(PAPER.counts_per_micro_g)
@@ -142,7 +144,6 @@ def test_a_fit_has_all_positions_sources_sections_and_groups(response):
 
 
 def test_the_error_of_the_compensator_is_that_stated_by_the_fit(response):
-    # The recording is in an attitude that was not fitted.
     up = np.array([[0.48, -0.6, 0.64]])
     (record,) = records_of(OWN_LAGS, up, 77)
     compensator = Compensator(response.calibration)
@@ -163,8 +164,7 @@ def test_the_error_of_the_compensator_is_that_stated_by_the_fit(response):
 
 
 def test_slow_noise_for_an_unmodelled_drift_leaves_the_white_noise():
-    # WHY: the file stated white noise of 0.3 ug/sqrt(Hz) for a unit with 5 ug/sqrt(Hz), so that no
-    # window of the node's check of |f| counted as still.
+    # WHY: the file stated a noise of 0.3, not 5 ug/sqrt(Hz), so no window counted as still.
     paper = fitted(OWN_LAGS, positions(2, 1), 1, model='golovach')
     stated = np.array(paper.calibration.noise_density_m_s2_sqrt_hz) / MICRO_G
     np.testing.assert_allclose(stated, 5.0, rtol=0.4)
@@ -186,24 +186,29 @@ def test_six_faces_leave_misalignment_at_its_prior():
 
 
 def test_the_claimed_sd_of_nine_positions_includes_turn_on_offsets(rng):
-    # WHY: nine constants fit nine |f| exactly, whatever the offsets, and the claimed sd of the
-    # constants was too small by a factor of 3 to 5.
+    # WHY: nine constants fit nine |f| exactly: the claimed sd was too small by a factor of 3 to 5.
     turn_ons = PLAIN.scale_factor * rng.normal(0.0, 50e-6 * STANDARD_GRAVITY, (9, 3))
     records = records_of(PLAIN, positions(9, 1), 1)
     pairs = zip(records, turn_ons, strict=True)
     switched_on = [replace(record, counts=record.counts + by) for record, by in pairs]
     options = FitOptions(gravity=STANDARD_GRAVITY, groups=('curve', 'set'))
     found = fit(sources_of(switched_on), options)
-    # For a unit with the noise of PLAIN the prior sd of turn-ons is some 50 ug. The RMS of nine
-    # standard normal errors exceeds 1.55 with a probability of 1 %.
+    # The prior sd of turn-ons is some 50 ug. Nine normal errors exceed 1.55 RMS with p = 1 %.
     assert np.sqrt(np.mean(pulls(found, PLAIN) ** 2)) < 1.55
 
 
-def test_bags_with_and_bags_without_a_thermometer_in_one_fit_are_refused():
+def test_mixed_bags_and_accelerations_given_as_counts_are_refused(rng):
     records = records_of(PLAIN, FACES, 5)
     sources = sources_of(records[:3]) + sources_of(records[3:], False, 3)
     with pytest.raises(FitError, match='bag3: no board temperature, which the other bags have'):
         fit(sources, FitOptions(gravity=STANDARD_GRAVITY))
+    for scale, text in (
+        (9.81, r'norm 9.81 and are not whole numbers: they look like m/s'),
+        (1.0, 'they look like g, not counts'),
+    ):
+        forces = (scale * (up + 1e-3 * rng.standard_normal((4000, 3))) + 0.01 for up in FACES)
+        with pytest.raises(FitError, match=text):
+            fit(faces_of(forces), FitOptions(gravity=9.81))
 
 
 def short(accel, board, name='bag'):
@@ -224,16 +229,6 @@ def test_bags_without_rests_or_samples_are_refused(rng, n, message):
 def faces_of(samples):
     celsius = np.linspace(10.0, 40.0, 40)
     return [short(accel, celsius, name=f'face{k}') for k, accel in enumerate(samples)]
-
-
-def test_accelerations_given_as_counts_are_refused(rng):
-    for scale, text in (
-        (9.81, r'norm 9.81 and are not whole numbers: they look like m/s'),
-        (1.0, 'they look like g, not counts'),
-    ):
-        forces = (scale * (up + 1e-3 * rng.standard_normal((4000, 3))) + 0.01 for up in FACES)
-        with pytest.raises(FitError, match=text):
-            fit(faces_of(forces), FitOptions(gravity=9.81))
 
 
 @pytest.mark.parametrize('n_averaged', [0, 1, 4000])
@@ -258,7 +253,71 @@ def test_misalignments_of_a_mems_unit_are_determined_by_nine_positions():
     # WHY: mounting offsets of 5 mg fit |f| in nine positions as well as misalignments do.
     unit = unit_preset('mems', 0).with_thermometers(rate_hz=0.25)
     records = arrays(unit, plan('chamber-9'), 0, rate_hz=1.0)
-    # A fit with only the groups of columns that the unit needs takes half the time.
     options = FitOptions(gravity=STANDARD_GRAVITY, groups=('curve', 'set', 'gradient', 'board'))
     calibration = fit(sources_of(records), options).calibration
     np.testing.assert_allclose(calibration.misalignment, unit.M, atol=3e-4)
+
+
+STEP_S, OWN_HEAT_K = 2.0, 0.6
+#: Noise of a sample [m/s^2]; a window of 60 s contains 30 samples.
+NOISE = 4.0 * MICRO_G
+
+
+def lagged(values, tau):
+    share = 1.0 - np.exp(-STEP_S / tau)
+    return lfilter([share], [1.0, share - 1.0], values - values[0]) + values[0]
+
+
+def recorded(rng, up, name, targets):
+    """Simulate a bias that is even in (T_case - T_board) - (this difference in a soak)."""
+    corners = [(0.0, targets[0]), (900.0, targets[0])]
+    for before, after in pairwise(targets):
+        corners += [(corners[-1][0] + 60.0 * abs(after - before), after)]
+        corners += [(corners[-1][0] + 1500.0, after)]
+    time = np.arange(0.0, corners[-1][0], STEP_S)
+    case = lagged(np.interp(time, *zip(*corners, strict=True)), 120.0)
+    board = lagged(case, 500.0)
+    heated = case - board
+    board = board + OWN_HEAT_K
+    t = board - 20.0
+    change = np.sqrt(heated**2 + 0.4**2) - 0.4
+    bias = np.outer(t, (8.0, -5.0, 11.0)) + np.outer(t**2, (0.05, 0.1, -0.08))
+    bias += np.outer(change, (9.0, -12.0, 6.0)) * (1.0 + 0.01 * t[:, None])
+    force = STANDARD_GRAVITY * up * (1.0 + 6e-5 * t[:, None])
+    stamps = 10**18 + np.rint(time * 1e9).astype(np.int64)
+    noise = 0.003 * rng.standard_normal((2, len(time)))
+    board, case = np.round(np.stack((board, case)) + noise, 4)
+    accel = force + bias * MICRO_G + NOISE * rng.standard_normal((len(time), 3))
+    # One reading in 10 s suffices for ramps of 1 K/min.
+    readings = (stamps[::5], board[::5], stamps[::5] + 1, case[::5])
+    return source_of(stamps, accel, *readings, name=name)
+
+
+@pytest.mark.slow
+def test_effects_even_about_the_rest_gradient_are_found(rng):
+    programs = ((20.0, 35.0, 5.0, 20.0), (5.0, 25.0, 12.0), (35.0, 15.0, 30.0))
+    bags = [recorded(rng, up, f'p{k}', programs[k % 3]) for k, up in enumerate(positions(4, 3))]
+    reduced = [reduce_source(bag, full_scale=None) for bag in bags]
+    # Rates computed over 120 s cause most of the error of the gradient; noise adds only 0.1 mK.
+    assert abs(gradients_at_rest(reduced, ('case',))['case'] + OWN_HEAT_K) < 0.005
+    groups = ('curve', 'gradient', 'board', 'gradient_even', 'gradient_even_about_rest')
+    about_rest, about_0 = (
+        fit(bags, FitOptions(gravity=STANDARD_GRAVITY, input='m/s^2', groups=names))
+        for names in (groups, groups[:-1])
+    )
+    kept = {column.group for column in about_rest.calibration.response}
+    assert 'gradient_even_about_rest' in kept
+    assert 'gradient_even' not in kept
+    # The effect is even about T_case - T_board = -0.6 K; functions even about 0 K fit only part.
+    floor = NOISE / np.sqrt(30.0)
+    assert about_rest.residuals[-1].fitted.rms < 1.1 * floor
+    assert about_0.residuals[-1].fitted.rms > 1.5 * floor
+    assert about_0.residuals[-1].left_out.rms > 1.5 * about_rest.residuals[-1].left_out.rms
+
+
+def test_forced_groups_are_fitted_together_with_permitted_groups(rng):
+    bags = [recorded(rng, up, f'p{k}', (20.0, 30.0, 20.0)) for k, up in enumerate(positions(3, 3))]
+    options = FitOptions(
+        gravity=STANDARD_GRAVITY, input='m/s^2', groups=('curve',), forced=('gradient',)
+    )
+    assert {column.group for column in fit(bags, options).calibration.response} == {'gradient'}

@@ -97,8 +97,7 @@ def test_exchanged_thermometers_in_one_bag_of_many_are_reported_with_its_name(go
 
 
 def test_the_noise_of_soaks_is_not_taken_for_a_ramp_or_for_exchanged_sensors(good, rng):
-    # WHY: bags of soaks were refused, because noise of readings gave rates and gradients as in
-    # ramps with exchanged thermometers.
+    # WHY: bags of soaks were refused: noise gave rates and gradients as of exchanged sensors.
     windows, up = good
     noise = rng.standard_normal(len(windows.rate))
     soaks = 5.0 + 15.0 * (windows.data.position % 3)
@@ -107,7 +106,6 @@ def test_the_noise_of_soaks_is_not_taken_for_a_ramp_or_for_exchanged_sensors(goo
     assert 'swapped' not in findings
     assert 'no ramp' in findings['ramps'].message
     assert 'soaks at 3 temperatures' in findings['soaks'].message
-    # A slow change over the whole temperature range is not a soak.
     drift = replace(windows, rate=0.0 * windows.rate)
     assert 'soaks' not in findings_of(drift, up)
 
@@ -126,11 +124,9 @@ def test_rests_at_room_temperature_are_sufficient_with_a_prior_of_the_unit(good)
     warm = replace(desk, temperature=desk.temperature + 20.0)
     advised = findings_of(warm, up, prior=prior)['span']
     assert (advised.level, 'the bags reach 42 to 4' in advised.message) == ('advice', True)
-    # Windows beyond the prior's range are not used, but their temperatures are reported.
     track = Track(0.0, 1.0, np.full((2, 9), 50.0), np.ones(2, dtype=bool))
     advised = findings_of(replace(desk, tracks=(track,)), up, prior=prior)['span']
     assert 'to 50 degC' in advised.message
-    # If the prior is from other units of the type, not from this unit, a chamber test is advised.
     of_type = replace(prior, provenance=replace(prior.provenance, model='population'))
     assert {'span', 'ramps'} <= {*findings_of(desk, up, prior=of_type)}
 
@@ -141,7 +137,6 @@ def test_six_faces_do_not_determine_the_misalignment(good):
     assert not determines_misalignment(faces)
     message = findings_of(windows, faces)['misalignment'].message
     assert 'the misalignment keeps its prior' in message
-    # A second rest on a face that differs by 2 degrees does not count as a new position.
     tilted = faces + 0.03
     tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
     assert len(distinct_directions(np.vstack((faces, tilted)))) == 6
@@ -182,20 +177,16 @@ def judged(raw, fitted, slow, left=None, span=30.0, drift=500.0, noise=0.1, sigm
     return {finding.name: finding for finding in findings}
 
 
-def test_only_a_residual_that_no_initial_lag_state_explains_contradicts_the_prior():
+def test_the_residual_is_reported_and_contradicts_the_prior_if_no_initial_lag_state_explains_it():
+    good = judged(100.0, 1.0, 0.2, 1.5)
+    assert set(good) == {'residual'}
+    assert 'raw, 1.0 ug in sample; error on data left out 1.5 ug' in good['residual'].message
+    assert 'left out' not in judged(100.0, 1.0, 0.2)['residual'].message
     # WHY: rests that began before the unit had settled gave the advice to check the prior.
     prior = calibration()
     assert 'prior' not in judged(10.0, 50.0, 1.0, prior=prior, sigma=10.0)
     findings = judged(10.0, 50.0, 1.0, prior=prior, sigma=40.0)
     assert 'contradict the prior' in findings['prior'].message
-
-
-def test_the_residual_of_the_fit_is_reported():
-    good = judged(100.0, 1.0, 0.2, 1.5)
-    assert set(good) == {'residual'}
-    assert 'raw, 1.0 ug in sample; error on data left out 1.5 ug' in good['residual'].message
-    # Without left-out positions the message has no residual of left-out data.
-    assert 'left out' not in judged(100.0, 1.0, 0.2)['residual'].message
 
 
 @pytest.mark.parametrize(

@@ -22,10 +22,7 @@ from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 
 def ratios_to_sd(seed, effect_sd):
-    """
-    Return error / fit's sd and error / claimed sd of the response weights. The biases change
-    randomly by `effect_sd` from section to section, alike in all positions.
-    """
+    """Return error / fit's sd and error / claimed sd of weights; sections change the biases."""
     truth, rng = fitting_truth.Truth(), np.random.default_rng(seed)
     windows, up = fitting_truth.table_of(truth, 12, rng, n_windows=24)
     effect = effect_sd * rng.standard_normal((N_SECTIONS, 3))
@@ -81,8 +78,7 @@ def ratio(path):
     options = FitOptions(gravity=STANDARD_GRAVITY, input='m/s^2')
     short = {'window_s': 1.0, 'cell_s': 0.2, 'min_rest_s': 1.0, 'fewest_windows': FEWEST_WINDOWS}
     whole = reduce_source(source_of(stamps, accel, name=path.stem), full_scale=None, **short)
-    # The claimed sd of a single recording includes an assumed sd of the bias at turn-on, which a
-    # jackknife does not observe, so each position is fitted as a recording.
+    # A jackknife does not observe the sd of turn-ons, so each position is fitted as a recording.
     result = fit_bags([replace(whole, intervals=[each]) for each in whole.intervals], options)
     posterior = result.fit.posterior
     calibration, data = result.calibration, result.fit.windows.data
@@ -90,9 +86,8 @@ def ratio(path):
     collected = []
     for p in range(data.n_positions):
         kept = np.flatnonzero(data.position != p)
-        rest = Regression(
-            fitting_truth.rows_of(data, kept), STANDARD_GRAVITY, K / posterior.state.kappa
-        )
+        rows = fitting_truth.rows_of(data, kept)
+        rest = Regression(rows, STANDARD_GRAVITY, K / posterior.state.kappa)
         others = np.arange(data.n_positions) != p
         local = {name: getattr(posterior.state, name)[others] for name in ('up', 'offset', 'tilt')}
         state = rest.solve(replace(posterior.state, **local), posterior.prior, n_steps=3).state

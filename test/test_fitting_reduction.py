@@ -53,7 +53,7 @@ def still(rng, seconds, level):
     return np.array(level) + 0.3 * rng.standard_normal((int(seconds * RATE_HZ), 3))
 
 
-def test_the_reduction_does_not_depend_on_how_samples_are_divided_into_blocks(rng):
+def test_the_reduction_does_not_depend_on_blocks_or_on_the_origin_of_time(rng):
     whole = block(np.rint(still(rng, 61.0, (10.0, -3000.0, 50.0))))
     at_once = reduced([whole])
     for n_parts in (2, 7, 50):
@@ -64,6 +64,14 @@ def test_the_reduction_does_not_depend_on_how_samples_are_divided_into_blocks(rn
             np.testing.assert_allclose(a.mean, b.mean, rtol=1e-13, atol=1e-11)
             np.testing.assert_allclose(a.time, b.time, rtol=1e-12)
         np.testing.assert_array_equal(at_once.board.value, other.board.value)
+    samples = still(rng, 30.0, UP)
+    results = []
+    for origin in (0, 1_900_000_000_000_000_000):
+        accumulator = CellAccumulator(0.5, None)
+        accumulator.add(np.arange(3000, dtype=np.int64) * 10_000_000 + origin, samples)
+        results.append(accumulator.cells())
+    np.testing.assert_array_equal(results[0].mean, results[1].mean)
+    np.testing.assert_array_equal(results[0].time, results[1].time)
 
 
 @pytest.mark.parametrize('rest_s', [30, 45])
@@ -93,33 +101,32 @@ def test_the_estimated_interval_between_samples_is_right_to_0_1_percent(rng, cyc
     assert reduced([block], full_scale=None).cycle_s == pytest.approx(cycle_s, rel=1e-3)
 
 
-def test_windows_are_means_of_their_samples(rng):
+def test_windows_are_means_of_their_samples_without_the_bad_samples(rng):
     samples = still(rng, 60.0, UP)
     (interval,) = reduced([block(samples)]).intervals
     assert interval.count.sum() == len(samples)
     assert len(interval.time) == 6
-    # A window of 10 s has 20 averages over 0.5 s (50 samples).
     np.testing.assert_allclose(interval.mean[2], samples[2000:3000].mean(axis=0), atol=1e-10)
     assert interval.time[2] == pytest.approx(24.995, abs=1e-9)
     np.testing.assert_allclose(interval.sample_sd, 0.3, rtol=0.1)
+    accel = still(rng, 30.0, UP)
+    accel[10, 1] = np.nan
+    accel[20, 2] = 32767.0
+    bag = reduced([block(accel)])
+    assert (bag.n_samples, bag.n_dropped, bag.n_saturated) == (3000, 1, 1)
+    assert sum(interval.count.sum() for interval in bag.intervals) == 2998
 
 
-def test_positions_in_one_bag_are_separated(rng):
+def test_positions_in_one_bag_are_separated_but_not_by_vibrations_of_a_compressor(rng):
     turn = np.linspace(UP, (3000.0, 0.0, 0.0), 3 * RATE_HZ)
     turn += 40.0 * rng.standard_normal(turn.shape)
     parts = still(rng, 40.0, UP), turn, still(rng, 30.0, (3000.0, 0.0, 0.0))
     first, second = reduced([block(np.vstack(parts))]).intervals
     np.testing.assert_allclose(first.mean[0], UP, atol=0.1)
     np.testing.assert_allclose(second.mean[-1], (3000.0, 0.0, 0.0), atol=0.1)
-    # Up to 1 s (two means) before and after the motion is left out of the rests.
     assert (first.end_ns - first.start_ns) * 1e-9 == pytest.approx(40.0, abs=1.6)
     assert (second.end_ns - second.start_ns) * 1e-9 == pytest.approx(30.0, abs=1.6)
-
-
-def test_vibrations_of_a_compressor_do_not_divide_a_position(rng):
-    # WHY: vibration by the compressor counted as motion, and each pause as a position: 18 bags had
-    # 1135 positions. WHAT: twelve vibrations of three times the noise belong to one rest, in which
-    # a turn by 300 urad is detected.
+    # WHY: vibration counted as motion: 18 bags had 1135 positions. A turn by 300 urad ends a rest.
     accel = still(rng, 720.0, UP)
     for start in range(3000, 72000, 6000):
         accel[start : start + 3000] += 0.9 * rng.standard_normal((3000, 3))
@@ -130,18 +137,8 @@ def test_vibrations_of_a_compressor_do_not_divide_a_position(rng):
     assert first.time[-1] < 345.0 < second.time[0]
 
 
-def test_bad_samples_are_counted_and_left_out(rng):
-    accel = still(rng, 30.0, UP)
-    accel[10, 1] = np.nan
-    accel[20, 2] = 32767.0
-    bag = reduced([block(accel)])
-    assert (bag.n_samples, bag.n_dropped, bag.n_saturated) == (3000, 1, 1)
-    assert sum(interval.count.sum() for interval in bag.intervals) == 2998
-
-
 def test_readings_of_a_lost_thermometer_are_counted_and_left_out(rng):
-    # WHY: with -127 degC in every 60th reading the estimated noise of the thermometer was 14 K,
-    # and the error of the fit 25 times as large as without these readings.
+    # WHY: with -127 degC in every 60th reading the error of the fit was 25 times as large.
     whole = block(still(rng, 2000.0, UP))
     whole.board[:] = 20.0 + 0.02 * rng.standard_normal(len(whole.board))
     whole.board[30::60] = -127.0
@@ -152,10 +149,8 @@ def test_readings_of_a_lost_thermometer_are_counted_and_left_out(rng):
     assert noise == pytest.approx(0.02, rel=0.1)
     (finding,) = (f for f in judge_bags([bag], FitOptions(gravity=9.8)) if f.name == 'spikes')
     assert '33 readings' in finding.message
-    # The first and the last reading may be spikes, too.
     at_ends = np.array([85.0, 20.0, 20.1, 20.2, 20.3, 20.4, -127.0])
     assert np.flatnonzero(is_spike(at_ends)).tolist() == [0, 6]
-    # Infinite readings, which are dropped later, give no warning.
     assert not is_spike(np.array([np.inf, np.inf, np.inf, np.inf, 20.0, 20.0, np.inf])).all()
     # Readings of a temperature that changes by up to 18 K from reading to reading are no spikes.
     assert not is_spike(np.array([-18.0, 0.0, 12.0, 18.0, 20.0, 21.0, 21.0])).any()
@@ -165,10 +160,8 @@ def test_glitches_are_counted_and_end_no_rest(rng):
     # WHY: each wrong sample ended a rest, and with 1 % wrong samples a fit took minutes, not 2 s.
     whole = block(still(rng, 2000.0, UP))
     whole.accel[50::100, 1] += 1500.0
-    # A tap that changes ten samples is a motion, and ends the rest.
     whole.accel[100_000:100_010] += 1500.0 * np.array([[-1.0], [1.0]] * 5)
     bag = reduced([whole])
-    # While the unit is turned by hand for 20 s, no sample counts as a glitch.
     turned = block(still(rng, 200.0, UP))
     turned.accel[9000:11_000] += 600.0 * rng.standard_normal((2000, 3))
     assert reduced([turned]).n_glitches == 0
@@ -179,9 +172,8 @@ def test_glitches_are_counted_and_end_no_rest(rng):
     assert '2000 samples' in finding.message
 
 
-def test_a_rest_is_found_in_samples_that_arrive_in_bursts(rng):
-    # WHY: the averaging time followed from the median step of stamps, 0.3 ms, so no samples were
-    # averaged between bursts, and a unit at rest for 22 min was reported as worn or driven.
+def test_samples_in_bursts_are_a_rest_and_several_with_one_stamp_are_reported(rng):
+    # WHY: without averages between bursts a unit at rest was reported as worn or driven.
     whole = block(still(rng, 600.0, UP))
     number = np.arange(len(whole.accel))
     for size in (20, 100, 200):
@@ -191,9 +183,6 @@ def test_a_rest_is_found_in_samples_that_arrive_in_bursts(rng):
         assert len(bag.intervals) == 1
         assert bag.cycle_s == pytest.approx(0.01, rel=0.1)
         assert bag.n_dropped == 0
-
-
-def test_several_samples_with_one_stamp_are_reported(rng):
     whole = block(still(rng, 600.0, UP))
     stamps = whole.accel_stamp_ns[np.arange(len(whole.accel)) // 10 * 10]
     bag = reduced([replace(whole, accel_stamp_ns=stamps)])
@@ -215,17 +204,6 @@ def test_a_few_stamps_that_do_not_rise_are_reported(n, rng):
     assert len(findings) == (n > 0)
     for finding in findings:
         assert f'have a stamp that does not rise, are left out ({n}, ' in finding.message
-
-
-def test_the_reduction_does_not_depend_on_the_origin_of_time(rng):
-    samples = still(rng, 30.0, UP)
-    results = []
-    for origin in (0, 1_900_000_000_000_000_000):
-        accumulator = CellAccumulator(0.5, None)
-        accumulator.add(np.arange(3000, dtype=np.int64) * 10_000_000 + origin, samples)
-        results.append(accumulator.cells())
-    np.testing.assert_array_equal(results[0].mean, results[1].mean)
-    np.testing.assert_array_equal(results[0].time, results[1].time)
 
 
 @pytest.mark.parametrize(
@@ -252,41 +230,53 @@ def test_a_last_window_is_kept_if_it_is_at_least_half_full(seconds, left, rng):
     assert interval.count.tolist() == [1000.0, 1000.0, *([float(left)] if left else [])]
 
 
-def test_fast_readings_are_averaged(rng):
+def test_fast_readings_are_averaged_but_each_change_of_a_wide_quantum_is_kept(rng):
     n = 60 * RATE_HZ
     at, celsius = stamps(n), 20.0 + 0.1 * rng.standard_normal(n)
     accel = still(rng, 60.0, UP)
     board = reduced([ArrayBlock(at, accel, at, celsius, at, celsius)]).board
     assert len(board.value) <= n / 19
     assert board.value.mean() == pytest.approx(celsius.mean(), abs=1e-3)
+    bag, noise = dense(rng, 0.05), ThermometerSettings(noise_sd_c=0.05)
+    bag.board.value[3000] = 85.0
+    detector = DetectorSettings(board=noise, case=noise)
+    means, settings = averaged(bag, detector, ('board', 'case'), 2.0)
+    for readings, sensor in ((means.board, settings.board), (means.case, settings.case)):
+        assert sensor.noise_sd_c == pytest.approx(0.05 / np.sqrt(20.0), rel=0.01)
+        is_mean = np.diff(readings.stamp_ns, prepend=0) > 1_500_000_000
+        error = readings.value - 20.0 - 1e-11 * (readings.stamp_ns - START_NS)
+        # An sd estimated from some 300 means has a relative sd of 1 / sqrt(2 * 300) = 4 %.
+        assert np.std(error[is_mean]) == pytest.approx(sensor.noise_sd_c, rel=0.16)
+    assert 85.0 in means.board.value
+    assert averaged(bag, detector, ('board', 'case'), 0.1) == (bag, detector)
+    bag = dense(rng, 0.05)
+    bag.board.value[:] = 20.1
+    means, _ = averaged(bag, DetectorSettings(), ('board', 'case'), 1.7)
+    assert set(means.board.value) == {20.1}
+    bag = dense(rng, 0.0, quantum=0.5)
+    wide = ThermometerSettings(quantum_c=0.5)
+    detector = DetectorSettings(board=wide, case=wide)
+    kept, settings = averaged(bag, detector, ('board', 'case'), 2.0)
+    assert settings == detector
+    changed = np.flatnonzero(np.diff(bag.board.value)) + 1
+    assert np.isin(bag.board.stamp_ns[changed], kept.board.stamp_ns).all()
+    assert len(kept.board.value) <= 301 + len(changed)
 
 
-@pytest.mark.parametrize(
-    ('latitude', 'height', 'expected'),
-    # Expected values: published normal gravity of WGS 84 at the equator, the pole and 45 degrees.
-    [(0.0, 0.0, 9.7803253359), (90.0, 0.0, 9.8321849379), (45.0, 0.0, 9.8061977694)],
-)
-def test_normal_gravity_agrees_with_published_values(latitude, height, expected):
-    assert normal_gravity(latitude, height) == pytest.approx(expected, abs=1e-8)
-    assert normal_gravity(-latitude, height) == normal_gravity(latitude, height)
-
-
-def test_gravity_falls_with_height():
+def test_normal_gravity_agrees_with_published_values_and_impossible_places_are_refused():
+    # Published normal gravity of WGS 84 at the equator, the pole and 45 degrees.
+    for latitude, expected in ((0.0, 9.7803253359), (90.0, 9.8321849379), (45.0, 9.8061977694)):
+        assert normal_gravity(latitude, 0.0) == pytest.approx(expected, abs=1e-8)
+        assert normal_gravity(-latitude, 0.0) == normal_gravity(latitude, 0.0)
     # The free-air gradient is 0.3086 mGal/m at the surface, 0.02 % less at a height of 1 km.
     fall = normal_gravity(50.0, 0.0) - normal_gravity(50.0, 1000.0)
     assert fall == pytest.approx(3.086e-3, rel=1e-3)
-
-
-@pytest.mark.parametrize(('latitude', 'height'), [(91.0, 0.0), (np.nan, 0.0), (0.0, 2e4)])
-def test_impossible_places_are_refused(latitude, height):
-    with pytest.raises(ValueError, match=r'`(latitude_deg|height_m)` must be within'):
-        normal_gravity(latitude, height)
-
-
-@pytest.mark.parametrize('gravity', [98.1, -1.0, np.nan])
-def test_a_gravity_not_found_on_earth_is_refused(gravity):
-    with pytest.raises(FitError, match='not found on Earth'):
-        FitOptions(gravity=gravity)
+    for latitude, height in ((91.0, 0.0), (np.nan, 0.0), (0.0, 2e4)):
+        with pytest.raises(ValueError, match=r'`(latitude_deg|height_m)` must be within'):
+            normal_gravity(latitude, height)
+    for gravity in (98.1, -1.0, np.nan):
+        with pytest.raises(FitError, match='not found on Earth'):
+            FitOptions(gravity=gravity)
 
 
 def soak_ramp_soak(quantum, noise, rng):
@@ -314,29 +304,20 @@ def test_thermometer_settings_are_estimated_from_readings(quantum, noise, rng):
     assert learned.fastest_ramp_k_min >= 1.0
 
 
-@pytest.mark.parametrize('noise', [0.02, 0.05, 0.09])
-def test_readings_that_alternate_at_edges_of_1_k_steps_show_their_noise(noise, rng):
+@pytest.mark.parametrize(('noise', 'found'), [(0.02, 0.02), (0.05, 0.05), (0.09, 0.09), (0, 0.01)])
+def test_readings_that_alternate_at_edges_of_1_k_steps_show_their_noise(noise, found, rng):
     learned = learn_thermometer([soak_ramp_soak(1.0, noise, rng)], ThermometerSettings())
-    # The readings cross 30 rounding edges; noise shows only at the two slowest crossings.
-    assert learned.noise_sd_c == pytest.approx(noise, rel=0.3)
+    # Noise shows only at the two slowest crossings of edges; without it 0.01 quanta are assumed.
+    assert learned.noise_sd_c == pytest.approx(found, rel=0.3 if noise else 1e-6)
 
 
-def test_readings_that_never_alternate_have_a_noise_of_0_01_quanta(rng):
-    learned = learn_thermometer([soak_ramp_soak(1.0, 0.0, rng)], ThermometerSettings())
-    assert learned.noise_sd_c == pytest.approx(0.01)
-
-
-def test_the_lag_is_at_least_three_reading_intervals(rng):
-    # WHY: a pause longer than the lag restarts the estimate of a thermometer: with readings every
-    # 60 s and a lag of 50 s the estimated rate was 0 in all ramps.
+def test_without_readings_the_settings_are_the_defaults_and_lags_are_three_reading_intervals(rng):
+    # WHY: with readings every 60 s and a lag of 50 s the estimated rate was 0 in all ramps.
     time = np.arange(0.0, 14400.0, 60.0)
     celsius = np.interp(time, [0.0, 3600.0, 5400.0], [5.0, 5.0, 35.0])
     celsius += 0.01 * rng.standard_normal(len(time))
     readings = Readings(stamps(len(time), 1.0 / 60.0), celsius)
     assert learn_thermometer([readings], ThermometerSettings()).lag_s == pytest.approx(180.0)
-
-
-def test_without_readings_the_thermometer_settings_are_the_defaults():
     empty = Readings(np.zeros(0, dtype=np.int64), np.zeros(0))
     base = DetectorSettings()
     assert learn_thermometer([empty], base.board) == base.board
@@ -357,7 +338,6 @@ def test_the_detector_settings_follow_the_slowest_ramp(rng):
 
 @pytest.mark.parametrize('step', [1.0, 16.0, 1.0 / 300.0])
 def test_a_rest_is_found_at_any_quantum_of_the_samples(step, rng):
-    # Rounded samples are constant, or alternate between two values that differ by a quantum.
     slow = 0.6 * np.sin(np.arange(60 * RATE_HZ) / 900.0)
     accel = 2900.0 + slow[:, None] + 0.05 * rng.standard_normal((len(slow), 3))
     bag = reduced([block(np.round(accel) * step)], full_scale=None)
@@ -365,14 +345,11 @@ def test_a_rest_is_found_at_any_quantum_of_the_samples(step, rng):
     assert bag.n_still_cells == bag.n_cells
 
 
-def test_the_rounding_sd_without_noise_is_that_of_simulated_rounding(rng):
+def test_the_rounding_sd_is_that_of_simulated_rounding_and_smaller_with_a_drift(rng):
     level = rng.uniform(-0.5, 0.5, 1000)
     (expected, _, _) = rounding_sd(np.zeros(3), np.zeros(3), np.ones(3))
     # The RMS of 1000 errors has an sd of 2 %.
     assert np.sqrt(np.mean((np.rint(level) - level) ** 2)) == pytest.approx(expected, rel=0.08)
-
-
-def test_a_drift_averages_the_error_of_rounding(rng):
     level = rng.uniform(-0.5, 0.5, 400)
     drift = np.linspace(0.0, 5.3, 1000)
     error = np.mean(np.rint(level[:, None] + drift) - level[:, None] - drift, axis=1)
@@ -381,22 +358,19 @@ def test_a_drift_averages_the_error_of_rounding(rng):
 
 
 @pytest.mark.parametrize('step', [1.0, 0.04])
-def test_steps_of_a_converter_after_a_constant_soak_do_not_divide_a_rest(rng, step):
-    # WHY: the step of the converter was searched in the first 20000 samples only. After 20000
-    # constant samples each change by a converter step began a new rest.
+def test_steps_of_a_converter_after_a_constant_soak_do_not_divide_a_rest_but_a_turn_does(
+    rng, step
+):
+    # WHY: after 20000 constant samples each change by a converter step began a new rest.
     rest = Rest(rng, duration_s=3600.0, sd=0.0)
     ramp = np.maximum(rest.time - 1800.0, 0.0) / 1800.0
     rest.accel = np.rint(rest.accel / 0.04 + 6.0 * np.outer(ramp, (1.0, -1.3, 0.7))) * step
     bag = reduce_source(rest.source(), full_scale=None)
     assert len(bag.intervals) == 1
-
-
-def test_a_turn_between_constant_samples_is_not_taken_for_a_step_of_the_converter(rng):
     # WHY: if samples changed only as the unit was turned, this change counted as an ADC step.
     rest = Rest(rng, sd=0.0)
     rest.accel[rest.time > 300.0] = (GRAVITY, 0.0, 0.0)
-    bag = reduce_source(rest.source(), full_scale=None)
-    assert len(bag.intervals) == 2
+    assert len(reduce_source(rest.source(), full_scale=None).intervals) == 2
 
 
 def dense(rng, noise_sd, quantum=0.0):
@@ -406,37 +380,3 @@ def dense(rng, noise_sd, quantum=0.0):
     celsius = np.rint(celsius / quantum) * quantum if quantum else celsius
     bag = reduced([block(still(rng, 30.0, UP))])
     return replace(bag, temperatures=dict.fromkeys(('board', 'case'), Readings(stamp, celsius)))
-
-
-def test_dense_readings_are_averaged_over_steps_and_have_the_noise_of_a_mean(rng):
-    bag, noise = dense(rng, 0.05), ThermometerSettings(noise_sd_c=0.05)
-    # Averaging must leave an impossible reading and its neighbours as they are.
-    bag.board.value[3000] = 85.0
-    detector = DetectorSettings(board=noise, case=noise)
-    means, settings = averaged(bag, detector, ('board', 'case'), 2.0)
-    for readings, sensor in ((means.board, settings.board), (means.case, settings.case)):
-        assert sensor.noise_sd_c == pytest.approx(0.05 / np.sqrt(20.0), rel=0.01)
-        is_mean = np.diff(readings.stamp_ns, prepend=0) > 1_500_000_000
-        error = readings.value - 20.0 - 1e-11 * (readings.stamp_ns - START_NS)
-        # An sd estimated from some 300 means has a relative sd of 1 / sqrt(2 * 300) = 4 %.
-        assert np.std(error[is_mean]) == pytest.approx(sensor.noise_sd_c, rel=0.16)
-    assert 85.0 in means.board.value
-    assert averaged(bag, detector, ('board', 'case'), 0.1) == (bag, detector)
-
-
-def test_means_of_equal_dense_readings_are_equal(rng):
-    bag = dense(rng, 0.05)
-    bag.board.value[:] = 20.1
-    means, _ = averaged(bag, DetectorSettings(), ('board', 'case'), 1.7)
-    assert set(means.board.value) == {20.1}
-
-
-def test_of_dense_readings_with_a_wide_quantum_each_change_is_kept(rng):
-    bag = dense(rng, 0.0, quantum=0.5)
-    wide = ThermometerSettings(quantum_c=0.5)
-    detector = DetectorSettings(board=wide, case=wide)
-    kept, settings = averaged(bag, detector, ('board', 'case'), 2.0)
-    assert settings == detector
-    changed = np.flatnonzero(np.diff(bag.board.value)) + 1
-    assert np.isin(bag.board.stamp_ns[changed], kept.board.stamp_ns).all()
-    assert len(kept.board.value) <= 301 + len(changed)

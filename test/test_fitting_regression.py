@@ -137,8 +137,7 @@ class Dense:
 def solved(request):
     n_positions, pose_of = request.param
     rng = np.random.default_rng(5)
-    # `table_of` draws an initial lag state per position, but positions of one bag share one state:
-    # for bags of several positions all states are 0.
+    # Positions of one bag share an initial lag state, which is 0 for bags of several positions.
     truth = Truth(
         start_sd=0.5 if n_positions == 1 else 0.0, noise=Noise(4.0, 2000.0),
         offset_sd=2.0 * MICRO, tilt_sd=2e-7 if pose_of else 5e-6,
@@ -150,8 +149,7 @@ def solved(request):
     bag = windows.position // n_positions
     windows = replace(windows, weight=weight, bag=bag, pose=pose)
     regression, state = begin(windows, up)
-    # The derivatives of the regression omit products of parameter changes. In one or two poses
-    # bias, scale and misalignment are undetermined; narrow priors limit their changes.
+    # In one or two poses bias, scale and M are undetermined: narrow priors limit their changes.
     narrow = {'scale_sd': 1e-5, 'misalignment_sd': 1e-5, 'bias_sd': np.full(3, 1e-4)}
     narrow['column_sd'] = column_sd(('curve', 'board'), 1e-2, 1e-5)
     narrow = narrow if pose_of else {}
@@ -159,19 +157,15 @@ def solved(request):
     return regression, prior, mode_of(regression, state, prior)
 
 
-def test_the_mode_agrees_with_a_least_squares_fit_by_dense_matrices(solved):
+def test_mode_covariance_and_evidence_agree_with_dense_linear_algebra(solved):
     regression, prior, mode = solved
     dense = Dense(regression, prior, mode)
     at = dense.residual(np.zeros(dense.n))
     gradient = dense.jacobian(np.zeros(dense.n)).T @ at * np.sqrt(mode.variance)
-    # At the mode the gradient of the objective is zero.
     assert np.abs(gradient).max() < 1e-4
     sd = np.sqrt(mode.variance)
     other = least_squares(dense.residual, np.zeros(dense.n), x_scale=sd, method='trf').x
     assert np.abs(other / sd).max() < 1e-3
-
-
-def test_covariance_and_evidence_agree_with_dense_linear_algebra(solved):
     regression, prior, fitted = solved
     np.testing.assert_allclose(regression.start_root @ regression.start_root.T, START, atol=1e-12)
     beside = []
@@ -186,40 +180,17 @@ def test_covariance_and_evidence_agree_with_dense_linear_algebra(solved):
         correlation = mode.covariance / np.outer(sd[:n], sd[:n])
         np.testing.assert_allclose(correlation, covariance, atol=1e-4)
         assert np.diag(covariance) == pytest.approx(1.0, rel=1e-4)
-        # Laplace: -2 ln Z = misfit + ln det(noise) + ln det(prior) + ln det(Hessian). Directions
-        # of the attitudes have no prior.
+        # Laplace: -2 ln Z = misfit + ln det(noise) + ln det(prior) + ln det(Hessian).
         precision = regression.precision(wide, mode.layout)
         known = np.log(precision[precision > 0.0]).sum()
         determinants = dense.determinant + np.linalg.slogdet(hessian)[1] - known
         beside.append(mode.log_evidence + 0.5 * (at @ at + determinants))
-    # The evidence contains a constant from the prior of the mean initial lag state, which does not
-    # depend on `start_variance_ratio`.
+    # The evidence contains a constant, which does not depend on `start_variance_ratio`.
     assert beside[1] == pytest.approx(beside[0], abs=1e-3)
 
 
-def test_the_regression_of_windows_without_noise_gives_the_true_parameters(rng):
-    truth = Truth(sigma=np.full(3, 1e-9 * MICRO))
-    windows, up = table_of(truth, 12, rng)
-    regression, state = begin(windows, up)
-    prior = replace(prior_of(truth), sigma=np.full(3, MICRO))
-    mode = mode_of(regression, state, prior).state
-    # The priors shift a fitted parameter by 1e-6 of its sd (about 1 ug).
-    np.testing.assert_allclose(mode.kappa, truth.kappa, atol=1e-9)
-    np.testing.assert_allclose(mode.bias, truth.bias, atol=1e-8)
-    np.testing.assert_allclose(mode.misalignment, truth.misalignment, atol=1e-8)
-    np.testing.assert_allclose(mode.up, up, atol=1e-8)
-    for part, atol in ((0, 1e-8), (1, 1e-9)):
-        weights = mode.weights[part] / regression.rms
-        np.testing.assert_allclose(weights, truth.weights[part], atol=atol)
-    np.testing.assert_allclose(mode.start, 0.0, atol=1e-2)
-    # `Regression.force` inverts the model, so it gives the true force of each window.
-    force = regression.force(mode)
-    np.testing.assert_allclose(force, GRAVITY * up[windows.position], atol=1e-7)
-
-
 def test_errors_of_the_regression_divided_by_the_claimed_sd_have_an_rms_of_1():
-    # With the true prior sd, the inverse Hessian is the covariance of the errors. For 36 units
-    # with 33 correlated parameters each, the RMS of error / sd is uncertain by at most 13 %.
+    # For 36 units of 33 correlated parameters the RMS of error / sd is uncertain by at most 13 %.
     rng = np.random.default_rng(11)
     truth = Truth(noise=Noise(0.5, 1000.0), offset_sd=MICRO, start_sd=0.3)
     errors = []
@@ -247,9 +218,8 @@ def refit_of(whole, regression, prior, kept):
     return replace(mode, weights=mode.weights / units)
 
 
-#: The left-out score is computed by linear steps from the fit to all rows. With the groups LINEAR
-#: the model is linear in all parameters but attitudes, and the score is exact. With PRODUCTS
-#: the score neglects (change of an initial lag state) * (change of this lag's weight).
+#: The left-out score is computed by linear steps, exactly with LINEAR. With PRODUCTS it neglects
+#: (change of an initial lag state) * (change of this lag's weight).
 LINEAR, PRODUCTS = ('curve',), ('curve', 'board')
 
 
@@ -316,8 +286,7 @@ def test_a_position_that_alone_determines_a_parameter_has_no_left_out_norm(rng):
     score = score_of(regression, mode)
     assert np.isnan(score.force).all()
     assert np.isnan(score.norms.square).all()
-    # The drift of |f| in a left-out position does not depend on bias and scale, so it is
-    # predicted. M keeps its prior mean and sd.
+    # The drift of a left-out position is predicted: it does not depend on bias and scale.
     assert np.isfinite(score.positions.square).all()
     np.testing.assert_allclose(mode.state.misalignment, 0.0, atol=1e-6)
     places = mode.layout.misalignment
@@ -338,15 +307,6 @@ def test_no_step_of_the_solver_increases_the_objective(seed):
         state, dense = solution.state, Dense(regression, prior, solution)
         sizes.append(0.5 * float(np.sum(dense.residual(np.zeros(dense.n)) ** 2)))
     assert np.diff(sizes).max() < 1e-9 * sizes[0]
-
-
-def test_excluded_columns_get_zero_weight(solved):
-    regression, prior, mode = solved
-    narrow = replace(prior, column_sd=prior.column_sd * [[1, 1, 0, 0, 0, 0], 6 * [1]])
-    # Columns with a prior sd of 0 get zero weight, even if the solver makes no step.
-    state = regression.solve(mode.state, narrow, n_steps=0).state
-    assert not state.weights[0, :, 2:4].any()
-    np.testing.assert_array_equal(state.weights[1], mode.state.weights[1])
 
 
 def test_published_huygens_coefficients_come_back(rng):
@@ -392,8 +352,7 @@ def test_published_huygens_coefficients_come_back(rng):
 
 @pytest.mark.parametrize('noise', [Noise(), Noise(0.5, 1500.0)])
 def test_scores_of_inactive_columns_agree_with_a_fit_in_which_they_are_active(noise):
-    # In a linear problem a fit with the inactive columns would give their weights the covariance
-    # S^-1 and the values S^-1 Q (S: sparsity factor, Q: quality factor).
+    # A fit with the inactive columns would give weights S^-1 Q with the covariance S^-1.
     truth, asked = Truth(noise=noise), np.isin(GROUPS, ('board', 'idle'))
     windows, up = table_of(truth, 12, np.random.default_rng(4), n_windows=30)
     regression, state = begin(without_starts(windows), up)
@@ -423,8 +382,7 @@ def test_scores_of_inactive_columns_agree_with_a_fit_in_which_they_are_active(no
 
 
 def test_inactive_and_active_columns_share_initial_lag_states(solved):
-    # WHY: the sparsity factor of an inactive scale column whose lag also changes the bias was 50
-    # times too large, because the prior of the sum of initial lag states was left out.
+    # WHY: the prior of the sum of initial lag states was left out of the sparsity factor.
     regression, prior, mode = solved
     of_scale = np.isin(GROUPS, ('board',)) * [[0.0], [1.0]]
     without = replace(prior, column_sd=np.where(of_scale > 0.0, 0.0, prior.column_sd))
@@ -448,15 +406,6 @@ def test_only_a_matrix_made_indefinite_by_rounding_gets_diagonal_jitter(rng):
     np.testing.assert_allclose(factor[1] @ factor[1].T, bad, atol=2e-9)
     with pytest.raises(np.linalg.LinAlgError):
         factored(np.stack((good, bad - 0.5 * np.eye(3))))
-
-
-def test_tangent_basis_is_orthonormal(rng):
-    up = rng.standard_normal((20, 3))
-    up /= np.linalg.norm(up, axis=1, keepdims=True)
-    up[0] = (1.0, 0.0, 0.0)
-    basis = np.concatenate((tangent_basis(up), up[:, :, None]), axis=2)
-    product = np.einsum('pij,pik->pjk', basis, basis)
-    np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=1e-14)
 
 
 def test_positions_in_motion_and_an_axis_with_equal_means_in_all_positions_are_refused(rng):

@@ -29,12 +29,10 @@ from thermo_comp.fitting.evidence import group_evidence, lack_of_fit
 from thermo_comp.fitting.hyperparameters import downweigh, settle
 from thermo_comp.fitting.initialisation import STEEPEST
 from thermo_comp.fitting.left_out import is_better
-from thermo_comp.fitting.regression import Regression
-from thermo_comp.fitting.selection import Fit, Selected, fit_all, select
+from thermo_comp.fitting.selection import Fit, fit_all, select
 from thermo_comp.fitting.series import Whitener
 from thermo_comp.fitting.unknowns import InformativePrior, Noise
 
-Case = tuple[Regression, Selected, Truth]
 ALL = ('curve', 'board', 'idle')
 IDLE = np.array(GROUPS) == 'idle'
 
@@ -77,17 +75,19 @@ def calm():
     return *selected_of(truth, windows, up), truth
 
 
-def test_columns_without_an_effect_are_not_chosen(calm):
-    regression, chosen, _ = calm
+def test_only_columns_with_an_effect_are_chosen_and_each_trial_has_a_left_out_error(calm):
+    regression, chosen, truth = calm
     np.testing.assert_array_equal(chosen.posterior.prior.column_sd > 0.0, [~IDLE, ~IDLE])
     assert chosen_groups(chosen) == {'curve', 'board'}
     evidence = group_evidence(regression, chosen.posterior)
     judged = {(group.part, group.group) for group in evidence}
     assert judged == {*product(('bias', 'scale'), ('curve', 'board'))}
     assert not chosen.posterior.state.weights[..., IDLE].any()
-
-
-def test_each_tried_model_has_a_left_out_error(calm):
+    # A tilt below the noise of a mean over 60 windows (2 ug / sqrt(60)) cannot be measured.
+    hidden = truth.sigma[0] / np.sqrt(60.0)
+    tilt = GRAVITY * chosen.posterior.state.tilt
+    assert np.abs(tilt).max() < hidden
+    assert np.sqrt(np.mean(tilt**2)) < 0.5 * hidden
     _, selected, truth = calm
     rms = {trial.groups: trial.score.rms for trial in selected.trials}
     # The first trial fits only constants; its left-out error is the effect of temperature.
@@ -102,8 +102,7 @@ def test_each_tried_model_has_a_left_out_error(calm):
 
 @pytest.mark.parametrize('where', ['one bag', 'one section', 'all'])
 def test_a_group_that_explains_one_bag_or_section_is_not_chosen(where):
-    # The evidence favours the group 'idle' in all cases; the left-out error favours this group
-    # only if its effect is in all bags and sections.
+    # The evidence always favours 'idle', the left-out error only if its effect is everywhere.
     truth = Truth()
     windows, up = table_of(truth, 10, np.random.default_rng(5), n_windows=30)
     rows = {
@@ -119,8 +118,7 @@ def test_a_group_that_explains_one_bag_or_section_is_not_chosen(where):
 
 @pytest.mark.parametrize(('n_positions', 'step_s'), [(10, 120.0), (12, 60.0), (12, 240.0)])
 def test_a_lag_is_found_although_a_curve_without_the_lag_is_rejected(n_positions, step_s):
-    # WHY: a bias that depends only on a lagged temperature needs the groups 'curve' and 'board'
-    # together; the group 'curve' without 'board' was rejected, and so the lag was not found.
+    # WHY: the group 'curve' without 'board' was rejected, and so the lag was not found.
     slope = 2e-5 * np.array([1.0, -2.0, 1.5])
     on_bias = np.outer(slope, [1.0, 0.0, 0.0, -1.0, 0.0, 0.0])
     truth = Truth(on_bias=on_bias, on_scale=np.zeros((3, 6)))
@@ -131,8 +129,8 @@ def test_a_lag_is_found_although_a_curve_without_the_lag_is_rejected(n_positions
     assert chosen.score.rms < 1.2 * truth.sigma[0]
 
 
-def test_estimated_noise_parameters_agree_with_the_truth(noisy):
-    _, chosen, truth = noisy
+def test_estimated_noise_parameters_agree_with_the_truth_and_errors_with_the_claimed_sd(noisy):
+    regression, chosen, truth = noisy
     prior = chosen.posterior.prior
     assert {'curve', 'board'} <= chosen_groups(chosen)
     # 1080 windows per axis determine the sd of white noise to 2 %, or less well beside slow noise.
@@ -142,14 +140,18 @@ def test_estimated_noise_parameters_agree_with_the_truth(noisy):
     assert 0.5 < prior.noise.time_s / truth.noise.time_s < 2.0
     # 54 means less 45 unknowns (directions, scale, bias, M) determine the mounting sd to 24 %.
     assert 0.5 < prior.offset_sd / truth.offset_sd < 1.7
+    errors = truth.errors(regression, chosen.posterior)
+    # Weights that the fit pruned have no sd and are not in `errors`.
+    every = np.concatenate([*errors.values()])
+    # The RMS of 30 values of error / sd is uncertain by 13 %; estimates of prior sd lower the RMS.
+    assert len(every) > 20
+    assert 0.5 < np.sqrt(np.mean(every**2)) < 1.5
+    assert np.abs(every).max() < 4.0
 
 
 @pytest.mark.slow
 def test_flicker_noise_has_several_correlation_times():
-    # WHY: with a single correlation time, initial lag states and tilts fitted the slower part of
-    # flicker noise, and the errors of the biases were 1.9 claimed sd RMS.
-    # WHY: flicker noise with a shortest correlation time below 3 windows was taken for noise of
-    # one correlation time: both models were compared before the noise variance was estimated.
+    # WHY: with a single correlation time the errors of the biases were 1.9 claimed sd RMS.
     errors = []
     for seed, time_s in ((0, 400.0), (5, 400.0), (6, 400.0), (6, 180.0)):
         truth = Truth(noise=Noise(4.0, time_s, 3))
@@ -175,18 +177,20 @@ def test_rounding_removes_no_correlation_time_from_the_search():
     assert not whitener.shows(90.0)
 
 
-def test_the_estimated_prior_sd_of_a_column_is_the_rms_of_its_true_weights(calm):
-    # Prior variance of a column: sum of its squared weights / 3 effective parameters. A
-    # hyperprior of variance (ln 10)^2 = 5.3 moves ln sd by 3 % of the distance to its centre.
+def test_the_prior_sd_of_columns_is_that_of_true_weights_below_the_steepest_plausible_slope(calm):
+    # Prior variance of a column: sum of its squared weights / 3. The hyperprior changes it by 3 %.
     regression, chosen, truth = calm
     true = np.sqrt(np.mean((truth.on_bias * regression.rms) ** 2, axis=0))
     np.testing.assert_allclose(chosen.posterior.prior.column_sd[0, :4], true[:4], rtol=0.25)
     for group in group_evidence(regression, chosen.posterior):
         assert 0.0 < group.effective_parameters <= 6.0 + 1e-9
         assert len(group.prior_sd) == 2
-
-
-def test_the_prior_sd_of_a_slope_stays_below_the_steepest_plausible_slope():
+    columns = regression.windows.columns[:, 2:4]
+    evidence = group_evidence(regression, chosen.posterior)
+    explains = {(group.part, group.group): group.explains_m_s2 for group in evidence}
+    expected = np.sqrt(np.mean((columns @ truth.on_bias[:, 2:4].T) ** 2))
+    # The group 'board' changes the bias by about 100 ug; the noise of a window is 2 ug.
+    assert explains['bias', 'board'] == pytest.approx(expected, rel=0.05)
     # The unit's bias slope is ten times the largest allowed prior sd of a bias slope.
     truth = Truth(on_bias=10.0 * STEEPEST[0] * np.outer([1.0, -1.0, 1.0], np.arange(6) == 0))
     windows, up = table_of(truth, 12, np.random.default_rng(2), n_windows=20)
@@ -216,17 +220,6 @@ def test_bends_have_one_prior_sd_of_the_change_of_slope():
     np.testing.assert_allclose(settled.column_sd[:, 2:], first.column_sd[:, 2:], rtol=0.1)
 
 
-def test_errors_of_fitted_parameters_in_claimed_sd_have_an_rms_near_1(noisy):
-    regression, chosen, truth = noisy
-    errors = truth.errors(regression, chosen.posterior)
-    # Weights that the fit pruned have no sd and are not in `errors`.
-    every = np.concatenate([*errors.values()])
-    # The RMS of 30 values of error / sd is uncertain by 13 %; estimates of prior sd lower the RMS.
-    assert len(every) > 20
-    assert 0.5 < np.sqrt(np.mean(every**2)) < 1.5
-    assert np.abs(every).max() < 4.0
-
-
 def test_the_bayes_factor_of_a_group_is_the_loss_of_evidence_if_the_group_is_removed():
     # The Savage-Dickey ratio equals the loss of evidence if attitudes act linearly.
     truth = Truth()
@@ -245,14 +238,8 @@ def test_the_bayes_factor_of_a_group_is_the_loss_of_evidence_if_the_group_is_rem
     falls = {(group.part, group.group): group.log_evidence_change for group in evidence}
     assert falls['bias', 'board'] > 10.0
     assert falls['bias', 'idle'] < 0.5
-
-
-def test_with_an_informative_prior_the_bayes_factor_compares_with_weights_at_the_prior_mean():
-    truth = Truth()
-    windows, up = table_of(truth, 12, np.random.default_rng(8))
-    regression, state = begin(without_starts(windows), up)
-    prior = prior_of(truth, column_sd=column_sd(ALL, 3e-4, 3e-5))
-    layout = mode_of(regression, state, prior).layout
+    # With an informative prior the weights are compared with those at the prior mean.
+    layout = posterior.layout
     sd = regression.precision(prior, layout)[: layout.n_unit] ** -0.5
     mean = 0.5 * sd
     mean[layout.kappa] = prior.scale_mean
@@ -268,16 +255,6 @@ def test_with_an_informative_prior_the_bayes_factor_compares_with_weights_at_the
         kept[layout.weights[part][:, of_group]] *= 1e-4
         fall = posterior.log_evidence - posterior_of(kept).log_evidence
         assert row.log_evidence_change == pytest.approx(fall, rel=0.01, abs=0.02), row
-
-
-def test_the_contribution_of_a_group_is_the_rms_of_its_effect(calm):
-    regression, chosen, truth = calm
-    columns = regression.windows.columns[:, 2:4]
-    evidence = group_evidence(regression, chosen.posterior)
-    explains = {(group.part, group.group): group.explains_m_s2 for group in evidence}
-    expected = np.sqrt(np.mean((columns @ truth.on_bias[:, 2:4].T) ** 2))
-    # The group 'board' changes the bias by about 100 ug; the noise of a window is 2 ug.
-    assert explains['bias', 'board'] == pytest.approx(expected, rel=0.05)
 
 
 def test_outliers_do_not_shift_the_fit(calm):
@@ -297,8 +274,7 @@ def test_outliers_do_not_shift_the_fit(calm):
 
 
 def test_quantised_window_means_are_not_down_weighted_as_outliers():
-    # If a converter adds its rounding remainder to the next sample, most window means are equal,
-    # and a few differ by one step: a difference of one step is no outlier.
+    # A converter that carries remainders gives mostly equal means: one step is no outlier.
     windows, up = table_of(Truth(), 9, np.random.default_rng(2))
     regression, state = begin(windows, up)
     prior = prior_of(Truth(), (), offset_sd=1e-9)
@@ -340,8 +316,7 @@ def test_the_variance_of_initial_lag_states_is_estimated(start_sd, lower, upper)
 
 @pytest.mark.parametrize('offset', [0.0, 30.0])
 def test_the_evidence_selects_the_sd_of_an_informative_prior(calm, offset):
-    # The unit differs from the mean of the prior by 0 or by 30 sd; the fit chooses between the sd
-    # of the prior and 100 times this sd.
+    # The unit differs from the mean of the prior by 0 or by 30 sd: its sd, or 100 times, is right.
     _, selected, truth = calm
     state = selected.posterior.state
     regression, _ = begin(calm[0].windows, state.up)
@@ -358,7 +333,6 @@ def test_the_evidence_selects_the_sd_of_an_informative_prior(calm, offset):
     chosen = fit_all(regression, state, prior, fixed, priors)
     assert chosen.posterior.prior.informative is priors[int(offset > 0.0)]
     curve = unit_of(chosen.posterior.state, layout)[places]
-    # With the selected prior the error of the fitted curve is below two claimed sd.
     assert np.abs(curve - true).max() < 2.0 * np.sqrt(chosen.posterior.variance[places]).max()
 
 
@@ -380,22 +354,17 @@ def test_thermal_tilts_of_supports_are_separated_from_the_drift_of_the_unit():
     assert drift_left(stiff)[1] > 1.0 * MICRO
 
 
-def test_the_estimated_tilt_of_a_stiff_support_is_below_the_noise(calm):
-    # A tilt below the noise of a mean over 60 windows (2 ug / sqrt(60)) cannot be measured.
-    _, chosen, truth = calm
-    hidden = truth.sigma[0] / np.sqrt(60.0)
-    tilt = GRAVITY * chosen.posterior.state.tilt
-    assert np.abs(tilt).max() < hidden
-    assert np.sqrt(np.mean(tilt**2)) < 0.5 * hidden
-
-
-def claimed(gravity_sd):
-    truth = Truth(offset_sd=20.0 * MICRO)
-    windows, up = table_of(truth, 12, np.random.default_rng(1), n_windows=20)
+def forced(truth, n, seed, n_windows):
+    """Fit a table with the groups 'curve' and 'board'."""
+    windows, up = table_of(truth, n, np.random.default_rng(seed), n_windows=n_windows)
     regression, state = begin(without_starts(windows), up)
     candidates = candidates_of(windows, ('curve', 'board'))
     candidates = replace(candidates, typical=candidates.typical * ~IDLE)
-    selection = select(regression, state, constants(truth), candidates)
+    return windows, regression, select(regression, state, constants(truth), candidates)
+
+
+def claimed(gravity_sd):
+    windows, regression, selection = forced(Truth(offset_sd=20.0 * MICRO), 12, 1, 20)
     return claim_of(Fit(windows, regression, selection), gravity_sd).covariance
 
 
@@ -413,17 +382,12 @@ def test_the_sd_of_gravity_adds_a_common_error_to_all_scale_factors():
 
 
 def test_the_drift_of_scale_factors_determines_the_sd_of_turn_on_offsets():
-    # WHY: nine constants fit |f| of nine positions exactly: the estimated sd of turn-on offsets
-    # was 5 ug instead of 300 ug, and the constants were wrong by 75 claimed sd.
+    # WHY: the estimated sd was 5 ug, not 300 ug, and the constants were wrong by 75 claimed sd.
     on_scale = np.outer([1.0, -0.7, 1.3], [1e-4, 0.0, 0.0, 0.0, 0.0, 0.0])
     truth = Truth(offset_sd=300.0 * MICRO, sigma=np.full(3, 0.5 * MICRO), on_scale=on_scale)
-    windows, up = table_of(truth, 9, np.random.default_rng(2), n_windows=60)
-    regression, state = begin(without_starts(windows), up)
-    candidates = candidates_of(windows, ('curve', 'board'))
-    candidates = replace(candidates, typical=candidates.typical * ~IDLE)
-    posterior = select(regression, state, constants(truth), candidates).posterior
-    # Of the 27 offsets (9 turn-ons, 3 axes) 18 combinations are determined; 9 act like changes of
-    # the nine constants. The sd of 18 numbers is uncertain by 1 / sqrt(2 * 18), 17 %.
+    _, regression, selection = forced(truth, 9, 2, 60)
+    posterior = selection.posterior
+    # Of the 27 offsets 18 combinations are determined: their sd is uncertain by 17 %.
     assert posterior.prior.offset_sd == pytest.approx(300.0 * MICRO, rel=0.5)
     for errors in truth.errors(regression, posterior).values():
         # The RMS of three standard normal errors exceeds 2 with a probability of 0.7 %.
@@ -437,18 +401,15 @@ def test_windows_that_the_model_misses_count_in_the_lack_of_fit_in_spite_of_thei
     low, high = np.quantile(temperature, (0.45, 0.55))
     is_bump = (low <= temperature) & (temperature <= high)
     bump = 100.0 * MICRO * is_bump[:, None]
-    regression, chosen = selected_of(
-        Truth(), replace(windows, mean=windows.mean + NOMINAL * bump), up
-    )
+    bumped = replace(windows, mean=windows.mean + NOMINAL * bump)
+    regression, chosen = selected_of(Truth(), bumped, up)
     # WHY: the noise expected of a window of small weight was so large that it showed no excess.
     assert np.median(regression.weight[is_bump]) < 0.1
-    table = SimpleNamespace(
-        data=regression.windows, temperature=temperature, is_dynamic=np.zeros_like(is_bump)
-    )
+    no_ramp = np.zeros_like(is_bump)
+    table = SimpleNamespace(data=regression.windows, temperature=temperature, is_dynamic=no_ramp)
     fit = Fit(table, regression, chosen)
     points, _ = lack_of_fit(fit, claim_of(fit))
     widest = np.max([point.sd_m_s2 for point in points], axis=0)
-    # The bump is in half of the windows of the middle of five bins: RMS 100 ug / sqrt(2) = 71 ug,
-    # of which the curve and the means of positions take up to a half.
+    # The bump is in half of a bin: RMS 71 ug, of which curve and means take up to a half.
     assert (widest > 35.0 * MICRO).all()
     assert (widest < 100.0 * MICRO).all()

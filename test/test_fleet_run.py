@@ -65,7 +65,6 @@ def test_all_units_are_fitted_despite_a_killed_worker_and_only_once(client, flee
     collected = []
 
     def report(n, total):
-        # When the first result arrives, two workers are at work.
         if n == 1:
             os.kill(min(client.run(os.getpid).values()), signal.SIGKILL)
         collected.append((n, total))
@@ -90,13 +89,11 @@ def test_all_units_are_fitted_despite_a_killed_worker_and_only_once(client, flee
     assert again.n_done == 0
     assert again.rows == result.rows
     assert contents(out / 'units') == before
-    # A unit is fitted again if the modification time of a bag has changed.
     os.utime(fleet / 'A/good/01.mcap', ns=(0, 0))
     touched = fit_fleet(str(fleet), out, OPTIONS, scheduler=scheduler)
     assert touched.n_done == 1
     after = contents(out / 'units')
     assert {Path(name).parts[1] for name in before if before[name] != after[name]} == {'good'}
-    # A result whose calibration file was edited counts as missing.
     (out / 'units/B/exchanged').rename(out / 'units/B/other')
     (out / 'units/A/torn/calibration.yaml').write_text('edited')
     results = Results(out)
@@ -144,7 +141,6 @@ def test_an_interrupted_fleet_run_continues(scheduler, tmp_path):
         fit_fleet(str(fleet), out, OPTIONS, scheduler=scheduler, progress=stop)
     assert not (out / 'fleet.csv').exists()
     assert len(list(out.rglob('result.json'))) == 1
-    # The result file of unit A/u0 is cut off, as after a power failure.
     (out / 'units/A/u0').mkdir(parents=True, exist_ok=True)
     (out / 'units/A/u0/result.json').write_text('{"format": 1,')
     result = fit_fleet(str(fleet), out, OPTIONS, scheduler=scheduler)
@@ -185,13 +181,12 @@ def test_ctrl_c_while_workers_start_prints_no_traceback(tmp_path):
 
 
 class TestScheduler:
-    def test_a_scheduler_that_does_not_answer_is_named(self, fleet, tmp_path, monkeypatch):
+    def test_a_scheduler_that_does_not_answer_or_has_no_worker_is_refused(
+        self, fleet, tmp_path, monkeypatch
+    ):
         monkeypatch.setattr('thermo_comp.fleet.work._WAIT_S', 0.2)
         with pytest.raises(ThermoCompError, match=r'127\.0\.0\.1:9: no Dask scheduler answers'):
             fit_fleet(str(fleet), tmp_path / 'out', OPTIONS, scheduler='tcp://127.0.0.1:9')
-
-    def test_a_scheduler_without_workers_is_refused(self, monkeypatch):
-        monkeypatch.setattr('thermo_comp.fleet.work._WAIT_S', 0.2)
         options = {'processes': False, 'protocol': 'tcp', 'dashboard_address': '127.0.0.1:0'}
         with (
             distributed.LocalCluster(n_workers=0, **options) as cluster,
@@ -237,18 +232,13 @@ def test_the_next_run_repeats_a_failed_task(future, problem, fleet, tmp_path):
     assert results.look_up(unit, OPTIONS) is None
 
 
-def test_without_dask_fleet_fit_names_the_package_to_install(tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, 'distributed', None)
-    assert command(tmp_path, tmp_path / 'out', '--gravity', '9.81') == 1
-    text = "thermo_comp: error: a fleet needs Dask: pip install 'thermo_comp[fleet]' (distributed "
-    assert capsys.readouterr().err == f'{text}is not installed)\n'
-
-
 def command(folder, out, *options):
     return run_command(['fleet', 'fit', str(folder), '-o', str(out), *options])
 
 
-def test_wrong_arguments_of_fleet_fit_give_a_message(tmp_path, capsys):
+def test_without_dask_or_with_wrong_arguments_fleet_fit_gives_a_message(
+    tmp_path, capsys, monkeypatch
+):
     assert command(tmp_path, tmp_path / 'out') == 2
     assert 'give --gravity, or --latitude and --height' in capsys.readouterr().err
     assert command(tmp_path, tmp_path / 'out', '--gravity', '-1') == 1
@@ -257,6 +247,10 @@ def test_wrong_arguments_of_fleet_fit_give_a_message(tmp_path, capsys):
     printed = capsys.readouterr().err
     assert 'no bag in it' in printed
     assert len(printed.splitlines()) == 1
+    monkeypatch.setitem(sys.modules, 'distributed', None)
+    assert command(tmp_path, tmp_path / 'out', '--gravity', '9.81') == 1
+    text = "thermo_comp: error: a fleet needs Dask: pip install 'thermo_comp[fleet]' (distributed "
+    assert capsys.readouterr().err == f'{text}is not installed)\n'
 
 
 def test_a_unit_without_a_calibration_gives_exit_code_1(scheduler, tmp_path, capsys):

@@ -106,10 +106,6 @@ class TestElsewhere:
         assert outcome.row['verdict'] == 'failed'
         assert str(outcome.row['left_out']).startswith('unit/a.mcap: ')
 
-    def test_an_unknown_protocol_is_refused(self):
-        with pytest.raises(ThermoCompError, match='nowhere://x: Protocol not known'):
-            Storage('nowhere://x')
-
 
 class TestDiscovery:
     @pytest.mark.parametrize(
@@ -134,9 +130,7 @@ class TestDiscovery:
         ):
             (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
             (tmp_path / name).touch()
-        found = [
-            (unit.name, unit.lot, [*unit.bags]) for unit in find_units(Storage(str(tmp_path)))
-        ]
+        found = [(u.name, u.lot, [*u.bags]) for u in find_units(Storage(str(tmp_path)))]
         assert found == [
             ('lot-A/u1', 'lot-A', ['lot-A/u1/1.mcap', 'lot-A/u1/2.mcap']),
             *(('lot-B/u2', 'lot-B', ['lot-B/u2/1.mcap']), ('u3', '', ['u3/1.mcap'])),
@@ -179,8 +173,7 @@ class TestDiscovery:
         assert [name for unit in units for name in unit.bags] == ['unit/1.mcap']
 
     def test_a_folder_that_cannot_be_read_is_named(self, tmp_path, monkeypatch):
-        # WHY: without permission for the folder of a unit, the fleet lacked this unit, and the
-        # exit code was 0.
+        # WHY: without permission for its folder a unit was left out, and the exit code was 0.
         unread = '.hidden', 'lost+found'
         write_unit(tmp_path / 'u1', 1, 1)
         for name in ('u2', *unread):
@@ -193,24 +186,25 @@ class TestDiscovery:
             return scan(path)
 
         monkeypatch.setattr(os, 'scandir', refusing)
-        with pytest.raises(
-            ThermoCompError, match=r'cannot be listed: Permission denied in .*/u2$'
-        ):
+        reason = r'cannot be listed: Permission denied in .*/u2$'
+        with pytest.raises(ThermoCompError, match=reason):
             find_units(Storage(str(tmp_path)))
         (tmp_path / 'u2').rmdir()
         assert [unit.name for unit in find_units(Storage(str(tmp_path)))] == ['u1']
 
-    def test_a_relative_path_of_a_fleet_becomes_absolute(self, tmp_path, monkeypatch):
-        monkeypatch.chdir(tmp_path)
-        assert Storage('bags').address == str(tmp_path / 'bags')
-        assert Storage('memory://bags').address == 'memory://bags'
-
-    def test_a_folder_without_bags_is_refused(self, tmp_path):
+    def test_folders_without_bags_and_unknown_protocols_are_refused_and_paths_are_absolute(
+        self, tmp_path, monkeypatch
+    ):
         with pytest.raises(ThermoCompError, match='no bag in it; expected DIR/UNIT/BAG'):
             find_units(Storage(str(tmp_path)))
         for url in (str(tmp_path / 'gone'), 'memory://never-made'):
             with pytest.raises(ThermoCompError, match='cannot be listed: no such directory'):
                 find_units(Storage(url))
+        with pytest.raises(ThermoCompError, match='nowhere://x: Protocol not known'):
+            Storage('nowhere://x')
+        monkeypatch.chdir(tmp_path)
+        assert Storage('bags').address == str(tmp_path / 'bags')
+        assert Storage('memory://bags').address == 'memory://bags'
 
 
 def test_a_damaged_bag_is_not_reported_as_a_failure_of_the_file_system(tmp_path):
@@ -331,8 +325,7 @@ class TestRow:
         assert row['chosen'] == '/imu/raw, its only Vector3Stamped, is taken for counts'
 
     def test_the_row_has_no_sd_of_a_slope_that_the_positions_do_not_determine(self, tmp_path):
-        # WHY: a fit of one position stated the sum of the slopes of bias and scale as the slope of
-        # the bias, with an sd of 0.06 ug/K.
+        # WHY: a fit of one position stated the slope of the bias with an sd of 0.06 ug/K.
         write_unit(tmp_path / 'u', 1, 1)
         row = processed(tmp_path).row
         assert [row[f'bias_slope_sd_{axis}_ug_k'] for axis in 'xyz'] == [None] * 3

@@ -29,13 +29,10 @@ def test_seeds_cut_off_or_changed_do_not_crash_the_targets(name, rng):
             target.check(bytes(changed))
 
 
-def test_fuzz_run_lists_every_target():
+def test_fuzz_run_lists_every_target_and_seeds_are_valid_inputs():
     import run
 
     assert set(run.NAMES) == set(TARGETS)
-
-
-def test_seeds_of_the_fuzz_targets_are_valid_inputs():
     assert parse_calibration(TARGETS['calibration'].seeds[0]).unit.serial == 'T'
     for seed in TARGETS['mcap'].seeds:
         targets.BAG.write_bytes(seed)

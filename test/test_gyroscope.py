@@ -67,7 +67,6 @@ def unit():
 def fitted(unit):
     """Fit a MEMS unit in nine positions; its gyroscope's drift is the sum of several effects."""
     records = arrays(unit, plan('chamber-9', 2), 2, rate_hz=RATE_HZ)
-    # A fit with only five groups of columns takes half the time of a fit with all groups.
     options = replace(OPTIONS, groups=('curve', 'gradient', 'board', 'gradient_lag', 'product'))
     return fit([source_of(record, unit.scale_factor) for record in records], options)
 
@@ -82,7 +81,9 @@ def held_out(unit):
 
 
 @pytest.mark.slow
-def test_the_corrected_rate_of_a_mems_gyroscope_has_only_noise(unit, fitted, held_out):
+def test_the_corrected_rate_of_a_mems_gyroscope_has_only_noise_also_in_data_left_out(
+    unit, fitted, held_out
+):
     calibration = fitted.calibration
     gyroscope = calibration.gyroscope
     block = block_of(held_out, unit.scale_factor)
@@ -103,10 +104,6 @@ def test_the_corrected_rate_of_a_mems_gyroscope_has_only_noise(unit, fitted, hel
     np.testing.assert_allclose(gyroscope.noise_density_rad_s_sqrt_hz, 5.0 * MILLIDEGREE, rtol=0.05)
     # From nine positions the residual sd estimates the sd of turn-on offsets, 2 mdeg/s.
     assert np.mean(gyroscope.residual_sd_rad_s) == pytest.approx(2.0 * MILLIDEGREE, rel=0.4)
-
-
-@pytest.mark.slow
-def test_left_out_residuals_of_a_gyroscope_are_near_its_fitted_residuals(fitted):
     row = fitted.rates[-1]
     assert row.section == 'all'
     assert row.raw.rms > 100.0 * FLOOR
@@ -128,7 +125,6 @@ def test_a_gyroscope_does_not_change_the_accelerometer_s_fit(unit):
     provenance = without.calibration.provenance
     same = replace(with_rate.calibration, gyroscope=None, provenance=provenance)
     assert same == without.calibration
-    # A bag with NaN angular rates at rest counts as a bag without angular rates.
     broken = np.array(records[0].angular_rate)
     broken[len(broken) // 2 :] = np.nan
     sources = [source_of(records[0], unit.scale_factor, broken, 'first'), plain[1]]
@@ -137,7 +133,6 @@ def test_a_gyroscope_does_not_change_the_accelerometer_s_fit(unit):
     (messages,) = (finding.message for finding in result.findings if finding.name == 'rate')
     assert messages == 'first: not every sample has an angular rate, so no gyroscope was fitted'
     assert 'rate' not in {finding.name for finding in (*with_rate.findings, *without.findings)}
-    # If the stated |f| differs between rests, the file says, too, why it has no gyroscope.
     known = KnownForce('stated', (Section(0.0, math.inf, 1.002 * STANDARD_GRAVITY, 0.0),))
     result = fit([replace(plain[0], force=known), plain[1]], options)
     notes = result.calibration.provenance.notes
@@ -159,7 +154,7 @@ def test_residuals_about_position_means_do_not_depend_on_the_means(places, seed)
         np.testing.assert_allclose(within[position == p].sum(axis=0), 0.0, atol=1e-12)
 
 
-def test_a_gyroscope_is_read_back_from_a_file_bit_for_bit():
+def test_a_gyroscope_is_read_back_from_a_file_and_messages_name_wrong_keys():
     whole = rich_calibration()
     assert parse_calibration(dump_calibration(whole).encode()) == whole
     triad = rate_triad(whole)
@@ -177,10 +172,7 @@ def test_a_gyroscope_is_read_back_from_a_file_bit_for_bit():
     np.testing.assert_allclose(sd_bias[0], expected, rtol=1e-5)
     with pytest.raises(ValueError, match='`calibration` must have a gyroscope'):
         rate_triad(calibration())
-
-
-def test_the_message_on_a_wrong_gyroscope_names_the_key():
-    text = dump_calibration(rich_calibration())
+    text = dump_calibration(whole)
     for old, new, said in (
         ('bias_rad_s: [0.02', 'bias_rad_s: [.nan', r'gyroscope\.bias_rad_s\[0\]'),
         ('noise_density_rad_s_sqrt_hz: [0.0001', 'noise_density_rad_s_sqrt_hz: [0.0',
@@ -190,18 +182,17 @@ def test_the_message_on_a_wrong_gyroscope_names_the_key():
         assert old in text
         with pytest.raises(CalibrationError, match=said):
             parse_calibration(text.replace(old, new).encode())
-    gyro = rich_calibration().gyroscope
+    gyro = whole.gyroscope
     with pytest.raises(ValueError, match=r'`posterior\.diagonal` must have one number per param'):
         replace(gyro, response=gyro.response[1:])
     with pytest.raises(ValueError, match=r'`bias_function` must be 0 at t = 0 .*, got 1'):
         RateCurve(Polynomial((1.0, 2.0)))
     foreign = replace(gyro, response=(replace(gyro.response[0], sensor='magnet'),), posterior=None)
     with pytest.raises(ValueError, match=r'`gyroscope.response\[0\].sensor` must be one of'):
-        replace(rich_calibration(), gyroscope=foreign)
+        replace(whole, gyroscope=foreign)
 
 
 def test_the_rate_at_the_reference_temperature_is_corrected_by_its_bias():
-    # The gyroscope's calibration subtracts a constant bias of the rate and does not change forces.
     triad = replace(rich_calibration().gyroscope, response=(), posterior=None)
     for gyroscope in (triad, None):
         compensator = Compensator(replace(calibration(), gyroscope=gyroscope))
@@ -225,11 +216,16 @@ def test_the_rate_at_the_reference_temperature_is_corrected_by_its_bias():
 
 
 @pytest.mark.slow
-def test_a_fit_with_a_prior_keeps_the_gyroscope_of_the_prior(unit, fitted):
+def test_after_a_tumble_the_gyroscope_of_the_prior_is_kept_and_gives_no_alarm(unit, fitted):
     record = arrays(unit, plan('tumble', 2)[:1], 5, rate_hz=RATE_HZ)[0]
     again = fit([source_of(record, unit.scale_factor)], replace(OPTIONS, prior=fitted.calibration))
     assert again.calibration.gyroscope == fitted.calibration.gyroscope
     assert again.rates == ()
+    bags = reduced(unit, arrays(unit, plan('tumble', 2)[:2], 3, rate_hz=RATE_HZ))
+    rate = judge_bags(bags, fitted.calibration).rate
+    section = rate.sections['all']
+    assert section.rms < section.raw_rms < 1.3 * section.rms
+    assert rate.kind is Verdict.WIDE
 
 
 def reduced(unit, records):
@@ -240,7 +236,6 @@ def reduced(unit, records):
 @pytest.mark.slow
 def test_the_changes_of_the_rate_are_compared_with_their_claimed_sd(unit, fitted, held_out):
     calibration, bags = fitted.calibration, reduced(unit, [held_out])
-    # The first third of the bag is sufficient to detect a wrong calibration, and saves time.
     thirds = [replace(interval, n_whole=interval.n_whole // 3) for interval in bags[0].intervals]
     short = [replace(bags[0], intervals=tuple(thirds))]
     judged = judge_bags(bags, calibration)
@@ -255,7 +250,6 @@ def test_the_changes_of_the_rate_are_compared_with_their_claimed_sd(unit, fitted
         assert section.raw_rms > 50.0 * FLOOR
     assert judged.facts()['angular_rate']['reason'] == rate.reason
     assert 'angular rate: valid: 0.' in str(rate)
-    # A wrong gyroscope calibration is detected, although it has no covariance.
     gyro = calibration.gyroscope
     other = replace(gyro, response=(), static=gyro.dynamic, dynamic=gyro.dynamic, posterior=None)
     wrong = judge_bags(short, replace(calibration, gyroscope=other))
@@ -263,18 +257,8 @@ def test_the_changes_of_the_rate_are_compared_with_their_claimed_sd(unit, fitted
     assert wrong.rate.kind is Verdict.RECALIBRATE
     assert wrong.exit_code == 1
     assert judge_bags(short, replace(calibration, gyroscope=None)).rate is None
-    # A gyroscope calibration without covariance, as after an import, gives no verdict.
     silent = replace(other, residual_sd_rad_s=(0.0, 0.0, 0.0))
     unknown = judge_bags(short, replace(calibration, gyroscope=silent))
     assert unknown.rate.kind is Verdict.NO_CLAIM
     assert np.isnan(unknown.rate.sections['all'].claimed_rms)
     assert unknown.exit_code == 0
-
-
-@pytest.mark.slow
-def test_a_bag_without_temperature_change_gives_no_alarm(unit, fitted):
-    bags = reduced(unit, arrays(unit, plan('tumble', 2)[:2], 3, rate_hz=RATE_HZ))
-    rate = judge_bags(bags, fitted.calibration).rate
-    section = rate.sections['all']
-    assert section.rms < section.raw_rms < 1.3 * section.rms
-    assert rate.kind is Verdict.WIDE

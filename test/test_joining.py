@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The parts of a split recording give the same fit and judgement as the whole recording."""
+"""The parts of a split recording, and a part of a bag, give the results of one recording."""
 
+import re
 from dataclasses import replace
 from itertools import pairwise
 
@@ -9,15 +10,18 @@ import numpy as np
 import pytest
 from builders import ArrayBlock
 from conftest import ROOT
+from position_helpers import GRAVITY, MG, Rest
+from position_helpers import START_NS as REST_NS
 
 import thermo_comp
-from thermo_comp.errors import FitError
+from thermo_comp.errors import FitError, RecordingError
 from thermo_comp.fitting import FitOptions, FitSource, fit
 from thermo_comp.fitting.joining import joined
 from thermo_comp.fitting.reduction import reduce_source
-from thermo_comp.fitting.sources import KnownForce, digest, parse_sections
+from thermo_comp.fitting.sources import KnownForce, digest, fit_sources, parse_sections
 from thermo_comp.judging.evaluation import evaluate
-from thermo_comp.recording.topics import Topics
+from thermo_comp.recording.reader import open_recording, read_recording
+from thermo_comp.recording.topics import BagPart, Topics
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.unit.gravity import MICRO_G
 
@@ -65,7 +69,6 @@ def test_parts_of_a_rest_have_the_windows_of_the_whole_rest(rng, edges_s):
     whole = recorded(rng, 600.0)
     (bag,) = reduced([whole])
     (rest,) = bag.intervals
-    # The parts are given in reverse order, which must not change the result.
     (again,) = joined(reduced(cut(whole, edges_s))[::-1])
     (continued,) = again.intervals
     assert (again.start_ns, again.end_ns) == (bag.start_ns, bag.end_ns)
@@ -86,15 +89,6 @@ def test_parts_of_a_rest_have_the_windows_of_the_whole_rest(rng, edges_s):
     np.testing.assert_allclose(continued.sample_sd, NOISE, rtol=0.05)
 
 
-def test_a_move_between_two_parts_of_a_recording_gives_two_rests(rng):
-    whole = recorded(rng, 600.0)
-    before, after = cut(whole, (300.0,))
-    moved = replace(after, accel=after.accel + np.array([0.0, 1.0, 0.0]))
-    (bag,) = joined(reduced([before, moved]))
-    first, second = bag.intervals
-    assert first.time[-1] < 300.0 < second.time[0]
-
-
 def test_recordings_that_are_not_parts_of_one_are_not_joined(rng):
     whole = recorded(rng, 400.0)
     # Parts are joined after a pause of up to 60 s; in a longer pause the unit may have restarted.
@@ -102,7 +96,6 @@ def test_recordings_that_are_not_parts_of_one_are_not_joined(rng):
         assert len(joined(reduced(cut(whole, (200.0,), pause_s=pause_s)))) == n
     known = KnownForce('part', parse_sections('0 400 2.0'))
     assert len(joined(reduced(cut(whole, (200.0,)), force=known))) == 2
-    # Recordings of 2 s that begin at equal times are not parts of one recording.
     short = recorded(rng, 2.0)
     assert len(joined(reduced([short, short]))) == 2
     # Two recordings have equal stamps: each is joined only with its own second part.
@@ -114,7 +107,7 @@ def test_recordings_that_are_not_parts_of_one_are_not_joined(rng):
     assert len(joined(reduced([before], serial='a') + reduced([after], serial='b'))) == 2
 
 
-def test_a_part_in_which_the_unit_never_rests_is_joined(rng):
+def test_a_move_between_parts_gives_two_rests_and_parts_without_a_rest_are_joined(rng):
     before, after = cut(recorded(rng, 600.0), (300.0,))
     shaken = replace(after, accel=1e3 * rng.standard_normal(after.accel.shape))
     parts = reduced([before, shaken])
@@ -128,12 +121,16 @@ def test_a_part_in_which_the_unit_never_rests_is_joined(rng):
     assert len(fit(sources, FitOptions(gravity=9.80665, groups=('curve',))).positions) == 1
     with pytest.raises(FitError, match='part1: '):
         fit(sources[1:], FitOptions(gravity=9.80665))
+    whole = recorded(rng, 600.0)
+    before, after = cut(whole, (300.0,))
+    moved = replace(after, accel=after.accel + np.array([0.0, 1.0, 0.0]))
+    (bag,) = joined(reduced([before, moved]))
+    first, second = bag.intervals
+    assert first.time[-1] < 300.0 < second.time[0]
 
 
 def test_a_split_recording_gives_the_calibration_of_the_whole_recording():
-    # WHY: each part of a split recording was fitted with a separate turn-on and separate initial
-    # lag states. For 18 recordings of 9 h, split every hour, the fit took 30 times as long as a
-    # fit of the whole recordings, and had 6 times its claimed sd.
+    # WHY: each part was fitted with a separate turn-on and lag states: an error of 6 claimed sd.
     bag = thermo_comp.read(ROOT / 'bags/fit/01.mcap')
     parts = []
     for begin_s in np.arange(0.0, bag.time_s[-1], 1800.0):
@@ -144,7 +141,6 @@ def test_a_split_recording_gives_the_calibration_of_the_whole_recording():
         use = (bag.time_s >= begin_s) & (bag.time_s < begin_s + 1800.0)
         part = replace(bag, time_s=bag.time_s[use], counts=bag.counts[use])
         parts.append(replace(part, temperatures=readings, name=f'{begin_s:g} s'))
-    # A fit of the column groups 'curve' and 'board' takes 1/5 of the time of a choice of groups.
     options = {'gravity': 9.80665, 'groups': ('curve', 'board')}
     whole, split = (thermo_comp.fit(bags, **options) for bags in (bag, parts))
     assert len(split.provenance.sources) == len(parts)
@@ -152,8 +148,7 @@ def test_a_split_recording_gives_the_calibration_of_the_whole_recording():
         unit.correct(bag.time_s, bag.counts, **bag.temperatures).specific_force
         for unit in (whole, split)
     ))  # fmt: skip
-    # At the end of each part 30 s of samples are lost; the difference of the forces by both fits
-    # scatters by less than 1.2 ug, the noise of a mean over 60 s.
+    # At the end of each part 30 s are lost; 1.2 ug is the noise of a mean over 60 s.
     assert np.nanstd(difference, axis=0).max() < 1.2 * MICRO_G
 
 
@@ -178,6 +173,107 @@ def test_evaluate_and_report_take_the_parts_as_one_recording(tmp_path, rng, cli)
     assert 'part0.mcap .. part1.mcap: 2 bags of one recording, joined' in errors
     page = tmp_path / 'unit.html'
     cli('report', *paths, '-c', tmp_path / 'unit.yaml', '-o', page)
-    # The certificate has name and SHA-256 of each joined bag.
     text = page.read_text()
     assert all(path.name in text and digest(path) in text for path in paths)
+
+
+OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2')
+
+
+def bag_of(path, rest):
+    stamp_ns = REST_NS + np.rint(rest.time * 1e9).astype(np.int64)
+    board_ns = REST_NS + np.rint((rest.board_time - 3.0) * 1e9).astype(np.int64)
+    with BagWriter(path) as writer:
+        writer.write_imu('/imu/uncompensated', stamp_ns, rest.accel, np.zeros((len(stamp_ns), 9)))
+        writer.write_temperature('/temperature/board', board_ns, rest.temperature(rest.board_time))
+    return path
+
+
+@pytest.fixture
+def bag(rng, tmp_path):
+    return bag_of(tmp_path / 'bag.mcap', Rest(rng, duration_s=120.0))
+
+
+def part_of(path, begin=None, end=None, **options):
+    topics = Topics(part=BagPart(begin, end))
+    with open_recording(path, topics, require=('accel',)) as reader:
+        return list(reader.blocks(**options)), reader.since_s
+
+
+@pytest.mark.parametrize('n_messages', [8192, 100])
+@pytest.mark.parametrize(('begin', 'end'), [(20.0, 50.0), (20.0, None), (None, 50.0)])
+def test_a_part_contains_exactly_the_messages_inside(bag, begin, end, n_messages, monkeypatch):
+    monkeypatch.setattr('thermo_comp.recording.blocks.BLOCK_MESSAGES', n_messages)
+    blocks, since = part_of(bag, begin, end, raw=True)
+    whole = read_recording(bag, require=()).columns
+    time = (whole.accel_stamp_ns - REST_NS) * 1e-9
+    inside = (time >= (begin or 0.0)) & (time < (end or 1e3))
+    np.testing.assert_array_equal(np.concatenate([b.accel for b in blocks]), whole.accel[inside])
+    board = whole.temperatures['board']
+    at = (board.stamp_ns - REST_NS) * 1e-9
+    own = (at >= (-9.0 if begin is None else begin)) & (at < (end or 1e3))
+    got = np.concatenate([b.temperatures['board'].celsius for b in blocks])
+    np.testing.assert_array_equal(got, board.celsius[own])
+    assert since == (begin or 0.0)
+    after = [np.sum(inside[:n]) for n in board.after[own]]
+    begins = np.cumsum([0, *map(len, blocks)])
+    places = [b.temperatures['board'].after + n for b, n in zip(blocks, begins, strict=False)]
+    np.testing.assert_array_equal(np.concatenate(places), after)
+    for block in blocks:
+        assert sum(map(len, block.raw.values())) == block.n_messages
+        assert all(len(raw.data) == raw.size.sum() for raw in block.raw.values())
+
+
+def test_a_part_by_stamps_equals_a_part_by_seconds_and_needs_samples(bag):
+    start = REST_NS * 1e-9
+    by_stamp, since = part_of(bag, start + 20.0, start + 50.0)
+    by_time, _ = part_of(bag, 20, 50)
+    assert since == pytest.approx(20.0)
+    for stamped, other in zip(by_stamp, by_time, strict=True):
+        np.testing.assert_array_equal(stamped.accel, other.accel)
+    with pytest.raises(RecordingError, match=re.escape('no sample is in [500:]')) as refused:
+        part_of(bag, 500.0)
+    assert str(bag) in str(refused.value)
+    assert 'which is 120.0 s' in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ('begin', 'end', 'reason'),
+    [
+        (5.0, 5.0, 'must end after its begin 5 s, got 5 s'),
+        (-1.0, None, '0 s or a positive time'),
+        (float('nan'), None, '0 s or a positive time'),
+        (5.0, 1.7e9, 'or both as stamps'),
+    ],
+)
+def test_impossible_bounds_of_a_part_are_refused(begin, end, reason):
+    with pytest.raises(ValueError, match=reason):
+        BagPart(begin, end)
+
+
+def test_the_part_before_a_jump_is_fitted(rng, tmp_path):
+    rest = Rest(rng)
+    rest.add((0.0, 0.0, 20.0 * MG), from_s=300.0)
+    bag = bag_of(tmp_path / 'bag.mcap', rest)
+    for begin in (None, 100.0):
+        sources, kind = fit_sources([bag], Topics(part=BagPart(begin)))
+        with pytest.raises(FitError, match=r'at 300\.0 s the sensor jumped'):
+            fit(sources, OPTIONS)
+    sources, kind = fit_sources([bag], Topics(part=BagPart(100.0, 299.0)))
+    assert kind == 'imu'
+    result = fit(sources, replace(OPTIONS))
+    assert result.bags[0].n_samples == 199 * 25
+    assert result.calibration.provenance.sources[0].name == 'bag.mcap[100:299]'
+
+
+def test_a_jump_of_the_clock_does_not_change_a_part(rng, tmp_path):
+    rest = Rest(rng, duration_s=120.0)
+    path = bag_of(tmp_path / 'bag.mcap', rest)
+    block = read_recording(path, require=()).columns
+    with BagWriter(tmp_path / 'set.mcap') as writer:
+        set_ns = block.accel_stamp_ns + np.where(rest.time >= 60.0, 10**17, 0)
+        writer.write_imu('/imu/uncompensated', set_ns, block.accel, np.zeros((len(set_ns), 9)))
+    topics = Topics(part=BagPart(30.0))
+    with open_recording(tmp_path / 'set.mcap', topics, require=('accel',)) as reader:
+        blocks = list(reader.blocks_on_one_clock())
+    assert sum(map(len, blocks)) == 90 * 25

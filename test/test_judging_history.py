@@ -1,15 +1,21 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Changes between calibrations of a unit are right; `evaluate` and `report` agree."""
+"""Changes between calibrations and the verdicts and forecasts of the drift watch are right."""
 
 import json
 from dataclasses import replace
 
+import field_units
+import field_watch
 import numpy as np
 import pytest
 from builders import axis_set, calibration, regime_set
+from field_helpers import in_any_attitude, jump_of, known, no_error, rests, upright
 from report_helpers import evidence, fitted, write_bag
+from scipy.stats import norm
 
+from thermo_comp.field.series import series_of
+from thermo_comp.field.watch import LIMIT, passage, watch
 from thermo_comp.judging.evaluation import drifts_of, history_of
 from thermo_comp.report.page import render_report
 from thermo_comp.report.style import number
@@ -33,7 +39,7 @@ def dated(created, bias_ug=0.0, ppm=0.0, sd_ug=3.0):
     return replace(unit, provenance=provenance)
 
 
-def test_changes_between_calibrations_and_their_sd_equal_those_found_by_hand():
+def test_changes_between_calibrations_equal_those_found_by_hand_if_they_form_a_history():
     # Dates give the order of calibrations. The change of z bias has the sd hypot(3, 4) = 5 ug.
     drifts = drifts_of(history_of([dated('2026-02-01', 20.0, 50.0, 4.0), dated('2026-01-01')]))
     names = [f'{kind} {axis}' for kind in ('bias', 'scale') for axis in 'xyz']
@@ -47,11 +53,7 @@ def test_changes_between_calibrations_and_their_sd_equal_those_found_by_hand():
     for change in still:
         assert change.change == pytest.approx(0.0, abs=1e-9)
         assert not change.is_sure
-
-
-def test_calibrations_that_do_not_form_a_history_give_no_drift():
     unit = dated('2026-01-01')
-    # One calibration, two of the same bags, or two of different units do not form a history.
     other = replace(unit, unit=replace(unit.unit, serial='other'))
     for calibrations in ([unit], [unit, unit], [unit, other]):
         assert drifts_of(history_of(calibrations)) == []
@@ -113,7 +115,6 @@ def test_evaluate_and_report_give_equal_verdicts(cli, folder, options):
         assert ours[name] == theirs[name], name
     assert printed.returncode == other.returncode == (0 if ours['is_valid'] else 1)
     assert ours['window_s'] == float(options[3] if options else 60)
-    # The page of the report shows the figures of `evaluate`, from windows of the same length.
     text = page.read_text(encoding='utf-8')
     assert f'means over {ours["window_s"]:g} s' in text
     assert ours['verdict'].replace(' ug', ' µg') in text
@@ -121,3 +122,93 @@ def test_evaluate_and_report_give_equal_verdicts(cli, folder, options):
         if section['n']:
             for name in ('raw_rms', 'rms', 'peak', 'claimed_rms'):
                 assert f'>{number(section[name] / 9.80665e-6)}<' in text
+
+
+SLOW = pytest.mark.slow
+
+
+def walked(rate, bound, axes=1, mean=0.0):
+    """Forecast a walk that starts at `mean`; on each axis its variance grows by `rate` per day."""
+    start = np.full(axes, mean)
+    return passage(start, np.zeros((axes, axes)), np.sqrt(rate) * np.eye(axes), bound)
+
+
+def test_the_probability_of_a_first_passage_agrees_with_closed_forms():
+    # A random walk of rate r stays within (-c, c) up to t with the probability: sum over k of
+    # (-1)^k [N((2 k + 1) c / s) - N((2 k - 1) c / s)], s^2 = r t, N: normal distribution. In three
+    # dimensions a walk of rate r on each axis stays in a ball of radius c up to t with the
+    # probability: 2 sum over k > 0 of (-1)^(k + 1) exp(-(k pi)^2 r t / 2 c^2).
+    rate, bound = 4.0, 50.0
+    k, n = np.arange(-40, 41), np.arange(1, 200)
+    both = walked(rate, bound), walked(rate, bound, 3)
+    for probability, days, of_ball in zip((0.1, 0.5, 0.9), *both, strict=True):
+        s = np.sqrt(rate * days)
+        inside = norm.cdf((2 * k + 1) * bound / s) - norm.cdf((2 * k - 1) * bound / s)
+        # A share of about 0.5 among 2000 simulated walks has a standard error of 0.011.
+        assert float((-1.0) ** k @ inside) == pytest.approx(1.0 - probability, abs=0.025)
+        stays = 2.0 * (-1.0) ** (n + 1) @ np.exp(-((n * np.pi) ** 2) * rate * of_ball / 5000.0)
+        assert stays == pytest.approx(1.0 - probability, abs=0.025)
+    # A random walk passes a nearer bound earlier; a unit that does not age never passes a bound.
+    assert walked(rate, bound, mean=30.0)[1] < walked(rate, bound)[1]
+    assert walked(1e-12, bound) == (np.inf,) * 3
+    assert walked(rate, bound, mean=51.0) == (0.0,) * 3
+
+
+@pytest.mark.slow
+def test_forecasts_agree_with_the_simulated_future_of_units():
+    # WHY: errors of opposite attitudes cancelled: forecasts were 3 to 5 times too long.
+    shares, ratios = [], []
+    for kind in ('fixed', 'up and down', 'faces', 'carried'):
+        for rows in field_watch.forecasts(kind, 3, 20).values():
+            shares += rows[:, 0].tolist()
+            ratios.append(float(np.median(rows[:, 3] / rows[:, 1])))
+    # The interval must contain 80 % of the days on which a unit leaves the tolerance, within 6 %.
+    assert np.mean(shares) == pytest.approx(0.8, abs=0.12)
+    # The median time of a unit is uncertain by a factor of 1.5, the mean of eight by 1.3.
+    assert 1.0 / 1.6 < np.exp(np.mean(np.log(ratios))) < 1.6
+    assert 0.45 < min(ratios) < max(ratios) < 2.2
+
+
+@pytest.mark.parametrize('attitudes', [upright, pytest.param(in_any_attitude, marks=SLOW)])
+def test_the_verdict_follows_the_true_error_on_each_day(attitudes):
+    # The RMS error is 1.5 times the limit on days 20 to 34, 20 times on day 12, or else 0.6 times.
+    unit = known()
+    limit = LIMIT * np.sqrt(np.mean(series_of(rests(unit, attitudes, no_error), unit).claim ** 2))
+
+    def error(day):
+        size = 1.5 if 20.0 <= day < 34.0 else 0.6
+        # A bias error of s on each axis has an RMS component of s along random directions.
+        return np.full(3, limit * (20.0 if 12.0 <= day < 13.0 else size))
+
+    series = series_of(rests(unit, attitudes, error, 40, turn_on=5.0 * MICRO_G), unit)
+    first = int(series.day[0])
+    for n_days in (11, 13, 14, 16, 18, 20, 24, 26, 28, 33, 34, 40):
+        result = watch(series.at(series.day < first + n_days), unit)
+        since = {13: 12}.get(n_days, 20 if 20 < n_days <= 34 else None)
+        outside = None if since is None else str(np.datetime64(first + since, 'D'))
+        assert (result.exit_code, result.outside_since) == (int(outside is not None), outside)
+        assert ('outside its claim since' in str(result)) == (since is not None)
+        # With gravity along (1, 1, 1), bias errors of 0.6 times the limit change |f| by 1.04 times
+        # the limit: the day on which the unit returns to its claim may be printed a day late.
+        back = [str(np.datetime64(first + day, 'D')) for day in (34, 35)]
+        assert (result.inside_since in back) == (n_days > 34)
+        assert ('again within its claim since' in str(result)) == (result.inside_since is not None)
+        assert since is not None or f'about {result.last}' not in str(result)
+
+
+def test_the_drift_watch_states_the_day_and_the_temperature_range():
+    of_field = field_units.calibration()
+    unit = known(static=of_field.static, dynamic=of_field.dynamic)
+    healthy = watch(series_of(rests(unit, upright, no_error), unit), unit)
+    assert (healthy.exit_code, healthy.outside_since) == (0, None)
+    assert 'within its claim up to 2030-01-20' in str(healthy)
+    n_rests = [row.n_rests for row in healthy.temperatures]
+    assert sum(row.n_rests for row in healthy.days) == sum(n_rests)
+    assert [row.name for row in healthy.temperatures] == ['10 .. 20 degC', '20 .. 30 degC']
+    assert [row.name for row in healthy.periods] == [row.name for row in healthy.days]
+    year = watch(series_of(rests(unit, upright, no_error, days=61), unit), unit)
+    assert [row.n_rests for row in year.periods] == [9] * 20 + [3]
+    assert healthy.forecast[0] < healthy.forecast[1] <= healthy.forecast[2]
+    assert watch(series_of(rests(unit, upright, no_error), unit), unit, 1.0).forecast[0] == np.inf
+    aged = watch(series_of(rests(unit, upright, jump_of(400.0, 10.0)), unit), unit)
+    assert (aged.exit_code, aged.outside_since, aged.forecast) == (1, '2030-01-11', ())

@@ -75,12 +75,6 @@ def parameters_set(arguments):
     return {value(tag.get('name', '')): value(tag.get('value', '')) for tag in elements}
 
 
-def test_each_driver_of_the_launch_file_has_a_topics_file():
-    parameters = parameters_set({'driver': 'xsens'})
-    assert parameters['topics'] == str(ROOT / 'config/drivers/xsens.yaml')
-    assert 'topics' not in parameters_set({})
-
-
 def test_a_parameter_is_set_only_where_its_argument_was_given(tmp_path):
     # WHY: defaults of launch arguments replaced values in the user's parameter file.
     pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
@@ -119,7 +113,7 @@ def test_a_parameter_is_set_only_where_its_argument_was_given(tmp_path):
         assert all(name.startswith(NOT_GIVEN) for name in unknown)
 
 
-def test_executable_parameters_and_topics_of_a_launch_file_exist():
+def test_executable_parameters_topics_and_drivers_of_a_launch_file_exist():
     pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
     from dataclasses import fields
 
@@ -141,34 +135,29 @@ def test_executable_parameters_and_topics_of_a_launch_file_exist():
     defaults = {arg.get('name'): arg.get('default') for arg in parse(OURS).findall('arg')}
     for remap in node.findall('remap'):
         topic = remap.get('from')
-        # The topic of a thermometer is temperature/NAME.
         assert topic in topics or topic.startswith('temperature/'), topic
         argument = re.fullmatch(r'\$\(var (\w+)\)', remap.get('to', ''))
         assert defaults[argument[1]] == topic
+    parameters = parameters_set({'driver': 'xsens'})
+    assert parameters['topics'] == str(ROOT / 'config/drivers/xsens.yaml')
+    assert 'topics' not in parameters_set({})
 
 
-def test_the_launch_file_beside_ins_passes_declared_arguments():
+def test_the_launch_file_beside_ins_has_existing_arguments_parameters_and_frames():
     (include,) = parse(BESIDE).findall('include')
     assert include.get('file', '').endswith(OURS.name)
     assert {element.get('name') for element in include.findall('arg')} <= declared(parse(OURS))
-
-
-def test_the_launch_file_beside_ins_sets_existing_parameters_of_other_nodes():
     nodes = {(node.get('pkg'), node.get('exec')): node for node in parse(BESIDE).findall('node')}
     assert set(nodes) == set(OTHERS)
     for key, node in nodes.items():
         assert {element.get('name') for element in node.findall('param')} <= OTHERS[key]
-
-
-def test_in_beside_ins_one_node_subtracts_gravity_and_each_frame_has_one_parent():
-    nodes = {element.get('exec'): element for element in parse(BESIDE).findall('node')}
-    given = {
-        name: {arg.get('name'): arg.get('value') for arg in nodes[name].findall('param')}
+    by_exec = {executable: node for (_, executable), node in nodes.items()}
+    madgwick, ekf = (
+        {arg.get('name'): arg.get('value') for arg in by_exec[name].findall('param')}
         for name in ('imu_filter_madgwick_node', 'ekf_node')
-    }
-    madgwick, ekf = given.values()
+    )
     assert (madgwick['publish_tf'], ekf['publish_tf']) == ('false', 'true')
     assert madgwick['remove_gravity_vector'] == 'false'
     assert ekf['imu0_remove_gravitational_acceleration'] == 'true'
-    mounting = nodes['static_transform_publisher'].get('args', '')
+    mounting = by_exec['static_transform_publisher'].get('args', '')
     assert f'--frame-id {ekf["base_link_frame"]}' in mounting

@@ -149,36 +149,19 @@ def loaded_after(statement, *watched):
     return ran(sys.executable, '-c', code, check=True, timeout=120).stdout.split()
 
 
-def test_help_imports_none_of_the_heavy_libraries():
-    heavy = ('numpy', 'scipy', 'rosbags', 'mcap', 'matplotlib', 'rclpy', 'dask')
-    assert loaded_after('import thermo_comp.cli.app', *heavy) == []
-
-
-def test_the_command_info_does_not_import_the_fit():
+def test_help_and_the_command_info_import_none_of_the_heavy_libraries():
     heavy = ('scipy', 'matplotlib', 'rosbags', 'rclpy', 'thermo_comp.fitting')
+    assert loaded_after('import thermo_comp.cli.app', 'numpy', 'mcap', 'dask', *heavy) == []
     assert loaded_after('import thermo_comp.recording.overview', *heavy) == []
 
 
 DOCS = ROOT / 'docs'
 
 
-def test_the_table_of_packages_on_the_page_equals_that_of_test_layers():
+def test_tables_of_packages_and_of_groups_equal_those_of_the_source():
     text = (DOCS / 'architecture.md').read_text()
     rows = re.findall(r'^\| (\d) \| `(\w+)` \|', text, re.MULTILINE)
     assert {room: int(layer) for layer, room in rows} == LAYERS
-
-
-@pytest.mark.parametrize('page', ['architecture.md', 'theory.md'])
-def test_the_files_that_a_page_names_exist(page):
-    text = (DOCS / page).read_text()
-    for name in re.findall(r'[\w*/]+\.py\b', text):
-        places = (ROOT, ROOT / 'thermo_comp', ROOT / 'test')
-        # A page names a file by its path, or by its name alone if the folder is named before.
-        is_path = any(list(place.glob(name)) for place in places)
-        assert is_path or any(path.name == name for path in SOURCES), name
-
-
-def test_the_page_and_the_help_of_fit_have_every_group_of_columns():
     text = (DOCS / 'theory.md').read_text()
     shown = re.findall(r'^\| `(\w+)` \|', text, re.MULTILINE)
     columns = bank(('case',), {'case': -0.5}, (-9.0, 9.0))
@@ -189,3 +172,13 @@ def test_the_page_and_the_help_of_fit_have_every_group_of_columns():
     command = (PACKAGE / 'cli' / 'fit.py').read_text()
     listed = re.search(r'Groups of regression columns: ([^.]*)\.', command)[1]
     assert set(re.findall(r'\w+', listed)) == {'curve', 'set', *groups}
+
+
+@pytest.mark.parametrize('page', ['architecture.md', 'theory.md'])
+def test_the_files_that_a_page_names_exist(page):
+    text = (DOCS / page).read_text()
+    for name in re.findall(r'[\w*/]+\.py\b', text):
+        places = (ROOT, ROOT / 'thermo_comp', ROOT / 'test')
+        # A page names a file by its path, or by its name alone if the folder is named before.
+        is_path = any(list(place.glob(name)) for place in places)
+        assert is_path or any(path.name == name for path in SOURCES), name

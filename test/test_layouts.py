@@ -22,8 +22,6 @@ from thermo_comp.unit.calibration import Unit
 FOXGLOVE = ROOT / 'config' / 'thermo_comp.foxglove.json'
 PLOTJUGGLER = ROOT / 'config' / 'plotjuggler_layout.xml'
 TYPES = get_typestore(Stores.ROS2_JAZZY)
-# A replayed bag has no diagnostics, which only the node publishes.
-LIVE_ONLY = {'/diagnostics'}
 
 
 def replayed(folder, kind):
@@ -71,10 +69,6 @@ def panels():
     return json.loads(FOXGLOVE.read_text())['configById']
 
 
-def foxglove_paths():
-    return [path['value'] for panel in panels().values() for path in panel.get('paths', [])]
-
-
 def script():
     (only,) = json.loads(FOXGLOVE.read_text())['userNodes'].values()
     return only['sourceCode']
@@ -84,7 +78,7 @@ def test_foxglove_paths_name_numbers_in_the_messages(topics):
     used = set()
     (output,) = re.findall(r'export const output = "(.*)"', script())
     fields_of_script = re.findall(r'(\w+): number', re.search(r'type Output = .*', script())[0])
-    for path in foxglove_paths():
+    for path in (path['value'] for panel in panels().values() for path in panel.get('paths', [])):
         topic = max((t for t in [*topics, output] if path.startswith(f'{t}.')), key=len)
         fields = path[len(topic) + 1 :].removesuffix('.@sqrt').split('.')
         if topic == output:
@@ -96,14 +90,11 @@ def test_foxglove_paths_name_numbers_in_the_messages(topics):
     assert used == {output, *topics} - {'/regime/stamped'}
 
 
-def test_topics_in_the_foxglove_script_and_diagnostics_panels_exist(topics):
+def test_foxglove_panels_are_shown_once_and_their_topics_exist(topics):
     (inputs,) = re.findall(r'export const inputs = (\[.*\])', script())
     assert set(json.loads(inputs)) <= set(topics)
     rendered = {p['topicToRender'] for p in panels().values() if 'topicToRender' in p}
-    assert rendered == LIVE_ONLY
-
-
-def test_foxglove_shows_every_panel_once():
+    assert rendered == {'/diagnostics'}  # which only the node publishes
     layout = json.dumps(json.loads(FOXGLOVE.read_text())['layout'])
     shown = re.findall(r'"(?:first|second)": "([^"]*)"', layout)
     assert sorted(shown) == sorted(panels())
@@ -125,7 +116,7 @@ def source_kind(topics, series):
     return field_kind(topics[topic], fields)
 
 
-def test_plotjuggler_curves_name_numbers_in_the_messages(topics):
+def test_plotjuggler_curves_name_numbers_and_splitters_count_their_panels(topics):
     root = plotjuggler()
     snippets = {snippet.get('name'): snippet for snippet in root.iter('snippet')}
     curves = {curve.get('name') for curve in root.iter('curve')}
@@ -134,10 +125,7 @@ def test_plotjuggler_curves_name_numbers_in_the_messages(topics):
     assert set(snippets) <= curves
     for series in (curves - set(snippets)) | sources:
         assert source_kind(topics, series) in ('float64', 'bool')
-
-
-def test_plotjuggler_splitters_have_the_right_number_of_panels():
-    for splitter in plotjuggler().iter('DockSplitter'):
+    for splitter in root.iter('DockSplitter'):
         assert int(splitter.get('count')) == len(splitter)
         assert len(splitter.get('sizes').split(';')) == len(splitter)
 

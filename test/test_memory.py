@@ -13,6 +13,7 @@ from thermo_comp.thermal.lags import START_JITTER, Lag, MemorySpec, start_covari
 from thermo_comp.thermal.memory import LagBank, ThermalMemory, memory_on_grid
 
 TAUS = (60.0, 900.0, 7680.0)
+TWO_STAGES = Lag('board', 900.0, 150.0)
 
 
 @pytest.mark.parametrize('step_s', [0.5, 5.0, 77.0])
@@ -29,14 +30,7 @@ def test_the_lag_of_a_ramp_agrees_with_the_closed_formula(step_s):
     assert (max(extra) > 0.0) == (step_s > 6.0)
 
 
-def test_a_value_with_the_last_stamp_replaces_the_last_value():
-    bank = LagBank((100.0,))
-    bank.step(0, 1.0)
-    bank.step(0, 3.0)
-    assert bank.at(0, 3.0)[0] == [2.0]
-
-
-def test_the_variance_of_a_lag_after_a_gap_agrees_with_the_formula():
+def test_errors_of_a_lag_after_a_gap_a_jump_wrong_or_stuck_readings_agree_with_formulas():
     bank = LagBank((100.0, 1000.0))
     bank.step(0, 0.0)
     # A gap above tau / 10 adds variance to a lag: a gap of 50 s if tau = 100 s, not if 1000 s.
@@ -47,16 +41,29 @@ def test_the_variance_of_a_lag_after_a_gap_agrees_with_the_formula():
     assert variance == pytest.approx([lost**2 * math.exp(-2.0), 0.0])
     bank.note_jump(3.0)
     assert bank.extra == pytest.approx([lost**2 + 9.0, 9.0])
-
-
-def test_a_constant_error_of_readings_gives_an_equal_error_of_the_lag():
+    bank = LagBank((100.0,))
+    bank.step(0, 1.0)
+    bank.step(0, 3.0)
+    assert bank.at(0, 3.0)[0] == [2.0]
     bank = LagBank((100.0,))
     for second in range(2000):
         bank.step(second * SECOND_NS, 0.0, 0.5 if second else 0.0)
     assert bank.extra == pytest.approx([0.25], rel=1e-6)
-
-
-TWO_STAGES = Lag('board', 900.0, 150.0)
+    memory = ThermalMemory(MemorySpec(lags=(TWO_STAGES,)))
+    memory.board_step(0, 0.0)
+    memory.note_jump(2.0)
+    # The lag is (900 * lag_900 - 150 * lag_150) / 750: errors of +-2 K add up to 2 K * 1.4.
+    assert memory.at(0, 0.0, [0.0])[1] == pytest.approx((2.0 * 1.4) ** 2)
+    memory = ThermalMemory(MemorySpec(lags=(('board', 900.0), ('case', 600.0))))
+    memory.board_step(0, 20.0)
+    memory.banks['case'].step(0, 1.0)
+    at = (0, 20.0, [1.0])
+    stuck, right = (2.0, 300.0), (0.0, 0.0)
+    some = (), (stuck, right), (stuck, stuck)
+    moving, board, both = (np.array(memory.at(*at, still)[1::2]) for still in some)
+    share = 1.0 - np.exp(-300.0 / np.array([900.0, 600.0]))
+    np.testing.assert_allclose(board - moving, (2.0 * share) ** 2)
+    np.testing.assert_allclose(both - moving, (2.0 * share) ** 2 * [1.0, 2.0])
 
 
 def after_two_stages(times, board):
@@ -174,23 +181,9 @@ def test_the_prior_of_the_initial_state_of_two_stages_is_that_of_a_random_walk(r
         assert b < 0.0 < share < 1.0
 
 
-def test_a_jump_gives_a_lag_of_two_stages_the_errors_of_both_stages():
-    memory = ThermalMemory(MemorySpec(lags=(TWO_STAGES,)))
-    memory.board_step(0, 0.0)
-    memory.note_jump(2.0)
-    # The lag is a difference of two first-order lags: (900 * lag_900 - 150 * lag_150) / 750.
-    # Errors of +2 K in lag_900 and -2 K in lag_150 add up to 2 K * (900 + 150) / 750 = 2 K * 1.4.
-    assert memory.at(0, 0.0, [0.0])[1] == pytest.approx((2.0 * 1.4) ** 2)
-
-
-def plays(*widths):
-    return ThermalMemory(MemorySpec(plays=tuple((0.0, width) for width in widths)))
-
-
 def test_the_hysteresis_loop_of_a_play_agrees_with_the_formula():
-    # The output of a play operator (half-width 1 K) is v - 1 while its input v rises, v + 1 while
-    # v falls, and constant after a reversal until v has changed by 2 K.
-    memory = plays(1.0)
+    # The output is v - 1 while v rises, v + 1 while v falls, constant for 2 K after a reversal.
+    memory = ThermalMemory(MemorySpec(plays=((0.0, 1.0),)))
     way = np.concatenate((np.linspace(0, 5, 51), np.linspace(5, 0, 51), np.linspace(0, 5, 51)))
     P = []
     for k, v in enumerate(way.tolist()):
@@ -204,21 +197,7 @@ def test_the_hysteresis_loop_of_a_play_agrees_with_the_formula():
     assert memory.at(200, -9.0, [0.0]) == [1.0]
 
 
-def test_the_prior_covariance_of_initial_lag_states_agrees_with_the_formula():
-    lags = (('board', 60.0), ('board', 3600.0), ('case', 3600.0), ('tip', 3600.0))
-    P = start_covariance(lags)
-    assert math.sqrt(P[1, 1]) == pytest.approx(3.0, rel=START_JITTER)
-    assert math.sqrt(P[0, 0]) == pytest.approx(0.39, abs=0.005)
-    assert math.sqrt(P[2, 2]) == pytest.approx(1.0, rel=START_JITTER)
-    assert P[0, 1] == pytest.approx(0.005 * 60.0 * 3600.0 / 3660.0)
-    assert not P[:2, 2:].any()
-    assert P[2, 3] == 0.0
-    assert np.linalg.eigvalsh(P).min() > 0.0
-    assert start_covariance(()).shape == (0, 0)
-
-
-def test_the_prior_of_initial_lag_states_is_their_covariance_after_a_random_walk(rng):
-    # `start_covariance` equals the covariance of lags after a long random walk of T_board.
+def test_initial_lag_states_have_the_prior_of_a_random_walk_and_decay(rng):
     D = 0.005
     tau = np.array([60.0, 240.0, 960.0])
     n, step = 4000, 6.0
@@ -230,25 +209,19 @@ def test_the_prior_of_initial_lag_states_is_their_covariance_after_a_random_walk
     P = start_covariance([('board', t) for t in tau])
     # The variance of n draws is uncertain by sqrt(2 / n) = 2.2 %; time step: 10 % of tau = 60 s.
     np.testing.assert_allclose(m.T @ m / n, P, rtol=0.11)
-
-
-def test_initial_lag_states_decay_with_their_time_constants():
+    lags = (('board', 60.0), ('board', 3600.0), ('case', 3600.0), ('tip', 3600.0))
+    P = start_covariance(lags)
+    assert math.sqrt(P[1, 1]) == pytest.approx(3.0, rel=START_JITTER)
+    assert math.sqrt(P[0, 0]) == pytest.approx(0.39, abs=0.005)
+    assert math.sqrt(P[2, 2]) == pytest.approx(1.0, rel=START_JITTER)
+    assert P[0, 1] == pytest.approx(0.005 * 60.0 * 3600.0 / 3660.0)
+    assert not P[:2, 2:].any()
+    assert P[2, 3] == 0.0
+    assert np.linalg.eigvalsh(P).min() > 0.0
+    assert start_covariance(()).shape == (0, 0)
     memory = ThermalMemory(MemorySpec(lags=(('board', 60.0), ('board', 600.0), ('case', 600.0))))
     assert memory.remaining_shares(5) == [1.0, 1.0, 1.0]
     memory.board_step(0, 20.0)
     memory.banks['case'].step(300 * SECOND_NS, 2.0)
     shares = memory.remaining_shares(600 * SECOND_NS)
     assert shares == pytest.approx([math.exp(-10.0), math.exp(-1.0), math.exp(-0.5)])
-
-
-def test_a_stuck_board_thermometer_adds_errors_to_the_lags_of_board_and_case():
-    memory = ThermalMemory(MemorySpec(lags=(('board', 900.0), ('case', 600.0))))
-    memory.board_step(0, 20.0)
-    memory.banks['case'].step(0, 1.0)
-    at = (0, 20.0, [1.0])
-    stuck, right = (2.0, 300.0), (0.0, 0.0)
-    some = (), (stuck, right), (stuck, stuck)
-    moving, board, both = (np.array(memory.at(*at, still)[1::2]) for still in some)
-    share = 1.0 - np.exp(-300.0 / np.array([900.0, 600.0]))
-    np.testing.assert_allclose(board - moving, (2.0 * share) ** 2)
-    np.testing.assert_allclose(both - moving, (2.0 * share) ** 2 * [1.0, 2.0])

@@ -28,7 +28,6 @@ from thermo_comp.unit.nonlinearity import Nonlinearity
 
 BEST_EFFORT = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-IMU_UNIT = Unit('T-1', 'm/s^2', 160.0, 0.01)
 
 
 @pytest.fixture
@@ -62,7 +61,7 @@ def diagnosis(peer):
 
 
 def test_the_node_takes_imu_input_and_can_switch_to_counts(peer, saved):
-    unit = replace(calibration(), unit=IMU_UNIT)
+    unit = replace(calibration(), unit=Unit('T-1', 'm/s^2', 160.0, 0.01))
     with ros.node_in_thread(*saved(unit, 'input:=imu', 'frame_id:=body')) as node:
         heard = peer.listen(Imu, 'imu/data_raw')
         driver = ros.drive(peer, node, Imu, 'imu/uncompensated')
@@ -107,7 +106,6 @@ def test_the_regime_flag_is_latched_and_not_published_while_unknown(peer, saved)
         assert not flags
         n = 0
         while not flags and n < 4000:
-            # Send samples and readings of 2 min at a time until the soak is recognised.
             for _ in range(120):
                 n += 1
                 driver.temperatures(ros.START_NS + n * ros.SECOND_NS, 20.0, 20.0)
@@ -120,7 +118,6 @@ def test_the_regime_flag_is_latched_and_not_published_while_unknown(peer, saved)
         assert not late[0].data
         # `regime/stamped`, the flag with the stamp of the deciding reading, is latched, too.
         latched = peer.listen(DiagnosticArray, 'regime/stamped', LATCHED)
-        # A subscriber that joins later gets the latched messages, the newest last.
         peer.wait_for(lambda: latched and len(stamped_flags) == len(flags), 'the stamped flags')
         last_ns = ros.stamp_of(stamped_flags[-1])
         peer.wait_for(lambda: ros.stamp_of(latched[-1]) == last_ns, 'the last stamped flag')
@@ -159,7 +156,6 @@ def test_diagnostics_name_faults_of_samples(peer, saved):
         assert (values['samples in'], values['samples out']) == ('4', '1')
         assert values['sample stamp [ns]'] == str(stamp_ns)
         assert [m.linear_acceleration.x for m in heard] == [1.0 / 300.0]
-        # A report without new saturated samples does not mention saturation.
         wait(lambda s, _: 'no samples are coming in' in s.message and 'sat' not in s.message)
         driver.temperatures(stamp_ns, 40.0, 40.0)
         driver.counts(stamp_ns + ros.CYCLE_NS, 1.0, 2.0, 3.0)
@@ -178,7 +174,6 @@ def test_diagnostics_contain_noise_density_and_bias_sd(peer, saved):
         driver.counts(ros.START_NS + 1, *ros.standing(0))
         _, _, values = wait(lambda _, values: values['samples out'] == '1')
         for axis in 'xyz':
-            # An INS needs noise density and bias sd as well as the covariance of each sample.
             density = float(values[f'noise density {axis} [m/s^2/sqrt(Hz)]'])
             whole, bias = (float(values[f'{name} {axis} [m/s^2]']) for name in ('sd', 'bias sd'))
             assert density == unit.noise_density_m_s2_sqrt_hz['xyz'.index(axis)]
@@ -216,7 +211,6 @@ def test_diagnostics_name_faults_of_temperatures(peer, saved):
     unit = replace(thermal_calibration(), nonlinearity=Nonlinearity((1.0, 5.0), 1e-4))
     with ros.node_in_thread(*saved(unit, 'temperature_timeout:=20', 'case_timeout:=10')) as node:
         driver = ros.drive(peer, node)
-        # 50 degC are 15 K above the calibrated range.
         for k in range(5):
             driver.temperatures(ros.START_NS + k * ros.SECOND_NS, 50.0, 50.0)
             driver.counts(ros.START_NS + k * ros.SECOND_NS, *ros.standing(k))
@@ -247,7 +241,6 @@ def test_a_node_with_constants_needs_no_thermometer(peer, saved):
         for k in range(20):
             driver.counts(ros.START_NS + k * ros.CYCLE_NS, *ros.standing(k))
         _, status, values = wait(lambda _, values: values['samples out'] == '20')
-        # The diagnostics may arrive before the last samples, which have a different topic.
         peer.wait_for(lambda: len(heard) == 20)
     # The samples are sent without pauses, so the report may warn of a wrong sample rate.
     assert 'not corrected for temperature' in status.message or 'samples/s' in status.message
@@ -260,21 +253,18 @@ def test_the_sample_rate_is_compared_with_the_calibrated_rate(peer, saved):
     with ros.node_in_thread(*saved(calibration())) as node:
         driver = ros.drive(peer, node)
         driver.temperatures(ros.START_NS, 20.0, 20.0)
-        # The unit's cycle is 10 ms; the samples have stamps 20 ms apart.
-        for k in range(50):
+        for k in range(100):
             driver.counts(ros.START_NS + 2 * k * ros.CYCLE_NS, *ros.standing(k))
-        wait(lambda _, values: values['samples in'] == '50')
-        for k in range(50, 100):
-            driver.counts(ros.START_NS + 2 * k * ros.CYCLE_NS, *ros.standing(k))
+            if k == 49:
+                wait(lambda _, values: values['samples in'] == '50')
         _, _, values = wait(lambda s, _: 'calibrated for 100' in s.message)
         assert float(values['sample rate [Hz]']) == pytest.approx(50.0, rel=0.1)
 
 
-@pytest.mark.parametrize('qos', [ros.DEEP, BEST_EFFORT], ids=['reliable', 'best effort'])
-def test_the_node_connects_to_peers_of_any_reliability(peer, saved, qos):
+def test_the_node_connects_to_best_effort_peers(peer, saved):
     with ros.node_in_thread(*saved(calibration())) as node:
-        heard = peer.listen(Imu, 'imu/data_raw', qos)
-        driver = ros.drive(peer, node, qos=qos)
+        heard = peer.listen(Imu, 'imu/data_raw', BEST_EFFORT)
+        driver = ros.drive(peer, node, qos=BEST_EFFORT)
         driver.temperatures(ros.START_NS, 20.0)
         driver.counts(ros.START_NS, *ros.standing(0))
         peer.wait_for(lambda: heard, 'the sample')

@@ -48,7 +48,6 @@ def thermal_test(path, imu=False, has_case=True):
     case = np.interp(seconds, [0.0, 400.0, 800.0], [15.0, 15.0, 25.0])
     board = np.interp(seconds - 100.0, [0.0, 400.0, 800.0], [16.0, 16.0, 26.0])
     reading_ns = START_NS + (seconds * 1e9).astype(np.int64)
-    # The unit rests with z up; the counts follow from the scale factors of `rich_calibration`.
     accel = np.array([5.0, -3.0, 310.0 * 9.80665]) + rng.integers(-4, 5, (n, 3))
     with BagWriter(path) as writer:
         for topic, values, late_ns in (
@@ -125,8 +124,7 @@ def test_node_and_replay_give_equal_output_for_counts(tmp_path):
 
 @pytest.mark.slow
 def test_without_a_case_sensor_the_board_rate_selects_the_regime(tmp_path):
-    # WHY: without a case sensor `regime/dynamic` was never published, and the table of a replay
-    # stated the regime `unknown`.
+    # WHY: without a case sensor `regime/dynamic` was never published.
     n = thermal_test(tmp_path / 'bag', has_case=False)
     unit = replace(rich_calibration(), unit=UNIT)
     assert run(unit, tmp_path / 'bag', tmp_path) == n
@@ -150,8 +148,7 @@ def test_node_and_replay_give_equal_output_for_imu_messages(tmp_path):
     # The node corrects measured angular rates, and does not change rates marked as missing.
     moved = np.abs(published.imu.angular_velocity - given.angular_velocity)
     assert moved[~is_rate].max() == 0.0
-    # WHY: an acceleration marked as absent was published corrected, and an angular rate that is
-    # NaN was published with the variances of a corrected rate.
+    # WHY: a rate that is NaN was published with the variances of a corrected rate.
     assert (given.linear_acceleration_covariance[:, 0] != -1.0).all()
     is_nan = np.isnan(published.imu.angular_velocity).any(axis=1)
     assert 0 < np.count_nonzero(is_nan) < len(is_nan) / 10

@@ -83,10 +83,8 @@ def test_a_reload_while_samples_flow_loses_no_sample(peer, tmp_path):
         flow = Flow(peer)
         before = flow.more()
         assert flow.bias(before - 1) == 1.0
-        # When the service answers, the node already uses the new calibration.
         assert [r.successful for r in peer.set_parameters(calibration_file=str(second))] == [True]
         flow.more()
-        # A broken file is refused with path, key and reason; the node keeps its calibration.
         # WHY: a file with a lag of 1e-300 s was refused after its bias was already in use.
         for key, old, new in (
             ('lag_s', 'lag_s: 600.0', 'lag_s: 1e-300'), ('axes.x.bias', 'bias: 77.0', 'bias: .nan')
@@ -101,7 +99,6 @@ def test_a_reload_while_samples_flow_loses_no_sample(peer, tmp_path):
             request = GetParameters.Request(names=['calibration_file'])
             (parameter,) = peer.call(GetParameters, 'thermo_comp/get_parameters', request).values
             assert parameter.string_value == str(second)
-        # An atomic request with a wrong value changes no parameter.
         assert not peer.set_atomically(transition_time=5, calibration_file=str(broken)).successful
         assert peer.set_atomically(no_such=5).reason == 'there is no parameter `no_such`'
         result = peer.set_atomically(transition_time=5, calibration_file=str(tmp_path / 'none'))
@@ -128,7 +125,6 @@ def test_a_reload_while_samples_flow_loses_no_sample(peer, tmp_path):
         save_calibration(of_bias(4.0, unit=Unit('T-1', 'm/s^2', 160.0, 0.01)), third)
         (result,) = peer.set_parameters(calibration_file=str(third))
         assert "must be 'counts' (parameter `input` is counts), got 'm/s^2'" in result.reason
-        # A file that names thermometers to which this node does not subscribe is refused.
         save_calibration(of_bias(5.0, sensors=('case', 'lid')), third)
         (result,) = peer.set_parameters(calibration_file=str(third))
         assert 'sensors: must be case, which this node listens to, got case, lid' in result.reason
@@ -137,10 +133,8 @@ def test_a_reload_while_samples_flow_loses_no_sample(peer, tmp_path):
         assert node.is_alive, node.said
         assert node.stop() == 0
         assert 'Traceback' not in node.said
-    # No sample after the first output is lost, repeated or out of order.
     stamps = [stamp_of(message) for message in flow.heard]
     assert stamps == list(range(stamps[0], stamps[-1] + 1, CYCLE_NS))
-    # Each sample is corrected with one of the calibrations, in the order in which they were set.
     biases = [flow.bias(index) for index in range(len(stamps))]
     changes = [b for a, b in pairwise(biases) if a != b]
     assert (biases[0], changes) == (1.0, [2.0, 3.0])
@@ -204,7 +198,6 @@ def test_a_change_that_fails_at_any_line_is_not_applied(tmp_path):
                 sample = START_NS + k * CYCLE_NS, *standing(k)
                 assert running.compensator.process(*sample) == undisturbed.process(*sample)
                 k += 1
-        # Setting the parameters executes over 150 lines; an exception was raised at each line.
         assert number > 150
         for change in changes:
             assert node.node.get_parameter(change.name).value == change.value

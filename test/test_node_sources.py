@@ -42,9 +42,8 @@ def test_samples_of_a_second_publisher_are_never_published(peer, unit):
 
         def both():
             samples.send(1)
-            strange = ros.stamped(
-                Vector3Stamped(), ros.START_NS + samples.n_sent * ros.CYCLE_NS - 5
-            )
+            stamp_ns = ros.START_NS + samples.n_sent * ros.CYCLE_NS - 5
+            strange = ros.stamped(Vector3Stamped(), stamp_ns)
             strange.vector.x, strange.vector.y = 2000.0 + samples.n_sent % 3, -2000.0
             other.publish(strange)
 
@@ -117,7 +116,6 @@ def test_after_a_driver_was_killed_output_continues_within_two_seconds(peer, uni
         with driver_process('first'):
             peer.wait_for(lambda: len(of('first')) > 100, 'samples of the first driver')
         killed = time.monotonic()
-        # Start the driver again 1 s after it was killed, as a supervisor does.
         peer.poll(lambda: time.monotonic() - killed > 1.0, 'a second')
         with driver_process('second') as (_, began_ns):
             peer.wait_for(lambda: of('second'), 'samples of the second driver')

@@ -15,7 +15,7 @@ pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
 
 from builders import calibration
 from node_process import NodeProcess
-from ros_helpers import TIMEOUT, Driver, Peer, node_in_thread, standing
+from ros_helpers import TIMEOUT, Driver, node_in_thread, standing
 from sensor_msgs.msg import Imu
 
 from thermo_comp.ros.node import main
@@ -24,7 +24,8 @@ from thermo_comp.unit.calibration_file import dump_calibration, save_calibration
 
 
 def arguments(*overrides):
-    words = [word for override in overrides for word in ('-p', override)]
+    kinds = ('-r' if rule.startswith('temperature') else '-p' for rule in overrides)
+    words = [word for pair in zip(kinds, overrides, strict=True) for word in pair]
     return ['thermo_comp_node', '--ros-args', *words]
 
 
@@ -48,6 +49,8 @@ def arguments(*overrides):
         (['calibration_file:={unit}', 'qos_overrides./accel/counts.subscription.depth:=deep'],
          "accel/counts cannot be opened: Trying to set parameter 'qos_overrides./accel/counts"),
         (['calibration_file:={unit}', 'use_sim_time:=7'], "set parameter 'use_sim_time' to '7'"),
+        (['calibration_file:={unit}', 'topics:=board=/t', 'temperature/case:=/t'],
+         '/t: one topic for both board and case: name a single thermometer as the board, not as'),
     ],
 )  # fmt: skip
 def test_a_node_that_cannot_start_prints_one_line(overrides, text, unit, tmp_path, capfd):
@@ -62,16 +65,6 @@ def test_a_node_that_cannot_start_prints_one_line(overrides, text, unit, tmp_pat
     (line,) = printed.err.splitlines()
     assert line.startswith('thermo_comp_node: ')
     assert text in line
-
-
-def test_a_node_with_one_topic_for_two_thermometers_does_not_start(unit, capfd):
-    remaps = [f'temperature/{name}:=/imu/temperature' for name in ('board', 'case')]
-    words = [word for remap in remaps for word in ('-r', remap)]
-    assert main([*arguments(f'calibration_file:={unit}'), *words]) == 1
-    assert capfd.readouterr().err == (
-        'thermo_comp_node: /imu/temperature: one topic for both board and case: name '
-        'a single thermometer as the board, not as another input\n'
-    )
 
 
 @pytest.mark.parametrize(
@@ -89,16 +82,14 @@ def test_an_unusable_ros_environment_is_one_line(name, value, text, unit, monkey
     assert text in printed
 
 
-def test_a_node_with_closed_streams_runs(unit):
+def test_a_node_with_closed_streams_runs(unit, peer):
     # WHY: with stderr closed, the pipe for signals had descriptor 2, so log text became a signal.
-    peer = Peer()
     shell = ['sh', '-c', 'exec "$0" "$@" <&- >&- 2>&-', sys.executable]
     words = [*shell, '-m', 'thermo_comp.ros.node', *arguments(f'calibration_file:={unit}')[1:]]
     with subprocess.Popen(words, cwd=Path(__file__).parents[1]) as node:
         assert peer.describe('serial')[0].description
         node.terminate()
         assert node.wait(TIMEOUT) == 0
-    peer.close()
 
 
 @pytest.mark.parametrize(('sink', 'code'), [('> /dev/full', 1), ('| true', 0)])
@@ -130,7 +121,7 @@ def test_node_and_commands_without_ros_end_with_advice(tmp_path, monkeypatch):
     assert f'cannot import (No module named {absent}): source the setup' in finished.stderr
 
 
-def test_the_node_needs_only_ros_numpy_and_yaml(unit, tmp_path, monkeypatch):
+def test_the_node_needs_only_ros_numpy_and_yaml(unit, peer, tmp_path, monkeypatch):
     # Python imports sitecustomize at its start, in the node and in its child processes.
     (tmp_path / 'sitecustomize.py').write_text(
         'import sys\n'
@@ -145,7 +136,6 @@ def test_the_node_needs_only_ros_numpy_and_yaml(unit, tmp_path, monkeypatch):
     check += '    try: find_spec(name)\n    except ModuleNotFoundError: print(name)'
     finished = ran(sys.executable, '-c', check)
     assert tuple(finished.stdout.split()) == ABSENT
-    peer = Peer()
     heard = peer.listen(Imu, 'imu/data_raw')
     with NodeProcess('-p', f'calibration_file:={unit}') as node:
         driver = Driver(peer)
@@ -165,21 +155,17 @@ def test_the_node_needs_only_ros_numpy_and_yaml(unit, tmp_path, monkeypatch):
         peer.poll(is_heard, 'a sample after the reload')
         assert node.stop() == 0
         assert 'rror' not in node.said.replace('[ERROR]', '')
-    peer.close()
     finished = ran(sys.executable, '-m', 'thermo_comp', 'info', unit)
     assert finished.returncode == 1
     text = 'thermo_comp: error: the commands need typer: pip install thermo_comp\n'
     assert (finished.stdout, finished.stderr) == ('', text)
 
 
-def test_the_node_prints_its_help_and_names_unknown_arguments(capfd):
+def test_the_node_prints_its_help_and_names_wrong_arguments(capfd):
     assert main(['thermo_comp_node', '--help']) == 0
     assert 'example: thermo_comp_node --ros-args -p calibration_file' in capfd.readouterr().out
     assert main(['thermo_comp_node', 'unit.yaml']) == 2
     assert "unknown argument 'unit.yaml'" in capfd.readouterr().err
-
-
-def test_wrong_ros_arguments_of_the_node_give_one_line(capfd):
     assert main(['thermo_comp_node', '--ros-args', '--params-file', '/none.yaml']) == 2
     printed = capfd.readouterr().err
     assert 'thermo_comp_node: ' in printed

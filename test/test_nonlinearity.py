@@ -30,14 +30,6 @@ def term(kind, x, y, z, slope=0.0):
     return NonlinearTerm(kind, (x, y, z), per_kelvin, 1e-4)
 
 
-def test_a_nonlinear_term_that_depends_on_temperature_needs_a_thermometer():
-    # WHY: if only a nonlinear term had a slope, the calibration needed no board temperature.
-    for slope in (0.0, 1e-7):
-        square = NonlinearTerm('square', (1e-5,) * 3, (0.0, 0.0, slope), 1e-4)
-        value = calibration(nonlinearity=Nonlinearity((0.0, 20.0), 1e-5, (square,)))
-        assert value.needs_temperature == bool(slope)
-
-
 SQUARE = term('square', 1e-5, -2e-5, 3e-5, 0.01)
 ODD = term('odd_square', 5e-6, -5e-6, 1e-5, 0.01)
 CUBE = term('cube', 1e-6, -1e-6, 2e-6, 0.01)
@@ -50,9 +42,8 @@ def with_covariance(unit, rng, size=1e-5):
     return replace(unit, posterior=posterior_of(root @ root.T + size**2 * np.eye(n)))
 
 
-# The error of one Halley step at 10 g is 1e-14 g for a K2 of 100 ug/g^2, 1e-9 g for 1 mg/g^2.
 @pytest.mark.parametrize(('k2', 'tolerance'), [(1e-5, 1e-12), (-1e-4, 1e-12), (1e-3, 3e-9)])
-def test_the_inverse_of_a_square_is_the_root_of_a_quadratic(k2, tolerance):
+def test_the_inverses_of_a_square_and_of_a_cube_are_roots(k2, tolerance):
     x = np.linspace(-10.0, 10.0, 41)
     root = 2.0 * x / (1.0 + np.sqrt(1.0 + 4.0 * k2 * x))
     np.testing.assert_allclose(linearised(x, k2, 0.0, 0.0), root, rtol=0.0, atol=tolerance)
@@ -61,16 +52,13 @@ def test_the_inverse_of_a_square_is_the_root_of_a_quadratic(k2, tolerance):
         odd = 2.0 * reading / (1.0 + np.sqrt(1.0 + 4.0 * signed * reading))
         forces = linearised(reading, 0.0, k2, 0.0), linearised(reading, k2, 0.0, 0.0)
         assert forces == pytest.approx((odd, expected), abs=tolerance)
-
-
-def test_the_inverse_of_a_cube_is_the_real_root():
     for x in np.linspace(-10.0, 10.0, 9).tolist():
         roots = np.roots([1e-6, 1e-5, 1.0, -x])
         real = roots[np.argmin(np.abs(roots - x))].real
         assert linearised(x, 1e-5, 0.0, 1e-6) == pytest.approx(real, abs=1e-11)
 
 
-def test_a_correction_inverts_the_terms_at_their_temperature():
+def test_a_correction_inverts_the_terms_and_blocks_have_the_bits_of_single_samples(rng):
     unit = calibration(nonlinearity=BENT)
     f = np.array([5.0, -3.0, 2.0])
     t = 6.0
@@ -80,9 +68,6 @@ def test_a_correction_inverts_the_terms_at_their_temperature():
     warm(compensator, 20.0 + t, until_s=120)
     corrected = compensator.process(119 * 10**9, *(300.0 * G * x).tolist())
     assert np.array(corrected[:3]) / G == pytest.approx(f, abs=1e-11)
-
-
-def test_nonlinear_corrections_of_single_samples_and_blocks_have_equal_bits(rng):
     bent = replace(rich_calibration(), posterior=None, nonlinearity=BENT)
     unit = with_covariance(bent, rng)
     # Forces reach 10 g on an axis; the largest force of the fit is 6 g.
@@ -94,12 +79,17 @@ def test_nonlinear_corrections_of_single_samples_and_blocks_have_equal_bits(rng)
     assert (np.abs(rows[:, 2]) > BENT.force_range_m_s2[1]).any()
 
 
-def test_a_nonlinearity_without_terms_does_not_change_a_bit(rng):
+def test_a_nonlinearity_without_terms_changes_no_bit_and_with_a_slope_needs_a_thermometer(rng):
     plain, events = rich_calibration(), run_of(rng, seconds=30)
     empty = replace(plain, nonlinearity=Nonlinearity((9.0, 100.0), 1e-4))
     before, _ = stream(Compensator(plain, UNCHECKED), events)
     np.testing.assert_array_equal(stream(Compensator(empty, UNCHECKED), events)[0], before)
     assert 'nonlinearity: null' in dump_calibration(plain)
+    # WHY: if only a nonlinear term had a slope, the calibration needed no board temperature.
+    for slope in (0.0, 1e-7):
+        square = NonlinearTerm('square', (1e-5,) * 3, (0.0, 0.0, slope), 1e-4)
+        value = calibration(nonlinearity=Nonlinearity((0.0, 20.0), 1e-5, (square,)))
+        assert value.needs_temperature == bool(slope)
 
 
 def test_the_variance_of_a_nonlinear_axis_includes_all_parameters(rng):

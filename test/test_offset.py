@@ -81,16 +81,13 @@ def test_a_bag_per_position_needs_no_other_bag_for_the_offset(rng):
     assert result.bags[0].n_saturated == result.bags[1].n_saturated == 0
 
 
-def test_the_scale_of_16_bit_words_in_one_attitude_is_right(rng):
+def test_16_bit_words_in_one_attitude_have_the_right_scale_and_are_saturated_at_their_limits(rng):
     result = fit([source(words_of([np.array((0.0, 0.0, 1.0))], rng) + 32768.0)], OPTIONS)
     bias, scale = constants(result)
     # In one attitude scale and bias keep their prior sd, 5 % and 1 m/s^2 (about 400 counts).
     np.testing.assert_allclose(scale, 4200.0 / GRAVITY, rtol=0.05)
     np.testing.assert_allclose(bias, 32768.0, atol=400.0)
     assert result.calibration.unit.full_scale == 65535.0
-
-
-def test_unsigned_words_at_their_limits_are_saturated(rng):
     words = words_of([np.array((0.0, 0.0, 1.0))], rng) + 32768.0
     words[500, 0], words[600, 2] = 65535.0, 0.0
     (bag,) = fit([source(words)], OPTIONS).bags
@@ -104,9 +101,8 @@ def test_the_offset_of_a_prior_is_used(rng, plain):
     np.testing.assert_allclose(constants(result)[0], 32768.0 + BIAS, atol=2.0)
 
 
-def test_drifts_and_rotations_in_one_pose_are_not_taken_for_an_offset(rng):
-    # WHY: the readings of four bags in one pose fit a sphere by chance; its centre was taken for
-    # the zero of unsigned integers, and the corrected drift had an error of 143 mg.
+def test_an_offset_is_found_only_if_positions_determine_it(rng):
+    # WHY: readings in one pose fit a sphere by chance; the corrected drift had an error of 143 mg.
     for up in (np.eye(3)[2], np.array([-0.06, -0.25, -0.97])):
         for n in (4, 6, 8):
             for _ in range(100):
@@ -114,9 +110,6 @@ def test_drifts_and_rotations_in_one_pose_are_not_taken_for_an_offset(rng):
                 drift = np.outer(celsius, 1e-4 * rng.standard_normal(3))
                 turned = up + 1e-3 * rng.standard_normal((n, 3)) + drift
                 assert not rough_centre(4e6 * turned).any()
-
-
-def test_an_offset_is_found_only_if_positions_determine_it(rng):
     ups = positions(12, 5)
     assert not rough_centre(4096.0 * ups + (800.0, -900.0, 700.0)).any()
     np.testing.assert_allclose(rough_centre(100.0 * ups + 338.0), 338.0, atol=1e-6)

@@ -25,31 +25,25 @@ KNOWN_KEYS = {
 }
 
 
-def setup_literals():
-    literals = {}
-    for node in ast.parse((ROOT / 'setup.py').read_text()).body:
-        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
-            try:
-                literals[node.targets[0].id] = ast.literal_eval(node.value)
-            except ValueError:
-                continue
-    return literals
-
-
-def test_the_version_is_equal_wherever_it_is_stated():
+def test_version_and_dependencies_are_equal_wherever_they_are_stated():
     assert MANIFEST.findtext('version') == thermo_comp.__version__
     assert re.fullmatch(r'\d+\.\d+\.\d+', thermo_comp.__version__)
     finished = ran(sys.executable, 'setup.py', '--version', check=True)
     assert finished.stdout.split()[-1] == thermo_comp.__version__
-
-
-def test_the_manifest_has_format_3_and_names_keys_that_exist():
     assert MANIFEST.get('format') == '3'
     assert MANIFEST.findtext('name') == 'thermo_comp'
     assert MANIFEST.findtext('export/build_type') == 'ament_python'
     tags = ('depend', 'exec_depend', 'build_depend', 'test_depend')
     keys = {node.text for tag in tags for node in MANIFEST.iter(tag)}
     assert keys == KNOWN_KEYS
+    # Commands have further dependencies, which come from PyPI.
+    keys = {node.text for node in MANIFEST.iter('exec_depend')}
+    libraries = {key for key in keys if key.startswith('python3-')}
+    assert libraries == {'python3-numpy', 'python3-yaml'}
+    install = re.search(r'^INSTALL = (\[.*?^\])', (ROOT / 'setup.py').read_text(), re.M | re.S)[1]
+    install = ast.literal_eval(install)
+    assert isinstance(install, list)
+    assert all('>=' in requirement for requirement in install), 'no floor'
 
 
 def test_the_licence_file_contains_the_whole_apache_licence():
@@ -68,28 +62,15 @@ def tracked(*patterns):
     return [ROOT / name for name in names if (ROOT / name).exists()]
 
 
-def test_every_source_file_states_its_licence():
+def test_every_source_file_states_its_licence_and_has_at_most_500_lines():
     first = 'SPDX-FileCopyrightText: 2026 thermo_comp contributors'
     second = 'SPDX-License-Identifier: Apache-2.0'
     for path in tracked('*.py', 'Makefile', '.ci/run'):
         lines = path.read_text().splitlines()
         lines = lines[1:] if lines and lines[0].startswith('#!') else lines
         assert lines[:2] == [f'# {first}', f'# {second}'], path
-
-
-def test_no_source_file_exceeds_the_limit_of_lines():
     lengths = {path: len(path.read_text().splitlines()) for path in tracked('*.py')}
     assert {path.name: n for path, n in lengths.items() if n > 500} == {}
-
-
-def test_the_manifest_lists_only_dependencies_of_the_node():
-    # Commands have further dependencies, which come from PyPI.
-    keys = {node.text for node in MANIFEST.iter('exec_depend')}
-    libraries = {key for key in keys if key.startswith('python3-')}
-    assert libraries == {'python3-numpy', 'python3-yaml'}
-    install = setup_literals()['INSTALL']
-    assert isinstance(install, list)
-    assert all('>=' in requirement for requirement in install), 'no floor'
 
 
 def test_hosted_ci_installs_as_the_readme_describes():
@@ -104,7 +85,6 @@ def test_hosted_ci_installs_as_the_readme_describes():
 
 
 def test_the_installed_share_folder_contains_the_files_that_ros_needs(tmp_path):
-    # Install the data files into a folder with setup.py, as colcon does.
     words = (*('build', '--build-base', tmp_path / 'build'), 'install_data', '--install-dir')
     environment = {**os.environ, 'PYTHONWARNINGS': 'ignore'}
     command = (sys.executable, 'setup.py', '-q', *words, tmp_path / 'prefix')
@@ -124,20 +104,14 @@ STYLE = ['D200', 'D205', 'D400', 'D403']
 
 
 @pytest.mark.filterwarnings('ignore')
-def test_ament_flake8_finds_nothing():
-    linter = pytest.importorskip('ament_flake8.main')
-    code, errors = linter.main_with_errors(argv=['--config', str(ROOT / 'setup.cfg'), *SOURCES])
-    assert code == 0, '\n'.join(errors)
-
-
-@pytest.mark.filterwarnings('ignore')
-def test_ament_pep257_finds_nothing():
-    linter = pytest.importorskip('ament_pep257.main')
-    assert linter.main(argv=['--add-ignore', *STYLE, '--', *SOURCES]) == 0
-
-
-@pytest.mark.filterwarnings('ignore')
-def test_ament_xmllint_finds_nothing():
-    linter = pytest.importorskip('ament_xmllint.main')
-    paths = [str(ROOT / name) for name in ('package.xml', 'config', 'launch')]
-    assert linter.main(argv=paths) == 0
+@pytest.mark.parametrize(
+    ('name', 'arguments'),
+    [
+        ('flake8', ['--config', str(ROOT / 'setup.cfg'), *SOURCES]),
+        ('pep257', ['--add-ignore', *STYLE, '--', *SOURCES]),
+        ('xmllint', [str(ROOT / name) for name in ('package.xml', 'config', 'launch')]),
+    ],
+)
+def test_the_linters_of_ament_find_nothing(name, arguments, capfd):
+    linter = pytest.importorskip(f'ament_{name}.main')
+    assert linter.main(argv=arguments) == 0, capfd.readouterr().out

@@ -19,16 +19,9 @@ from thermo_comp.ros.parameters import NodeConfig, ParameterError
 from thermo_comp.topics import OUTPUTS
 
 
-def test_parameters_and_compensator_have_the_same_defaults():
+def test_parameters_are_described_and_overrides_are_applied():
     with bare_node() as node:
         config = parameters.declare(node)
-    assert config == NodeConfig()
-    assert config.compensator_config() == CompensatorConfig()
-
-
-def test_every_parameter_is_described():
-    with bare_node() as node:
-        parameters.declare(node)
         for entry in fields(NodeConfig):
             shown = node.describe_parameter(entry.name)
             assert shown.description == entry.metadata['description']
@@ -37,9 +30,13 @@ def test_every_parameter_is_described():
             assert bool(shown.floating_point_range) == isinstance(entry.default, float)
             assert bool(shown.integer_range) == isinstance(entry.default, int)
     assert parameters.descriptor('input').additional_constraints == 'one of: counts, imu'
-
-
-def test_overrides_are_applied_and_integers_are_accepted_for_floats():
+    assert config == NodeConfig()
+    assert config.compensator_config() == CompensatorConfig()
+    table, text = parameters_table(), parameters.parameters_help()
+    for entry in fields(NodeConfig):
+        assert f'| `{entry.name}` |' in table
+        assert f'  {entry.name}:=' in text
+    assert table.count('\n') == 2 + len(fields(NodeConfig))
     # WHY: rclpy refuses `-p transition_time:=5` for a float parameter, with a traceback.
     with bare_node('transition_time:=5', 'serial:=unit42', 'case_timeout:=2.5') as node:
         config = parameters.declare(node)
@@ -75,33 +72,12 @@ def test_a_bad_override_is_refused_with_its_name_rule_and_value(override, text):
         ('serial', 'a\nb', "line of at most 64 characters, got 3 characters: 'a"),
     ],
 )
-def test_an_update_with_one_wrong_parameter_changes_no_parameter(name, value, text):
+def test_an_update_ignores_other_nodes_and_one_wrong_parameter_changes_none(name, value, text):
     changes = [Parameter('serial', value='other'), Parameter(name, value=value)]
     with pytest.raises(ParameterError, match=text):
         parameters.updated(NodeConfig(), changes)
-
-
-def test_an_update_ignores_parameters_of_other_nodes():
     changes = [Parameter('use_sim_time', value=True), Parameter('frame_id', value='imu_link')]
     assert parameters.updated(NodeConfig(), changes) == NodeConfig(frame_id='imu_link')
-
-
-def test_table_and_help_name_every_parameter():
-    table, text = parameters_table(), parameters.parameters_help()
-    for entry in fields(NodeConfig):
-        assert f'| `{entry.name}` |' in table
-        assert f'  {entry.name}:=' in text
-    assert table.count('\n') == 2 + len(fields(NodeConfig))
-
-
-def test_pages_contain_the_generated_table_of_parameters(root):
-    table = parameters_table()
-    header = table.splitlines()[0]
-    pages = [root / 'README.md', *(root / 'docs').rglob('*.md')]
-    shown = [page for page in pages if header in page.read_text(encoding='utf-8')]
-    assert shown
-    for page in shown:
-        assert table in page.read_text(encoding='utf-8'), page
 
 
 def test_the_parameter_file_states_the_defaults(root):

@@ -14,8 +14,8 @@ pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
 
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
-from recording_helpers import ACCEL, BOARD, Message, imu_columns, write_rosbag1
-from ros_helpers import TIMEOUT, stamp_of
+from recording_helpers import imu_columns
+from ros_helpers import TIMEOUT
 from rosbags.highlevel import AnyReader
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, Temperature
@@ -25,8 +25,6 @@ from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.ros import player
 from thermo_comp.ros.player import play
-
-WINDOW = player.WINDOW['accel']
 
 START_NS = 1_767_225_600_000_000_000
 CYCLE_NS = 2_500_000
@@ -45,9 +43,9 @@ def bag_of(path, n, rng):
     return path
 
 
-def messages_of(path):
+def messages_of(path, name=''):
     with AnyReader([path]) as reader:
-        return [bytes(data) for _, _, data in reader.messages()]
+        return [bytes(data) for link, _, data in reader.messages() if name in link.topic]
 
 
 class Listener:
@@ -63,23 +61,14 @@ class Listener:
         self.peer.wait_for(lambda: sum(map(len, self.topics.values())) >= n, f'{n} messages')
 
 
-def by_topic(path):
-    heard = {name: [] for name in NAMES}
-    with AnyReader([path]) as reader:
-        for connection, _, data in reader.messages():
-            heard[connection.topic.lstrip('/')].append(bytes(data))
-    return heard
-
-
 @pytest.mark.parametrize('rate', [0.0, 20.0], ids=['as fast as taken', 'paced'])
 def test_every_message_played_over_dds_arrives_byte_for_byte(peer, tmp_path, rng, rate):
     bag = bag_of(tmp_path / 'bag', 4000, rng)
     listener = Listener(peer)
     progress = []
     report = play(bag, rate=rate, progress=progress.append)
-    # The player ends after all reliable subscribers have received all messages.
     listener.wait_for(4800)
-    assert listener.topics == by_topic(bag)
+    assert listener.topics == {name: messages_of(bag, name) for name in NAMES}
     temperatures = {'/temperature/board': 400, '/temperature/case': 400}
     assert report.n_messages == {'/accel/counts': 4000, **temperatures}
     assert (report.unheard, report.lossy) == ([], [])
@@ -117,18 +106,16 @@ def test_the_player_waits_for_a_slow_subscriber_which_loses_no_message(tmp_path,
     words = [sys.executable, '-c', SLOW_LISTENER]
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as listener:
         try:
-            # On a busy machine the process of the listener may need a long time to start.
             report = play(tmp_path / 'bag.mcap', rate=0.0, wait_s=TIMEOUT)
             printed, _ = listener.communicate(timeout=2 * TIMEOUT)
         finally:
-            # After a failure the listener would wait for further messages for ever.
             listener.kill()
     assert report.n_messages == {'/accel/counts': 7000}
     expected = hashlib.sha256(b''.join(messages_of(tmp_path / 'bag.mcap'))).hexdigest()
     assert printed.strip() == expected
 
 
-def test_play_names_topics_without_subscriber_and_best_effort_subscribers(peer, tmp_path, rng):
+def test_play_names_unheard_and_lossy_topics_and_refuses_wrong_arguments(peer, tmp_path, rng):
     bag = bag_of(tmp_path / 'bag', 20, rng)
     best_effort = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
     peer.listen(Temperature, 'temperature/case', best_effort)
@@ -136,6 +123,10 @@ def test_play_names_topics_without_subscriber_and_best_effort_subscribers(peer, 
     assert report.unheard == ['/accel/counts', '/temperature/board']
     assert report.lossy == ['/temperature/case']
     assert report.n_messages['/accel/counts'] == 20
+    with pytest.raises(ValueError, match='`rate` must be zero or positive, got -1'):
+        play(bag, rate=-1.0)
+    with pytest.raises(RecordingError, match='none'):
+        play(tmp_path / 'none')
 
 
 def test_imu_messages_are_played_under_the_names_of_the_bag(peer, tmp_path, rng):
@@ -152,33 +143,7 @@ def test_imu_messages_are_played_under_the_names_of_the_bag(peer, tmp_path, rng)
     assert list(report.n_messages) == ['/imu/uncompensated']
 
 
-def test_ros_1_bags_are_played_in_cdr(peer, tmp_path):
-    path, messages = tmp_path / 'old.bag', []
-    for k in range(20):
-        for topic, numbers in ((BOARD, (20.0 + k, 0.0)), (ACCEL, (float(k), 2.0, 3.0))):
-            at = 5 * 10**9 + k
-            messages.append(Message(topic, at, at, 'imu_link', numbers))
-    write_rosbag1(path, messages)
-    counts_heard = peer.listen(Vector3Stamped, 'accel/counts', UNLIMITED)
-    board_heard = peer.listen(Temperature, 'temperature/board', UNLIMITED)
-    play(path, rate=0.0)
-    peer.wait_for(lambda: len(counts_heard) == len(board_heard) == 20, 'all messages')
-    assert [message.vector.x for message in counts_heard] == [float(k) for k in range(20)]
-    assert {message.header.frame_id for message in counts_heard} == {'imu_link'}
-    assert [stamp_of(message) for message in counts_heard] == [5 * 10**9 + k for k in range(20)]
-    assert [message.temperature for message in board_heard] == [20.0 + k for k in range(20)]
-
-
-def test_play_refuses_a_negative_rate_and_an_absent_bag(tmp_path, rng):
-    bag = bag_of(tmp_path / 'bag', 20, rng)
-    with pytest.raises(ValueError, match='`rate` must be zero or positive, got -1'):
-        play(bag, rate=-1.0)
-    with pytest.raises(RecordingError, match='none'):
-        play(tmp_path / 'none')
-
-
 def test_the_player_ends_if_a_subscriber_takes_no_message(peer, tmp_path, rng, monkeypatch):
-    # The middleware stores 5000 messages and refuses further messages.
     with BagWriter(tmp_path / 'bag') as writer:
         stamps = START_NS + np.arange(8000) * CYCLE_NS
         writer.write_counts(TOPICS.counts, stamps, rng.integers(-9, 9, (8000, 3)))

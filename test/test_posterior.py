@@ -44,17 +44,17 @@ def test_variances_are_kept_and_correlation_errors_are_within_the_tolerance(seed
     assert posterior.matrix.shape == (n, posterior.rank)
 
 
-def test_the_factor_of_a_covariance_has_few_columns():
-    assert posterior_of(random_covariance(1, 30)).rank < 30
-
-
-def test_exactly_known_parameters_have_zero_variance():
+def test_the_factor_is_small_and_read_only_and_known_parameters_have_zero_variance():
     covariance = np.zeros((4, 4))
     assert posterior_of(covariance) == Posterior.of(np.empty((4, 0)), np.zeros(4))
     covariance[2, 2] = 9.0
     posterior = posterior_of(covariance)
     assert posterior.rank == 1
     np.testing.assert_array_equal(posterior.covariance(), covariance)
+    assert posterior_of(random_covariance(1, 30)).rank < 30
+    posterior = posterior_of(np.eye(2))
+    with pytest.raises(ValueError, match='read-only'):
+        posterior.matrix[0, 0] = 1.0
 
 
 @pytest.mark.parametrize(
@@ -72,12 +72,6 @@ def test_a_matrix_that_is_no_covariance_in_single_precision_is_refused(matrix, m
         posterior_of(np.array(matrix))
     with pytest.raises(ValueError, match='`diagonal` must not have a negative variance'):
         Posterior.of(np.ones((1, 1)), np.array([-1.0]))
-
-
-def test_arrays_of_a_posterior_are_read_only():
-    posterior = posterior_of(np.eye(2))
-    with pytest.raises(ValueError, match='read-only'):
-        posterior.matrix[0, 0] = 1.0
 
 
 def test_the_order_of_parameters_equals_one_found_by_hand():
@@ -105,14 +99,11 @@ def whole_bank(sensors):
     return replace(value, posterior=Posterior.of(factor, np.full(n, 1 / 3)))
 
 
-def test_a_model_of_all_columns_of_two_thermometers_can_be_saved():
+def test_a_model_of_all_columns_of_two_thermometers_can_be_saved_and_of_three_not():
     value = whole_bank(('case', 'frame'))
     content = dump_calibration(value).encode()
     assert len(content) < SIZE_LIMIT
     assert parse_calibration(content) == value
-
-
-def test_a_file_above_the_size_limit_is_not_written():
     with pytest.raises(CalibrationError, match=rf'takes \d+ bytes, at most {SIZE_LIMIT} are'):
         dump_calibration(whole_bank(('case', 'frame', 'window')))
 
@@ -131,27 +122,20 @@ def said(result):
     return next((finding.message for finding in result.findings if finding.name == 'unseen'), '')
 
 
-def test_six_faces_determine_attitudes_at_the_corners_of_a_cube_least(rng):
+def test_the_least_determined_attitude_is_found_and_printed_if_a_side_was_never_up(rng):
     result = fitted(rng, FACES)
     least = result.least_known
     assert least_known(replace(result.calibration, posterior=None), FACES) is None
     # Near a corner of the cube the variance changes little: the direction found may lie beside it.
     np.testing.assert_allclose(np.abs(least.up), 3.0**-0.5, atol=0.05)
     assert least.away_deg == pytest.approx(np.degrees(np.arccos(3.0**-0.5)), abs=4.0)
-    # Three misalignment angles (prior sd of a MEMS: 0.01 rad each) change |f|, each by g times the
-    # product of two components of gravity's direction: 1 / 3 at a corner of the cube.
+    # Each of three angles (sd 0.01 rad) changes |f| by g * product of two components, here 1 / 3.
     assert least.sd_m_s2 == pytest.approx(GRAVITY * 1e-2 / 3.0**0.5, rel=0.2)
-
-
-def test_the_least_determined_attitude_is_that_of_a_side_that_was_never_up(rng):
     ups = positions(30, 4)
     result = fitted(rng, ups[ups[:, 2] > 0.2])
     np.testing.assert_allclose(result.least_known.up, (0.0, 0.0, -1.0), atol=0.06)
     assert '-z up' in said(result)
     assert said(result) in ' '.join(result.calibration.provenance.notes)
-
-
-def test_no_least_determined_attitude_is_printed_for_well_spread_positions(rng):
     result = fitted(rng, positions(18, 4))
     assert result.least_known.sd_m_s2 < 2.0 * result.least_known.seen_sd_m_s2
     assert not said(result)

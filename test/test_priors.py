@@ -10,7 +10,6 @@ import pytest
 from builders import arrays_of, rich_calibration, source_of
 from triads import sibling, triad
 
-from thermo_comp.cli.app import run
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.population import _scatter, population
@@ -52,10 +51,7 @@ test_of.__test__ = False
 
 @cache
 def fitted(number):
-    """
-    Fit a sibling to nine of its twelve positions. Nine positions do not determine the sd of
-    mounting offsets, so this sd is stated.
-    """
+    """Fit a sibling to nine positions, which do not determine the sd of mounting offsets."""
     options = replace(OPTIONS, serial=f'unit-{number}', mounting_sd=1e-6 * STANDARD_GRAVITY)
     return fit([source(record) for record in test_of(number, 0, 9)], options)
 
@@ -89,17 +85,15 @@ def test_a_population_has_the_mean_of_its_units_and_their_scatter():
     variance = np.diag(prior.posterior.covariance())
     at = parameter_layout(prior).bias[0].static + 1
     sd = np.sqrt(variance[at]) / prior.axes.x.scale_factor
-    # Expected variance of a fourth unit: 4/3 of the variance of three units (mean over the axes)
-    # times 6 / (6 - 2), for Student's distribution with 6 degrees of freedom, plus the claimed
-    # variance of the three units.
+    # Expected variance of a fourth unit: 4/3 of the variance of three units, times 6 / (6 - 2) for
+    # Student's distribution with 6 degrees of freedom, plus the claimed variance.
     own = np.array(own) / K[:, 0] ** 2
     expected = np.var(slopes, axis=0, ddof=1).mean() * 4.0 / 3.0 * 6.0 / 4.0 + own.mean()
     assert sd == pytest.approx(np.sqrt(expected), rel=1e-3)
 
 
 def test_the_scatter_of_an_axis_is_averaged_over_the_axes_of_three_units(rng):
-    # WHY: on one axis three siblings had nearly equal biases by chance; with their prior the force
-    # error of a fit to nine positions was 363 ug, without a prior 77 ug.
+    # WHY: on one axis siblings had nearly equal biases by chance: the error was 363, not 77 ug.
     layout = parameter_layout(rich_calibration())
     deviations = rng.standard_normal((3, layout.n_parameters))
     level = layout.bias[1].static
@@ -110,8 +104,7 @@ def test_the_scatter_of_an_axis_is_averaged_over_the_axes_of_three_units(rng):
 
 
 def test_chance_correlations_between_parameters_of_twelve_units_are_reduced(rng):
-    # WHY: the force error of a fit to one position with a prior from twelve units was 4.7 mg; the
-    # claimed sd was 0.9 mg.
+    # WHY: with a prior from twelve units the force error was 4.7 mg, the claimed sd 0.9 mg.
     layout = parameter_layout(rich_calibration())
     n = layout.n_parameters
 
@@ -136,8 +129,7 @@ def test_chance_correlations_between_parameters_of_twelve_units_are_reduced(rng)
 
 @pytest.mark.slow
 def test_equal_curves_of_both_sets_stay_equal_in_a_population():
-    # WHY: in the prior from siblings equal curves of both regimes were not fully correlated: a
-    # fit to nine positions had an error of 3.1 ug with this prior, and of 0.7 ug without a prior.
+    # WHY: equal curves of both regimes were not fully correlated: the error was 3.1, not 0.7 ug.
     prior = population(siblings())
     covariance, layout = prior.posterior.covariance(), parameter_layout(prior)
     for block in (*layout.bias, *layout.scale):
@@ -171,9 +163,7 @@ def helped():
 
 @pytest.mark.slow
 def test_a_fit_begins_with_the_widest_of_its_priors():
-    # WHY: a fit that began with the narrow prior of three units found mounting offsets of 190 ug,
-    # a local minimum: |f| - g of a held-out bag was 271 ug, not 0.9 ug. WHAT: a fit tries
-    # several priors, and begins with the one of largest variance in all directions.
+    # WHY: a fit that began with a narrow prior found mounting offsets of 190 ug, a local minimum.
     *tried, widest = (prior.root.T @ prior.root for prior in helped())
     assert len(tried) > 2
     root = np.sqrt(np.diag(widest))
@@ -188,8 +178,7 @@ def test_three_positions_reduce_the_sd_of_an_aged_calibration():
     later = [source(record) for record in test_of(9, 9, 12)]
     options = replace(OPTIONS, serial='unit-9', prior=old, ageing_bias=1e-4, ageing_scale=2e-5)
     new = fit(later, options).calibration
-    # Three positions determine three of the six sums bias +- scale * g of the axes, which removes
-    # half of the variance of ageing.
+    # Three positions determine three of the six sums bias +- scale * g: half of the variance.
     grown = np.mean(sd_of_levels(old) ** 2 + options.ageing_bias**2)
     assert np.mean(sd_of_levels(new) ** 2) < 0.75 * grown
     bias = [(a.bias - b.bias) / a.scale_factor for a, b in zip(new.axes, old.axes, strict=True)]
@@ -219,8 +208,7 @@ def test_rests_at_one_temperature_correct_a_bias_change_and_keep_the_response():
     pairs = (old, held_out), (old, [*map(aged, held_out)]), (new, [*map(aged, held_out)])
     left = [np.sqrt(np.mean([left_by(unit, r) ** 2 for r in records])) for unit, records in pairs]
     assert left[1] > 10.0 * left[0]
-    # In a rest of 10 min the unknown initial state of a lag of 1 h acts like a bias. Six means
-    # of |f| determine three biases to 10 ug (1 sd), or to 20 ug if also three scale factors.
+    # Six means of |f| determine three biases to 10 ug (1 sd), or to 20 ug with three scales.
     sd = float(sd_of_levels(new).max())
     assert sd < 20e-6 * STANDARD_GRAVITY
     assert left[2] < np.hypot(left[0], sd)
@@ -229,9 +217,8 @@ def test_rests_at_one_temperature_correct_a_bias_change_and_keep_the_response():
 
 def after(change, ups):
     """
-    Update the calibration of sibling 9 by rests of 10 min, whose counts are changed by a function
-    of counts and calibration. Return the change of the bias at 20 degC and the sd of the new
-    bias [m/s^2], the relative change of the scale factor and the new relative sd, shape (4, 3).
+    Update sibling 9 by rests of 10 min with changed counts; return the change of the bias at 20
+    degC, its new sd [m/s^2], and relative change and sd of the scale factor, shape (4, 3).
     """
     old, day = fitted(9).calibration, parse_cyclogram('20 10min')
     records = arrays(sibling(KIND, 9, 0.15), [Position(day, up) for up in ups], 999)
@@ -267,8 +254,7 @@ def test_three_faces_halve_the_error_of_a_change_of_bias_or_scale(kind):
     bias, bias_sd, scale, scale_sd = after(changed, np.eye(3))
     wrong = np.array([bias / STANDARD_GRAVITY, scale])
     wrong[('bias', 'scale').index(kind)] -= change
-    # The rests determine only the sum of bias and scale errors: bias and scale each get half of
-    # the change. The noise of a rest and unknown initial lag states leave an error of some ug.
+    # The rests determine only the sum of bias and scale errors, to some ug: each gets a half.
     assert np.abs(wrong.sum(axis=0)).max() < 10e-6
     assert np.abs(np.abs(wrong) / np.abs(change) - 0.5).max() < 0.1
     assert (np.abs(wrong) < 2.0 * np.array([bias_sd / STANDARD_GRAVITY, scale_sd])).all()
@@ -298,25 +284,6 @@ def test_population_refuses_too_few_equal_or_different_units():
         population([first, second, other])
 
 
-@pytest.mark.slow
-def test_the_command_prior_names_the_nonlinear_terms_that_it_leaves_out(cli, tmp_path):
-    cube = NonlinearTerm('cube', (1e-6,) * 3, (0.0,) * 3, 1e-5)
-    first, *others = siblings()
-    assert first.posterior is not None
-    row = parameter_layout(first).nonlinear
-    bent = Posterior.of(
-        np.insert(first.posterior.matrix, [row] * 6, 0.0, axis=0),
-        np.insert(first.posterior.variances, [row] * 6, 1e-14),
-    )
-    first = replace(first, nonlinearity=Nonlinearity((9.8, 50.0), 1e-4, (cube,)), posterior=bent)
-    paths = [tmp_path / f'{k}.yaml' for k in range(3)]
-    for unit, path in zip((first, *others), paths, strict=True):
-        save_calibration(unit, path)
-    printed = cli('prior', *paths, '-o', tmp_path / 'type.yaml').stdout
-    assert f'leaves out the nonlinear terms K2, K3 of units {first.unit.serial}\n' in printed
-    assert load_calibration(tmp_path / 'type.yaml').nonlinearity is None
-
-
 def test_an_update_uses_the_temperatures_of_its_prior_and_1_k_more():
     known = replace(rich_calibration(), response=(), posterior=None)
     provenance = replace(known.provenance, model='population')
@@ -324,11 +291,14 @@ def test_an_update_uses_the_temperatures_of_its_prior_and_1_k_more():
     assert prior_model(replace(known, provenance=provenance)).range_c == (-np.inf, np.inf)
 
 
-def test_a_prior_without_covariance_is_refused():
+def test_a_prior_without_covariance_or_in_another_unit_is_refused():
     prior = replace(fitted(9).calibration, posterior=None)
     few = [source(record) for record in test_of(9, 0, 6)]
     with pytest.raises(FitError, match='no covariance'):
         fit(few, replace(OPTIONS, serial='unit-9', prior=prior))
+    # WHY: scale factors of a prior in counts were used for samples in m/s^2.
+    with pytest.raises(ValueError, match=r'`prior` is in counts, the samples are in m/s\^2'):
+        replace(OPTIONS, prior=fitted(9).calibration, input='m/s^2')
 
 
 @pytest.mark.slow
@@ -346,21 +316,24 @@ def test_the_calibration_of_another_unit_is_refused_as_a_prior():
     assert not allowed.residuals[-1].one_set.n
 
 
-def test_a_prior_in_counts_is_refused_for_samples_in_m_s2():
-    # WHY: scale factors of a prior in counts were used for samples in m/s^2.
-    with pytest.raises(ValueError, match=r'`prior` is in counts, the samples are in m/s\^2'):
-        replace(OPTIONS, prior=fitted(9).calibration, input='m/s^2')
-
-
 @pytest.mark.slow
-def test_the_command_prior_writes_the_population_of_its_units(tmp_path, capsys):
-    files = []
-    for unit in siblings():
-        files.append(tmp_path / f'{unit.unit.serial}.yaml')
-        save_calibration(unit, files[-1])
-    target = tmp_path / 'type.yaml'
-    assert run(['prior', *map(str, files), '-o', str(target)]) == 0
+def test_the_command_prior_writes_the_population_and_names_nonlinear_terms_left_out(cli, tmp_path):
+    first, *others = siblings()
+    paths, target = [tmp_path / f'{k}.yaml' for k in range(3)], tmp_path / 'type.yaml'
+    for unit, path in zip((first, *others), paths, strict=True):
+        save_calibration(unit, path)
+    printed = cli('prior', *paths, '-o', target).stdout
     prior = load_calibration(target)
     assert prior == population(siblings())
-    expected = f'prior from 3 units, {len(prior.response)} columns'
-    assert expected in capsys.readouterr().out
+    assert f'prior from 3 units, {len(prior.response)} columns' in printed
+    cube = NonlinearTerm('cube', (1e-6,) * 3, (0.0,) * 3, 1e-5)
+    row = parameter_layout(first).nonlinear
+    bent = Posterior.of(
+        np.insert(first.posterior.matrix, [row] * 6, 0.0, axis=0),
+        np.insert(first.posterior.variances, [row] * 6, 1e-14),
+    )
+    nonlinearity = Nonlinearity((9.8, 50.0), 1e-4, (cube,))
+    save_calibration(replace(first, nonlinearity=nonlinearity, posterior=bent), paths[0])
+    printed = cli('prior', *paths, '-o', target, '--force').stdout
+    assert f'leaves out the nonlinear terms K2, K3 of units {first.unit.serial}\n' in printed
+    assert load_calibration(target).nonlinearity is None

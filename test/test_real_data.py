@@ -70,8 +70,7 @@ def test_six_faces_leave_the_misalignment_at_its_prior(real_data, work):
     result = fit(sources, replace(OPTIONS, input=kind))
     calibration = result.calibration
     assert len(result.positions) == 6
-    # Six faces, tilted by up to 1 degree, hardly determine misalignments: their sd stays within
-    # 1 % of the prior sd for a MEMS, 0.01 rad.
+    # Six faces hardly determine misalignments: their sd stays near that of a MEMS, 0.01 rad.
     np.testing.assert_allclose(calibration.misalignment, np.eye(3), atol=1e-4)
     np.testing.assert_allclose(calibration.misalignment_sd, 1e-2, rtol=0.01)
     # Expected bias: half of the sum of opposite faces; scale factor: half of their difference.
@@ -135,8 +134,7 @@ def test_the_error_of_the_freezer_run_on_held_out_minutes(
     assert len(raw) >= 17 * len(sets) // n_sets
     # One attitude does not determine the constants, so compare the sd of |a|.
     assert np.std(raw) / MG == pytest.approx(drift, abs=0.2)
-    # Means over 60 s have a noise of 0.19 mg. The first of five held-out parts is at temperatures
-    # that the fit to the other parts does not contain.
+    # Means over 60 s have a noise of 0.19 mg; the first of five parts is beyond the others' range.
     assert np.sqrt(np.mean(np.square(left))) / MG == pytest.approx(mg, rel=0.35)
 
 
@@ -155,8 +153,7 @@ def test_the_gyroscope_error_of_the_freezer_run_in_215_s_held_out(real_data, wor
     assert section.raw_rms > 1.7 * floor
     assert section.rms < 1.3 * floor
     assert 0.3 < section.ratio < 2.0
-    # The data sheet of the MPU-6050 states 5 mdeg/s/sqrt(Hz); samples at 12.7 Hz without an
-    # anti-aliasing filter have a larger noise density.
+    # The data sheet states 5 mdeg/s/sqrt(Hz); samples without anti-aliasing have a larger density.
     assert 30.0 < np.degrees(density) * 1e3 < 45.0
 
 

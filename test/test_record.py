@@ -84,7 +84,6 @@ def check_positions(result):
 
 def check_fit(result, cli, folder):
     """Run the fit that `record` printed, and compare its constants with the true constants."""
-    # The model `golovach` is sufficient for constants; a response takes ten times as long.
     given = '--gravity 9.80665 --model golovach'
     words = shlex.split(result['command'].replace('--gravity G', given))
     assert words.pop(0) == 'thermo_comp'
@@ -141,12 +140,18 @@ class TestGrowing:
         assert collected.pop('accel') == sent.pop('/accel/counts')
         assert {f'/temperature/{name}': own for name, own in collected.items()} == sent
 
-    def test_a_text_file_named_mcap_is_refused(self, tmp_path):
+    def test_wrong_files_and_options_of_record_are_refused(self, tmp_path, session, cli):
         with pytest.raises(RecordingError, match='no such file'):
             next(growing_blocks(tmp_path / 'no.mcap', Topics(), lambda _: True))
         (tmp_path / 'text.mcap').write_text('hello, this is no bag')
         with pytest.raises(RecordingError, match=r'text\.mcap'):
             list(growing_blocks(tmp_path / 'text.mcap', Topics(), lambda _: False))
+        out = ('-o', tmp_path / 'bags')
+        printed = cli('record', session, '--soak', '45', *out, code=2).stderr
+        assert "--soak: expected a duration like 45min, 1.5h or 30s, got '45'" in printed
+        (tmp_path / 'file').write_text('')
+        printed = cli('record', session, '-o', tmp_path / 'file', code=1).stderr
+        assert 'cannot be written' in printed
 
     def test_a_bag_of_several_positions_is_split_into_a_bag_for_each(self, session, cli, tmp_path):
         options = ('--positions', f'{N_POSITIONS}', '--soak', '80s', '-o', tmp_path / 'bags')
@@ -172,14 +177,6 @@ class TestGrowing:
         other = ('record', bag, '-o', bags, '--serial', 'lab-8')
         assert '01.mcap is of unit lab-7, not lab-8' in cli(*other, code=1).stderr
 
-    def test_wrong_options_of_record_are_refused(self, session, cli, tmp_path):
-        out = ('-o', tmp_path / 'bags')
-        printed = cli('record', session, '--soak', '45', *out, code=2).stderr
-        assert "--soak: expected a duration like 45min, 1.5h or 30s, got '45'" in printed
-        (tmp_path / 'file').write_text('')
-        printed = cli('record', session, '-o', tmp_path / 'file', code=1).stderr
-        assert 'cannot be written' in printed
-
 
 def test_a_bag_left_by_a_crash_is_reported_and_completed(session, cli, tmp_path):
     # WHY: after a killed run the next run did not report the hidden file with its last bag.
@@ -203,7 +200,6 @@ def test_a_bag_left_by_a_crash_is_reported_and_completed(session, cli, tmp_path)
     with open_recording(first, require=()) as reader:
         assert reader.info.truncated is None
         assert reader.info.metadata['serial'] == 'lab-7'
-    # An unreadable hidden file is reported and not deleted.
     broken = bags / '.07.999999999-abcdef.partial.mcap'
     broken.write_bytes(b'no bag')
     printed = cli(*arguments, '--finish', code=None).stderr
@@ -280,21 +276,15 @@ class TestLive:
         assert contents(numbered_bags(bags)) == contents([bag])
         assert sorted(bags.iterdir()) == numbered_bags(bags)
 
-    @pytest.mark.usefixtures('play')
     @pytest.mark.slow
-    def test_a_topic_of_a_wrong_type_is_named(self, tmp_path):
+    def test_a_topic_of_a_wrong_type_is_named(self, peer, tmp_path):
         from geometry_msgs.msg import PointStamped
-        from ros_helpers import Peer
 
-        peer = Peer()
-        try:
-            peer.node.create_publisher(PointStamped, 'accel/counts', 10)
-            recording = Recording('-o', tmp_path / 'bags', '--json')
-            recording.wait_for(
-                '/accel/counts has the type geometry_msgs/msg/PointStamped, '
-                'expected geometry_msgs/msg/Vector3Stamped'
-            )
-            code, result, _ = recording.end(signal.SIGINT)
-        finally:
-            peer.close()
+        peer.node.create_publisher(PointStamped, 'accel/counts', 10)
+        recording = Recording('-o', tmp_path / 'bags', '--json')
+        recording.wait_for(
+            '/accel/counts has the type geometry_msgs/msg/PointStamped, '
+            'expected geometry_msgs/msg/Vector3Stamped'
+        )
+        code, result, _ = recording.end(signal.SIGINT)
         assert (code, result['bags'], result['command']) == (0, [], None)

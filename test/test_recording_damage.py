@@ -253,12 +253,11 @@ def test_a_damaged_last_chunk_is_left_out(tmp_path):
     recording = read(path)
     assert str(recording.info.truncated).endswith('; its last chunk is damaged and left out')
     assert_columns(recording.columns, regular_messages(24)[: recording.info.n_messages])
-    # If the file ends inside the damaged chunk, the error names the cut.
     path.write_bytes(damaged[:-5])
     assert 'ends inside a chunk' in str(read(path).info.truncated)
 
 
-def test_a_nonsensical_summary_is_ignored_or_refused(tmp_path):
+def test_a_nonsensical_summary_large_metadata_and_wrong_times_are_ignored_or_refused(tmp_path):
     content = bytearray(small_bag('none')[0])
     path = tmp_path / 'bag.mcap'
     footer = len(content) - 37
@@ -273,21 +272,13 @@ def test_a_nonsensical_summary_is_ignored_or_refused(tmp_path):
         path.write_bytes(content)
         with pytest.raises(RecordingError, match=f'the summary cannot be at byte {claim}'):
             read(path)
-
-
-def test_large_metadata_are_skipped_and_large_schemas_refused(tmp_path):
-    path = tmp_path / 'bag.mcap'
     large = bytes((1 << 22) + 1)
     path.write_bytes(whole_file(struct.pack('<BQ', Opcode.METADATA, len(large)) + large))
     assert read(path).info.metadata == {}
     path.write_bytes(whole_file(struct.pack('<BQ', Opcode.SCHEMA, len(large)) + large))
     with pytest.raises(RecordingError, match=f'has {len(large)} bytes'):
         read(path)
-
-
-def test_a_chunk_with_wrong_declared_times_is_refused(tmp_path):
     content, position, _ = small_bag('none')
-    path = tmp_path / 'bag.mcap'
     start, end = struct.unpack_from('<QQ', content, position + 9)
     changed = content.replace(struct.pack('<QQ', start, end), struct.pack('<QQ', start + 5, end))
     path.write_bytes(changed)

@@ -24,20 +24,17 @@ from thermo_comp.recording.reader import inspect_recording, open_recording, read
 
 
 def whole(folder, storage='mcap', compression=''):
-    rec.write_rosbag2(
-        folder / 'bag', rec.regular_messages(400), storage=storage, compression=compression
-    )
-    return folder / 'bag'
+    messages, path = rec.regular_messages(400), folder / 'bag'
+    rec.write_rosbag2(path, messages, storage=storage, compression=compression)
+    return path
 
 
 def test_rows_deleted_from_a_database_are_reported(tmp_path, cli):
     bag = whole(tmp_path, 'sqlite3')
     with sqlite3.connect(bag / 'bag.db3') as database:
-        (topic,) = database.execute(
-            'select id from topics where name = ?', (rec.ACCEL,)
-        ).fetchone()
-        query = 'delete from messages where id > 100 and topic_id = ?'
-        n_left = 400 - database.execute(query, (topic,)).rowcount
+        query = 'delete from messages where id > 100 and topic_id = '
+        query += '(select id from topics where name = ?)'
+        n_left = 400 - database.execute(query, (rec.ACCEL,)).rowcount
     text = f'{rec.ACCEL}: {n_left} of 400 listed messages are in the bag'
     assert inspect_recording(bag).truncated == text
     assert text in cli('info', bag, code=1).stdout
@@ -47,7 +44,7 @@ def test_rows_deleted_from_a_database_are_reported(tmp_path, cli):
     assert (tmp_path / 'o.mcap').is_file()
 
 
-def test_a_conversion_reports_messages_that_the_bag_lacks(tmp_path, cli):
+def test_messages_that_a_topic_lacks_are_reported_at_the_end_of_the_first_reading(tmp_path, cli):
     messages = rec.regular_messages(400, accel=rec.IMU_IN)
     for message in messages:
         if message.topic == rec.IMU_IN:  # `convert` requires |f| = g at rest
@@ -58,6 +55,13 @@ def test_a_conversion_reports_messages_that_the_bag_lacks(tmp_path, cli):
     topics = ('--topic', f'board={rec.BOARD}', '--topic', f'case={rec.CASE}')
     done = cli('convert', tmp_path / 'bag', '-o', tmp_path / 'o.mcap', *topics, code=1)
     assert 'listed messages are in the bag' in done.stderr
+    rec.write_mcap(tmp_path / 'bag.mcap', rec.regular_messages(40))
+    with open_recording(tmp_path / 'bag.mcap') as reader:
+        kind = reader.info.topics[rec.ACCEL][0]
+        reader.info = replace(reader.info, topics={**reader.info.topics, rec.ACCEL: (kind, 64)})
+        for _ in range(2):  # a second pass over the bag must not add a second message
+            assert sum(map(len, reader.blocks())) == 40
+        assert reader.info.truncated == f'{rec.ACCEL}: 40 of 64 listed messages are in the bag'
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
@@ -68,20 +72,9 @@ def test_a_topic_that_only_the_metadata_list_is_reported(tmp_path, storage):
     topics = content['rosbag2_bagfile_information']['topics_with_message_count']
     topic = yaml.safe_load(yaml.safe_dump(topics[0]))
     topic['topic_metadata']['name'] = '/gone'
-    topic['message_count'] = 7
-    topics.append(topic)
+    topics.append({**topic, 'message_count': 7})
     path.write_text(yaml.safe_dump(content))
     assert inspect_recording(bag).truncated == '/gone: 0 of 7 listed messages are in the bag'
-
-
-def test_missing_messages_are_reported_at_the_end_of_the_first_reading(tmp_path):
-    rec.write_mcap(tmp_path / 'bag.mcap', rec.regular_messages(40))
-    with open_recording(tmp_path / 'bag.mcap') as reader:
-        kind = reader.info.topics[rec.ACCEL][0]
-        reader.info = replace(reader.info, topics={**reader.info.topics, rec.ACCEL: (kind, 64)})
-        for _ in range(2):  # a second pass over the bag must not add a second message
-            assert sum(map(len, reader.blocks())) == 40
-        assert reader.info.truncated == f'{rec.ACCEL}: 40 of 64 listed messages are in the bag'
 
 
 def test_a_compressed_file_is_read_up_to_its_damage(tmp_path):
@@ -118,16 +111,12 @@ def test_a_compressed_file_expands_within_limits_and_leaves_no_file(tmp_path, mo
     with pytest.raises(RecordingError, match=rf'{packed.name}: damaged: its content exceeds'):
         read_recording(bag)
     assert not list(temporary.iterdir())
-
-
-def test_a_compressed_message_expands_within_limits(tmp_path):
-    bag = whole(tmp_path, 'sqlite3', 'MESSAGE')
+    (tmp_path / 'messages').mkdir()
+    bag = whole(tmp_path / 'messages', 'sqlite3', 'MESSAGE')
     with sqlite3.connect(bag / 'bag.db3') as database:
         bomb = zstandard.compress(bytes(1 << 28))
         database.execute('update messages set data = ? where id = 1', (bomb,))
-    with pytest.raises(
-        RecordingError, match=r'\.db3: damaged: its content exceeds .* 67108864 by'
-    ):
+    with pytest.raises(RecordingError, match=r'\.db3: damaged: its content exceeds .* 67108864 '):
         read_recording(bag)
 
 

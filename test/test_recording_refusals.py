@@ -11,7 +11,6 @@ from mcap.opcode import Opcode
 from test_recording_damage import read, whole_file
 
 from thermo_comp.errors import RecordingError
-from thermo_comp.fitting.sources import recording_source
 from thermo_comp.recording.reader import inspect_recording, open_recording
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter
@@ -89,11 +88,7 @@ def test_paths_that_are_not_a_bag_are_refused(tmp_path):
     refused(tmp_path / 'nowhere', 'nowhere: no such file or directory')
     refused(tmp_path / ('x' * 300), 'cannot be opened: File name too long')
     for name, content, reason in (
-        (
-            'notes.txt',
-            b'',
-            r'not a bag: expected a directory, \.mcap, \.db3 or \.bag; `thermo_comp ',
-        ),
+        ('notes.txt', b'', r'not a bag: expected a directory, \.mcap, \.db3 or \.bag; `therm'),
         ('text.mcap', b'hello, this is no bag at all', 'not an MCAP file'),
         ('empty.mcap', b'', 'the file is empty'),
         ('begun.mcap', b'\x89MCAP0\r\n\x01', 'cut off inside its header'),
@@ -118,7 +113,7 @@ def test_paths_that_are_not_a_bag_are_refused(tmp_path):
         refused(tmp_path / 'folder', reason)
 
 
-def test_absent_topics_and_topics_of_a_wrong_type_are_refused(tmp_path):
+def test_absent_empty_and_ambiguous_topics_and_topics_of_a_wrong_type_are_refused(tmp_path):
     path = tmp_path / 'bag.mcap'
     messages = rec.regular_messages(8)
     rec.write_mcap(path, messages)
@@ -137,19 +132,13 @@ def test_absent_topics_and_topics_of_a_wrong_type_are_refused(tmp_path):
     refused(path, 'the bag holds no messages')
     assert inspect_recording(path).input is None
     assert len(read(path).columns) == 0
-
-
-def test_a_required_topic_without_messages_is_refused(tmp_path):
-    path = tmp_path / 'bag.mcap'
+    path = tmp_path / 'empty.mcap'
     with BagWriter(path) as bag:
         bag.write_counts('accel/counts', [1, 2], np.zeros((2, 3)))
         bag.write_temperature('temperature/board', [1], [20.0])
         bag.write_temperature('temperature/case', [], [])
     refused(path, '/temperature/case: the topic has no messages')
-
-
-def test_two_topics_with_a_matching_name_are_refused_as_ambiguous(tmp_path):
-    path = tmp_path / 'bag.mcap'
+    path = tmp_path / 'two.mcap'
     with BagWriter(path) as bag:
         for unit in ('a', 'b'):
             bag.write_counts(f'{unit}/accel/counts', [1], np.zeros((1, 3)))
@@ -228,11 +217,17 @@ def test_an_imu_topic_is_chosen_before_a_vector_topic_of_unknown_meaning(tmp_pat
             open_recording(path, require=('accel',))
 
 
-def test_the_input_that_the_user_names_is_compensated(tmp_path):
-    path = driver_bag(tmp_path / 'bag', ('accel/counts', 'vector'), ('imu/data', 'imu'))
+def test_a_named_input_is_taken_but_not_for_two_inputs(tmp_path):
+    topics = ('accel/counts', 'vector'), ('imu/data', 'imu'), ('imu/temperature', 'celsius')
+    path = driver_bag(tmp_path / 'bag', *topics)
     for names, taken in (({}, '/accel/counts'), ({'imu': '/imu/data'}, '/imu/data')):
         with open_recording(path, Topics.named(names), require=('accel',)) as reader:
             assert reader.topics['accel'] == taken
+    for second in ('case', 'temperature/lid'):
+        names = {'board': '/imu/temperature', second: 'imu/temperature'}
+        message = f'/imu/temperature: one topic for both board and {second.rpartition("/")[2]}: '
+        with pytest.raises(RecordingError, match=message):
+            open_recording(path, Topics.named(names), require=('accel',))
 
 
 def test_a_topic_that_thermo_comp_wrote_is_refused_as_input(tmp_path):
@@ -244,19 +239,3 @@ def test_a_topic_that_thermo_comp_wrote_is_refused_as_input(tmp_path):
     assert message in str(inspect_recording(path).chosen)
     with open_recording(path, Topics.named({'imu': 'imu/data_raw'}), require=('accel',)) as reader:
         assert reader.topics['accel'] == '/imu/data_raw'
-
-
-def test_one_topic_for_two_inputs_is_refused_with_its_name(tmp_path):
-    path = driver_bag(tmp_path / 'bag', ('accel/counts', 'vector'), ('imu/temperature', 'celsius'))
-    for second in ('case', 'temperature/lid'):
-        names = {'board': '/imu/temperature', second: 'imu/temperature'}
-        message = f'/imu/temperature: one topic for both board and {second.rpartition("/")[2]}: '
-        with pytest.raises(RecordingError, match=message):
-            open_recording(path, Topics.named(names), require=('accel',))
-
-
-def test_a_fit_that_fails_names_the_topic_that_was_taken(tmp_path):
-    source, _ = recording_source(driver_bag(tmp_path / 'bag', ('imu/data', 'imu')))
-    assert source.name == 'bag (/imu/data)'
-    source, _ = recording_source(driver_bag(tmp_path / 'usual', ('accel/counts', 'vector')))
-    assert source.name == 'usual'

@@ -54,20 +54,16 @@ def test_rosbags_and_mcap_read_the_written_messages(
                 bag.write_raw('regime/dynamic', BOOL, log_ns, flags)
                 bag.write_raw('diagnostics', 'std_msgs/msg/String', log_ns, raw)
                 bag.flush()
-                numbers = {
-                    rec.ACCEL: linear, rec.BOARD: np.column_stack((linear[:, 0], np.zeros(n))),
-                    rec.IMU_IN: np.hstack((*imu[:4], linear, covariance)),
-                }  # fmt: skip
+                readings = np.column_stack((linear[:, 0], np.zeros(n)))
+                columns = np.hstack((*imu[:4], linear, covariance))
+                times = list(zip(log_ns.tolist(), stamp_ns.tolist(), strict=True))
                 group = [
                     (log, topic, rec.serialize(rec.Message(topic, log, stamp, frame, tuple(row))))
-                    for topic, frame in (
-                        (rec.ACCEL, frame_id),
-                        (rec.BOARD, ''),
-                        (rec.IMU_IN, frame_id),
+                    for topic, frame, rows in (
+                        *((rec.ACCEL, frame_id, linear), (rec.BOARD, '', readings)),
+                        (rec.IMU_IN, frame_id, columns),
                     )
-                    for log, stamp, row in zip(
-                        log_ns.tolist(), stamp_ns.tolist(), numbers[topic].tolist(), strict=True
-                    )
+                    for (log, stamp), row in zip(times, rows.tolist(), strict=True)
                 ]
                 for topic, content in (('/regime/dynamic', flags), ('/diagnostics', raw)):
                     group += [(int(log), topic, c) for log, c in zip(log_ns, content, strict=True)]
@@ -113,7 +109,7 @@ def test_metadata_of_a_written_bag_are_read_back(tmp_path, name):
         assert read_recording(tmp_path / name, require=()).info.metadata == pairs
 
 
-def test_a_written_directory_equals_that_of_rosbag2(tmp_path):
+def test_a_written_directory_equals_that_of_rosbag2_and_a_file_contains_its_name(tmp_path):
     small(tmp_path / 'bag', metadata={'serial': '7'})
     assert {p.name for p in (tmp_path / 'bag').iterdir()} == {'metadata.yaml', 'bag_0.mcap'}
     content = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
@@ -142,29 +138,12 @@ def test_a_written_directory_equals_that_of_rosbag2(tmp_path):
     assert qos == topic['topic_metadata']['offered_qos_profiles']
     assert qos[0]['reliability'] == 'reliable'
     assert yaml.safe_load(metadata['rosbag2']['serialized_metadata']) == content
-
-
-def test_metadata_of_an_mcap_file_contain_its_final_name(tmp_path):
-    """A bag is written under a temporary name, which must not be in its metadata."""
+    # A bag is written under a temporary name, which must not be in its metadata.
     small(tmp_path / 'bag.mcap')
     with (tmp_path / 'bag.mcap').open('rb') as stream:
         (metadata,) = make_reader(stream).iter_metadata()
     content = yaml.safe_load(metadata.metadata['serialized_metadata'])
     assert content['relative_file_paths'] == [content['files'][0]['path']] == ['bag.mcap']
-
-
-def test_a_raw_message_needs_a_definition(tmp_path):
-    with BagWriter(tmp_path / 'bag.mcap') as bag:
-        with pytest.raises(RecordingError, match='/x: the definition of message type a/msg/B is'):
-            bag.write_raw('x', 'a/msg/B', [1], [b'\0\1\0\0\7'])
-        bag.write_raw('x', 'a/msg/B', [1], [b'\0\1\0\0\7'], ('ros2msg', 'uint8 data\n'))
-        with pytest.raises(RecordingError, match='/x: already written with another type than std'):
-            bag.write_raw('x', BOOL, [1], [b''])
-    with AnyReader([tmp_path / 'bag.mcap']) as reader:
-        ((connection, _, data),) = reader.messages()
-        assert reader.deserialize(data, connection.msgtype).data == 7
-    with open_recording(tmp_path / 'bag.mcap', require=()) as ours:
-        assert ours.definitions['a/msg/B'] == ('ros2msg', 'uint8 data\n')
 
 
 @pytest.mark.parametrize('name', ['bag', 'bag.mcap'])
@@ -193,7 +172,7 @@ def test_an_existing_output_stays_until_the_new_output_is_complete(tmp_path, nam
     assert [p.name for p in tmp_path.iterdir()] == [name]
 
 
-def test_an_output_never_replaces_a_file_or_folder_that_is_no_bag(tmp_path):
+def test_an_output_may_be_a_link_but_never_replaces_a_file_or_folder_that_is_no_bag(tmp_path):
     (tmp_path / 'home').mkdir()
     (tmp_path / 'home' / 'thesis.tex').write_text('ten years of work')
     (tmp_path / 'file').write_text('')
@@ -205,9 +184,6 @@ def test_an_output_never_replaces_a_file_or_folder_that_is_no_bag(tmp_path):
     ):
         with pytest.raises(OutputError, match=f'is not replaced: {reason}'):
             BagWriter(tmp_path / name, overwrite=True)
-
-
-def test_an_output_may_be_a_link(tmp_path):
     for name in ('bag', 'bag.mcap'):
         small(tmp_path / 'disk' / name, 1.0)
         (tmp_path / name).symlink_to(tmp_path / 'disk' / name)
@@ -217,7 +193,7 @@ def test_an_output_may_be_a_link(tmp_path):
         assert float(columns.accel[0, 0]) == 2.0
 
 
-def test_arguments_of_wrong_shape_or_type_are_refused(tmp_path):
+def test_arguments_of_wrong_shape_or_type_and_messages_without_a_definition_are_refused(tmp_path):
     xyz = [[1, 2, 3]]
     with BagWriter(tmp_path / 'bag') as bag:
         for write, given, reason in (
@@ -235,12 +211,22 @@ def test_arguments_of_wrong_shape_or_type_are_refused(tmp_path):
                 write('a', *given)
     with pytest.raises(RecordingError, match='the bag is closed'):
         bag.write_raw('a', BOOL, [1], [b''])
+    with BagWriter(tmp_path / 'bag.mcap') as bag:
+        with pytest.raises(RecordingError, match='/x: the definition of message type a/msg/B is'):
+            bag.write_raw('x', 'a/msg/B', [1], [b'\0\1\0\0\7'])
+        bag.write_raw('x', 'a/msg/B', [1], [b'\0\1\0\0\7'], ('ros2msg', 'uint8 data\n'))
+        with pytest.raises(RecordingError, match='/x: already written with another type than std'):
+            bag.write_raw('x', BOOL, [1], [b''])
+    with AnyReader([tmp_path / 'bag.mcap']) as reader:
+        ((connection, _, data),) = reader.messages()
+        assert reader.deserialize(data, connection.msgtype).data == 7
+    with open_recording(tmp_path / 'bag.mcap', require=()) as ours:
+        assert ours.definitions['a/msg/B'] == ('ros2msg', 'uint8 data\n')
 
 
 @pytest.mark.parametrize('name', ['bag', 'bag.mcap'])
 def test_regime_topics_of_a_bag_have_the_qos_of_the_node(tmp_path, name):
-    # WHY: a bag of `replay` had `regime/stamped` as volatile, so on playing the bag a subscriber
-    # that joined later got no regime.
+    # WHY: `regime/stamped` was volatile, so a subscriber that joined later got no regime.
     with BagWriter(tmp_path / name) as bag:
         bag.write_raw('imu0/regime/dynamic', BOOL, [1], [b''])
         for topic in ('imu0/regime/stamped', '/diagnostics'):

@@ -81,7 +81,7 @@ def page():
     return Page(certificate())
 
 
-def test_the_certificate_of_a_fit_has_the_expected_statements(page):
+def test_the_certificate_of_a_fit_has_the_expected_statements_and_residuals(page):
     assert not page.open  # every tag is closed
     for fact in (
         *('Unit thermostatted-0001', evidence().calibration.provenance.created),
@@ -93,16 +93,13 @@ def test_the_certificate_of_a_fit_has_the_expected_statements(page):
     for figure in figures_of(evidence()):
         assert figure.question in page.text
     assert not re.search(r'\bnan\b', page.text)
-
-
-def test_the_certificate_has_the_left_out_residual_of_each_position(page):
     shown = [position.residual_rms.get(LEFT_OUT) for position in evidence().positions]
     assert shown == [*LEFT_OUT_RMS, None]
     assert 'left out, µg RMS' in page.text
     assert 'Left out: RMS of |f| − g of each position by a fit to the other pos' in page.text
 
 
-def test_the_page_loads_no_file_and_runs_no_script(page):
+def test_the_page_loads_no_file_runs_no_script_and_has_unique_ids(page):
     assert not page.names() & {'script', 'img', 'link', 'iframe', 'object', 'embed', 'form'}
     for tag, attributes in page.tags:
         for name, value in attributes.items():
@@ -111,9 +108,6 @@ def test_the_page_loads_no_file_and_runs_no_script(page):
                 assert value.startswith('#')
     style = next(a['content'] for t, a in page.tags if t == 'meta' and 'http-equiv' in a)
     assert "default-src 'none'" in style
-
-
-def test_the_ids_of_the_page_are_unique_and_all_references_exist(page):
     ids = [attributes['id'] for _, attributes in page.tags if 'id' in attributes]
     assert len(set(ids)) == len(ids)
     assert set(re.findall(r'(?:url\(|href=")#([^)"]*)', page.source)) <= set(ids)
@@ -135,7 +129,6 @@ def test_a_page_without_calibration_shows_temperatures_derivatives_and_regime(op
     seen = evidence_of_bags(opened)
     shown = seen.shown
     truth = run(0).truth
-    # In the middle of the first ramp the rate of the case is near the chamber's, 1.5 K/min.
     ramp = (shown.time > 17 * 60) & (shown.time < 21 * 60)
     assert 1.0 < np.mean(shown.case_rate[ramp]) * 60.0 < 1.6
     dynamic = np.zeros(len(truth.grid_s), bool)
@@ -220,7 +213,6 @@ def test_a_calibration_without_bags_gives_a_page_and_figures_as_png(tmp_path):
     assert 'no recording was judged' in page.text
     assert '01.mcap' in page.text
     assert f'{1:064x}' in page.text
-    # Without bags only the figures of the calibration are drawn.
     names = [figure.name for figure in figures_of(evidence())]
     without_bags = [name for name in names if name in ('functions', 'step', 'hysteresis')]
     files = sorted(folder.iterdir())

@@ -49,7 +49,6 @@ def test_drawn_bias_and_scale_curves_agree_with_formulas():
 
 @pytest.mark.slow
 def test_measured_errors_in_soaks_are_those_of_the_scale_factors():
-    # In soaks the scale factors of all axes have an error of 30 ppm.
     windows = evidence().windows
     up = np.array([position.up for position in evidence().positions])[windows.position]
     length = np.where(windows.is_dynamic, 1.0, 1.0 + 30e-6) * windows.gravity
@@ -63,14 +62,10 @@ def test_measured_errors_in_soaks_are_those_of_the_scale_factors():
     assert np.linalg.norm(bias, axis=1) == pytest.approx(30.0, rel=1e-4)
 
 
-def test_position_errors_of_a_navigator_agree_with_hand_numbers():
-    # A bias of 1 mg causes a position error of 9.80665e-3 * 1800 m in 60 s; a bias of 1 ug causes
-    # a position error of at most 1e-6 Earth diameters at any time.
+def test_position_errors_and_the_map_of_the_sphere_agree_with_hand_numbers():
+    # 1 mg causes an error of 9.80665e-3 * 1800 m in 60 s, 1 ug of at most 1e-6 Earth diameters.
     assert position_error(1e3 * MICRO_G, 60.0) == pytest.approx(17.652, rel=1e-4)
     assert schuler_peak(MICRO_G) == pytest.approx(12.742, rel=1e-4)
-
-
-def test_the_map_of_the_sphere_preserves_areas():
     assert figures.equal_area((0.0, 0.0, 1.0), 1) == (0.0, 0.0)
     assert figures.equal_area((0.0, 1.0, 0.0), -1) == (0.0, 1.0)
     # The cap above 45 deg is 1 - sin 45 of the hemisphere; its map is this share of the disc.
@@ -78,7 +73,7 @@ def test_the_map_of_the_sphere_preserves_areas():
     assert x**2 + y**2 == pytest.approx(1.0 - np.sqrt(0.5))
 
 
-def test_the_drawn_trace_covers_the_bag_without_a_gap():
+def test_the_drawn_trace_covers_the_bag_without_a_gap_also_without_a_case():
     bag = fitted().bags[0]
     stretches = shown_bag(bag, 0, DetectorSettings()).stretches
     assert stretches[0].regime == Regime.UNKNOWN
@@ -87,10 +82,6 @@ def test_the_drawn_trace_covers_the_bag_without_a_gap():
     for before, after in pairwise(stretches):
         assert before.stop == after.start
         assert (before.regime, before.direction) != (after.regime, after.direction)
-
-
-def test_the_drawn_trace_without_a_case_thermometer_is_that_of_the_board():
-    bag = fitted().bags[0]
     bag = replace(bag, temperatures={'board': bag.board})
     shown = shown_bag(bag, 0, DetectorSettings())
     assert shown.leader == 'board'
@@ -133,7 +124,6 @@ def test_the_area_of_a_ring_is_proportional_to_the_residual_of_its_position():
         lines = [line for axes in figures.draw_positions(evidence()).axes for line in axes.lines]
     rings = [line for line in lines if line.get_marker() == 'o' and line.get_mfc() == 'none']
     areas = np.sort([ring.get_markersize() ** 2 for ring in rings])
-    # A position without a left-out residual has a ring of area 0.
     rms = np.sort([place.residual_rms.get(LEFT_OUT, 0.0) for place in evidence().positions])
     assert areas / areas[-1] == pytest.approx(rms / rms[-1])
 
@@ -180,33 +170,33 @@ HEADLESS = (
 )
 
 
-def browser():
+def browse(folder, page, *options):
+    """Open a page of a folder, beside the certificate, in a browser; return the browser's log."""
     path = next(filter(None, map(shutil.which, ('chromium', 'chromium-browser'))), None)
     if path is None:
         pytest.skip('no Chromium here (Debian: apt install chromium)')
-    return path
+    (folder / 'page.html').write_text(certificate(), encoding='utf-8')
+    profile = f'--user-data-dir={folder / "profile"}'
+    command = [path, *HEADLESS, profile, *options, (folder / page).as_uri()]
+    keys = {'capture_output': True, 'text': True, 'timeout': TIMEOUT_S}
+    return subprocess.run(command, check=True, **keys).stderr
 
 
 def test_a_browser_draws_the_page_at_390_pixels_without_errors(tmp_path):
     # A headless browser has a smallest window width; a frame in the window can be 390 px wide.
-    (tmp_path / 'page.html').write_text(certificate(), encoding='utf-8')
-    frame = tmp_path / 'frame.html'
-    frame.write_text("""<iframe src="page.html" style="width:390px;height:800px;border:0"></iframe>
+    (
+        tmp_path / 'frame.html'
+    ).write_text("""<iframe src="page.html" style="width:390px;height:800px;border:0"></iframe>
 <script>onload = () => {
   const page = frames[0].document;
   const shown = [page.documentElement, ...page.querySelectorAll("div:not(.drawing)")];
   console.log(shown.filter(one => one.scrollWidth > Math.max(one.clientWidth, 1)).length
     + " of " + page.querySelectorAll("table").length + " tables are cut");
 }</script>""")
-    finished = subprocess.run(
-        [
-            browser(), *HEADLESS, '--enable-logging=stderr', '--allow-file-access-from-files',
-            f'--user-data-dir={tmp_path / "profile"}', f'--screenshot={tmp_path / "phone.png"}',
-            frame.as_uri(),
-        ],
-        capture_output=True, text=True, timeout=TIMEOUT_S, check=True,
-    )  # fmt: skip
-    (text,) = [line for line in finished.stderr.splitlines() if 'CONSOLE' in line]
+    screenshot = f'--screenshot={tmp_path / "phone.png"}'
+    log = browse(tmp_path, 'frame.html', '--enable-logging=stderr',
+                 '--allow-file-access-from-files', screenshot)  # fmt: skip
+    (text,) = [line for line in log.splitlines() if 'CONSOLE' in line]
     cut, n_tables = re.search(r'(\d+) of (\d+) tables are cut', text).groups()
     assert int(n_tables) >= 5
     assert cut == '0'
@@ -214,15 +204,8 @@ def test_a_browser_draws_the_page_at_390_pixels_without_errors(tmp_path):
 
 
 def test_no_printed_page_is_empty(tmp_path):
-    (tmp_path / 'page.html').write_text(certificate(), encoding='utf-8')
-    subprocess.run(
-        [
-            browser(), *HEADLESS, f'--user-data-dir={tmp_path / "profile"}',
-            '--no-pdf-header-footer', f'--print-to-pdf={tmp_path / "page.pdf"}',
-            (tmp_path / 'page.html').as_uri(),
-        ],
-        capture_output=True, timeout=TIMEOUT_S, check=True,
-    )  # fmt: skip
+    printing = f'--print-to-pdf={tmp_path / "page.pdf"}'
+    browse(tmp_path, 'page.html', '--no-pdf-header-footer', printing)
     printed = (tmp_path / 'page.pdf').read_bytes()
     pages = re.findall(rb'/Type /Page\n.*?/Contents (\d+) 0 R', printed, re.DOTALL)
     assert 5 <= len(pages) <= 12

@@ -89,7 +89,7 @@ def check_blocks(stamps, samples, cuts, whole):
     assert np.allclose([row.mean for row in found], [row.mean for row in whole], atol=1e-9)
 
 
-def test_logged_windows_are_means_over_10_s_at_rest():
+def test_logged_windows_are_means_over_10_s_at_rest_with_a_mean_rate_if_none_is_missing():
     # A rest of 25 s and, after 1 s of handling, a rest of 21 s: each gives two windows of 10 s.
     first, second = standing(25 * RATE_HZ), standing(21 * RATE_HZ, 2)[:, [2, 1, 0]]
     handled = first[:RATE_HZ] + np.linspace(0.0, 900.0, RATE_HZ)[:, None]
@@ -101,11 +101,7 @@ def test_logged_windows_are_means_over_10_s_at_rest():
     for row, part in zip(whole, parts, strict=True):
         assert np.allclose(row.mean, part.mean(axis=0), atol=1e-9)
         assert np.allclose(row.sd, part.std(axis=0), rtol=0.05)
-    # Samples in blocks of any size give equal windows.
     check_blocks(stamps, samples, [7, 333, 334, 1201], whole)
-
-
-def test_a_rest_in_which_an_angular_rate_is_missing_has_no_mean_rate():
     # WHY: blocks of messages with and without rates had 6 and 3 columns, which ended the log.
     samples = np.hstack((standing(25 * RATE_HZ), np.full((25 * RATE_HZ, 3), 0.01)))
     samples[7, 3:] = np.nan
@@ -120,8 +116,7 @@ def test_a_rest_in_which_an_angular_rate_is_missing_has_no_mean_rate():
 
 @pytest.mark.parametrize('rate', [1.0, 2.0, 3.3, 5.0, 50.0, 2000.0])
 def test_rests_are_found_at_any_rate_of_samples(rate, rng):
-    # Rests of one minute in two attitudes, with jitter of the stamps. Samples at rates up to
-    # `RATE_HZ` have equal noise, at higher rates an equal noise density.
+    # Rests of one minute in two attitudes, with jitter; above `RATE_HZ` noise has equal density.
     n = round(120 * rate)
     cycles = np.arange(n) + 0.1 * rng.uniform(-1.0, 1.0, n)
     stamps = START_NS + np.rint(cycles * SECOND_NS / rate).astype(np.int64)
@@ -229,13 +224,12 @@ def test_the_size_of_a_rest_log_is_limited_per_day_and_in_total(tmp_path, monkey
     assert len(sizes) == 6
     assert max(sizes) <= 2000
     assert sum(sizes) <= 5000 + 2000
-    # The oldest file was thinned to less than half of the newest file, and no file was removed.
     assert sizes[0] < sizes[-1] / 2
     assert log.n_rests == len(logged(tmp_path))
     assert (log.n_days, log.n_lost, log.reason) == (6, 0, '')
 
 
-def test_rests_lost_on_a_full_disk_are_counted(small_disk):
+def test_rests_that_cannot_be_kept_are_counted_and_impossible_folders_refused(small_disk, unit):
     log = RestLog(str(small_disk))
     for k in range(100):
         log.put(rest(k).stamp_ns, encode(START), encode(rest(k)))
@@ -244,6 +238,8 @@ def test_rests_lost_on_a_full_disk_are_counted(small_disk):
     assert 0 < len(kept) < 100
     assert (log.n_rests, log.n_lost) == (len(kept), 100 - len(kept))
     assert log.reason == 'No space left on device'
+    with pytest.raises(OutputError, match='rests: parameter `rest_log`: Not a directory'):
+        RestLog(f'{unit}/rests')
 
 
 def test_a_killed_node_damages_at_most_one_line_of_its_rest_log(tmp_path, unit, peer):
@@ -296,8 +292,7 @@ def test_a_killed_node_damages_at_most_one_line_of_its_rest_log(tmp_path, unit, 
 
 
 def test_a_rest_has_the_temperature_at_its_own_time_at_any_speed_of_playing(tmp_path, unit, peer):
-    # WHY: the thermal state was that at the end of a block of samples, which at 70 times real time
-    # is a minute after the rest: an error of 0.75 K in a ramp.
+    # WHY: the thermal state was that at the end of a block: in a ramp an error of 0.75 K.
     folder, rate_k_s = tmp_path / 'rests', 0.02
     words = node_arguments(unit, f'rest_log:={folder}', 'diagnostics_period:=1.0')
     with node_in_thread(*words) as node:
@@ -322,8 +317,3 @@ def test_the_diagnostics_warn_of_a_full_disk(small_disk, unit, peer):
         send(driver, standing(12 * RATE_HZ))
         text = 'not kept in the rest log: No space left on device'
         peer.wait_for(lambda: any(text in each.status[0].message for each in heard), text)
-
-
-def test_a_folder_that_cannot_be_made_is_refused(unit):
-    with pytest.raises(OutputError, match='rests: parameter `rest_log`: Not a directory'):
-        RestLog(f'{unit}/rests')

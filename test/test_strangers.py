@@ -46,7 +46,7 @@ def ramp(given, rate, hours, environment=units.CHAMBER):
     return at, units.integrate(A, b, h, rate * at, 10.0, np.linalg.solve(A, -h))
 
 
-def test_a_node_lags_a_ramp_by_its_time_constant():
+def test_a_node_lags_a_ramp_by_its_time_constant_and_the_hidden_node_depends_on_the_air():
     # A node with x' = (u - x) / tau lags a ramp u by rate * tau after many time constants.
     lags = np.array([500.0, 900.0, 1500.0])
     given = unit(board_s=700.0, part_s=lags)
@@ -54,6 +54,19 @@ def test_a_node_lags_a_ramp_by_its_time_constant():
     case, board = states[-1, units.CASE], states[-1, units.BOARD]
     assert case - board == pytest.approx(0.01 * 700.0, rel=1e-6)
     assert board - states[-1, units.PARTS] == pytest.approx(0.01 * lags, rel=1e-6)
+    # The lag of x behind a ramp u after a soak is u - x = rate * tau * (1 - exp(-t / tau)).
+    A, b, h = np.array([[-1 / 300.0]]), np.array([1 / 300.0]), np.zeros(1)
+    at = np.arange(0.0, 1500.0, 5.0)
+    states = units.integrate(A, b, h, 0.01 * at, 5.0, np.zeros(1))
+    behind = 0.01 * at - states[:, 0]
+    assert behind == pytest.approx(3.0 * (1.0 - np.exp(-at / 300.0)), abs=1e-12)
+    # (hidden node - board) / (case - board) in a ramp differs between still air and chamber.
+    shares = []
+    for environment in (units.CHAMBER, units.STILL_AIR):
+        _, states = ramp(unit(), 0.01, 12, environment)
+        above = states[-1, units.HIDDEN] - states[-1, units.BOARD]
+        shares.append(above / (states[-1, units.CASE] - states[-1, units.BOARD]))
+    assert abs(shares[1] - shares[0]) > 0.3
 
 
 def test_a_board_cooled_by_the_fan_follows_the_case_in_another_way_without_fan():
@@ -70,27 +83,7 @@ def test_a_board_cooled_by_the_fan_follows_the_case_in_another_way_without_fan()
     assert lags[1] > 1.3 * lags[0]
 
 
-def test_the_integration_is_exact_at_each_step_of_a_ramp():
-    # The lag of x behind a ramp u after a soak is u - x = rate * tau * (1 - exp(-t / tau)).
-    A, b, h = np.array([[-1 / 300.0]]), np.array([1 / 300.0]), np.zeros(1)
-    at = np.arange(0.0, 1500.0, 5.0)
-    states = units.integrate(A, b, h, 0.01 * at, 5.0, np.zeros(1))
-    behind = 0.01 * at - states[:, 0]
-    assert behind == pytest.approx(3.0 * (1.0 - np.exp(-at / 300.0)), abs=1e-12)
-
-
-def test_still_air_changes_the_temperature_of_the_hidden_node():
-    # (hidden node - board) / (case - board) in a ramp differs between still air and chamber.
-    shares = []
-    for environment in (units.CHAMBER, units.STILL_AIR):
-        _, states = ramp(unit(), 0.01, 12, environment)
-        above = states[-1, units.HIDDEN] - states[-1, units.BOARD]
-        shares.append(above / (states[-1, units.CASE] - states[-1, units.BOARD]))
-    assert abs(shares[1] - shares[0]) > 0.3
-
-
 def test_simulated_samples_have_the_stated_noise_bias_scale_and_misalignment():
-    # M (samples - bias) / scale must give the true force plus white noise.
     given = unit(
         bias=np.array([100.0, -200.0, 300.0]), gain=np.array([0.01, -0.02, 0.03]),
         misalignment=np.array([1e-3, 2e-3, -3e-3]), density=5.0,
@@ -227,7 +220,7 @@ def curved_unit():
     )  # fmt: skip
 
 
-def test_the_scipy_cubic_fits_a_cubic_bias_and_constants_do_not():
+def test_the_scipy_cubic_fits_a_cubic_bias_in_many_attitudes_and_its_drift_in_one():
     given = curved_unit()
     fit = of_attitudes(given, np.linspace(5, 35, 7))
     held = of_attitudes(given, np.array([8.0, 29]))
@@ -236,6 +229,16 @@ def test_the_scipy_cubic_fits_a_cubic_bias_and_constants_do_not():
     # The cubic fitted by scipy neglects products below 5 ug, e.g. misalignment times bias.
     assert cubic.vector < 5.0
     assert constants.vector > 50.0
+    given = replace(curved_unit(), scale_curve=ZEROS)
+
+    def one_pose(board):
+        bag = of_attitudes(given, board)
+        rows = slice(len(board))
+        return Minutes(bag.samples[rows], bag.board[rows], bag.force[rows])
+
+    fit, held = one_pose(np.linspace(5, 35, 31)), one_pose(np.array([9.0, 22]))
+    error = strangers.error_of([by_drift([fit], 1.0, order=3)(held)], [held], is_drift=True)
+    assert error.vector < 1e-6
 
 
 def test_a_scipy_fit_to_one_attitude_does_not_change_the_scatter_of_forces():
@@ -267,43 +270,13 @@ def test_the_bias_score_is_error_over_bound_and_error_over_claimed_sd():
     assert score.bound_ratio == pytest.approx(1 / 0.3 / np.sqrt(3.0))
 
 
-def test_the_scipy_cubic_fits_the_drift_in_a_single_pose():
-    given = replace(curved_unit(), scale_curve=ZEROS)
-
-    def one_pose(board):
-        bag = of_attitudes(given, board)
-        rows = slice(len(board))
-        return Minutes(bag.samples[rows], bag.board[rows], bag.force[rows])
-
-    fit, held = one_pose(np.linspace(5, 35, 31)), one_pose(np.array([9.0, 22]))
-    error = strangers.error_of([by_drift([fit], 1.0, order=3)(held)], [held], is_drift=True)
-    assert error.vector < 1e-6
-
-
-def test_minutes_averages_whole_minutes_of_a_bag():
+def test_a_minute_is_a_mean_whose_claimed_sd_is_its_noise():
     time_s = np.arange(1.0, 151.0)
     samples = np.repeat(time_s[:, None], 3, axis=1)
     mean = minutes(Bag('', time_s, samples, {'board': (time_s, 2.0 * time_s)}))
     assert mean.samples[:, 0].tolist() == [30.5, 90.5]
     assert mean.board.tolist() == [61.0, 181.0]
     assert np.isnan(mean.force).all()
-
-
-def test_the_ratio_is_1_if_errors_have_the_claimed_covariance():
-    rng = rng_of('ratio')
-    n = 20000
-    truth = np.broadcast_to(GRAVITY * LEVEL, (n, 3))
-    root = 20.0 * UG * np.array([[1.0, 0.0, 0.0], [0.5, 1.0, 0.0], [0.2, -0.3, 2.0]])
-    error = rng.standard_normal((n, 3)) @ root.T
-    claim = np.broadcast_to(root @ root.T, (n, 3, 3))
-    out = strangers.Corrected(truth + error, claim, np.zeros(3))
-    scores = strangers.score([out], [Minutes(truth, np.zeros(n), truth)], is_drift=False)
-    # The RMS of the errors in 20000 windows is uncertain by 0.5 %.
-    assert (scores.ratio, scores.norm_ratio) == pytest.approx((1.0, 1.0), rel=0.02)
-    assert scores.claim == pytest.approx(scores.vector, rel=0.02)
-
-
-def test_the_claimed_sd_of_a_minute_is_the_noise_of_its_mean():
     # The calibration claims only white noise and rounding of counts.
     samples = np.tile(300.0 * GRAVITY * LEVEL, (30000, 1))
     samples[::2] += 1.0
@@ -315,7 +288,18 @@ def test_the_claimed_sd_of_a_minute_is_the_noise_of_its_mean():
     assert out.force == pytest.approx(np.tile(GRAVITY * LEVEL, (5, 1)))
 
 
-def test_a_score_is_infinite_if_3_percent_of_the_minutes_are_missing():
+def test_the_ratio_is_1_for_the_claimed_covariance_and_infinite_if_minutes_are_missing():
+    rng = rng_of('ratio')
+    n = 20000
+    truth = np.broadcast_to(GRAVITY * LEVEL, (n, 3))
+    root = 20.0 * UG * np.array([[1.0, 0.0, 0.0], [0.5, 1.0, 0.0], [0.2, -0.3, 2.0]])
+    error = rng.standard_normal((n, 3)) @ root.T
+    claim = np.broadcast_to(root @ root.T, (n, 3, 3))
+    out = strangers.Corrected(truth + error, claim, np.zeros(3))
+    scores = strangers.score([out], [Minutes(truth, np.zeros(n), truth)], is_drift=False)
+    # The RMS of the errors in 20000 windows is uncertain by 0.5 %.
+    assert (scores.ratio, scores.norm_ratio) == pytest.approx((1.0, 1.0), rel=0.02)
+    assert scores.claim == pytest.approx(scores.vector, rel=0.02)
     truth = np.broadcast_to(GRAVITY * LEVEL, (100, 3))
     force = truth + UG
     claim = np.broadcast_to(UG**2 * np.eye(3), (100, 3, 3))
@@ -339,9 +323,6 @@ def test_misses_names_exactly_the_limits_that_a_row_violates():
     assert missed(Score(41.0, 104.0, 1.0, 1.6, 90.0)) == ['ratio 1.6 > 1.5']
     assert missed(Score(30.0, 90.0, 1.0, 0.6, 90.0), 'turn-on 9') == ['ratio 0.6 < 0.7']
     assert missed(Score(13.0, 90.0, 1.0, 1.0, 90.0), 'kink') == ['norm 13 > 12']
-
-
-def test_a_joint_fit_is_compared_with_the_fit_to_the_chamber_bags():
     alone, joint = Score(20.0, 40.0, 1.0, 1.0, 40.0), Score(9.0, 30.0, 1.0, 1.0, 40.0)
     rows = rows_of([Result('third-node alone: its attitude', 1, {'fit': alone}),
                     Result('third-node joint: its attitude', 1, {'fit': joint})])  # fmt: skip
@@ -372,13 +353,10 @@ def carried_bag():
     return Bag('day', time_s, force, {'board': (time_s, np.full(len(time_s), 20.0))})
 
 
-def test_rests_are_stays_in_one_attitude_without_their_first_and_last_minute():
+def test_a_recorded_day_is_divided_into_rests_and_blocks_of_3_h():
     rows = rests_of(carried_bag())
     expected = [(60, 17940), (18060, 35940), (36180, 86340)]
     assert [(rest.start, rest.stop) for rest in rows] == expected
-
-
-def test_blocks_begin_at_multiples_of_3_h_and_share_no_sample():
     bag = carried_bag()
     blocks = blocks_of(part(bag, slice(9000, 86400), 'rest'), 'rest')
     assert list(blocks) == list(range(8))

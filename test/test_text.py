@@ -61,11 +61,8 @@ def test_impossible_serials_are_refused(serial):
         source = FitSource('bag', list, serial=serial)
         with pytest.raises(errors.FitError, match='must be one printable line'):
             check_serial([source], FitOptions(gravity=9.8))
-
-
-@pytest.mark.parametrize('serial', ['42', 'Блок 7', 'x' * LONGEST_SERIAL])
-def test_permitted_serials_are_accepted(serial):
-    assert valid_serial(serial) == serial
+    for good in ('42', 'Блок 7', 'x' * LONGEST_SERIAL):
+        assert valid_serial(good) == good
 
 
 @pytest.mark.parametrize(

@@ -78,9 +78,8 @@ PARTS = {
 @pytest.mark.parametrize('part', PARTS)
 @pytest.mark.parametrize('sensor', SENSORS)
 def test_squared_errors_are_on_average_below_5_claimed_variances(errors, sensor, part):
-    # In soaks and ramps the claimed variance is a few times the mean squared error, because it
-    # allows for the onset or end of a ramp at any time. Readings with steps have few independent
-    # errors, so their mean square is uncertain by a factor of 2.
+    # The claimed variance of soaks and ramps allows for the onset or end of a ramp at any time.
+    # For readings with steps the mean squared error is uncertain by a factor of 2.
     begin, end = PARTS[part]
     rows = errors[sensor]
     rows = rows[(rows[:, 0] >= begin) & (rows[:, 0] < end)]
@@ -121,8 +120,7 @@ def test_a_change_between_steps_of_1_k_determines_the_temperature():
 
 @pytest.mark.parametrize(('quantum', 'lag_s'), [(0.1, 120.0), (0.5, 180.0), (1.0, 600.0)])
 def test_equal_readings_each_minute_keep_the_error_below_1_5_quanta(quantum, lag_s):
-    # WHY: when the predicted temperature was more than a quantum from the reading, equal readings
-    # had no weight, and the claimed sd rose to 24 K within an hour of soak.
+    # WHY: equal readings more than a quantum from the prediction had no weight: an sd of 24 K.
     t = np.arange(-3600.0, 9000.0, 60.0)
     truth = 20.0 + lagged(t, [(0.0, 1.0), (1200.0, 0.0)], lag_s)
     thermometer = Thermometer(ThermometerSettings(0.01 * quantum, quantum, lag_s=lag_s))
@@ -160,7 +158,7 @@ def drawn(rng):
     return rng.normal(size=3), root @ root.T
 
 
-def test_the_prediction_and_the_correction_step_equal_matrix_algebra():
+def test_prediction_correction_and_blend_equal_matrix_algebra():
     mean, covariance = drawn(np.random.default_rng(0))
     dt, lag, power = 1.7, 50.0, 0.3
     forward = np.array([[1.0, dt, dt**2 / 2.0], [0.0, 1.0, dt], [0.0, 0.0, 1 / (1.0 + dt / lag)]])
@@ -178,9 +176,6 @@ def test_the_prediction_and_the_correction_step_equal_matrix_algebra():
     np.testing.assert_allclose(out[3:], (covariance - np.outer(gain, covariance[0]))[UPPER])
     assert innovation == 5.0 - mean[0]
     assert spread == pytest.approx(covariance[0, 0] + 0.2)
-
-
-def test_a_blend_has_mean_and_covariance_of_the_mixture():
     rng = np.random.default_rng(2)
     states, samples = [], []
     for n in (300_000, 100_000):
@@ -207,22 +202,16 @@ def test_readings_that_are_not_finite_or_not_newer_do_not_change_the_state(stamp
     assert thermometer.n_in_row == 600
 
 
-def test_a_reading_15_sd_from_its_prediction_is_down_weighted():
-    # A reading 6 to 30 sd from its prediction counts as 6 sd away; farther away it is not used.
-    thermometer = settled()
-    assert thermometer.update(600 * SECOND_NS, 20.015)
-    assert abs(thermometer.temperature - 20.0) < 0.004
-
-
-def test_a_lasting_step_is_accepted_after_four_readings():
+def test_a_far_reading_has_little_weight_and_a_lasting_step_is_accepted_after_four():
     thermometer = settled()
     used = [thermometer.update((600 + k) * SECOND_NS, 60.0) for k in range(6)]
     assert used == [False, False, False, True, True, True]
     assert thermometer.temperature == pytest.approx(60.0, abs=0.01)
     assert (thermometer.n_in_row, thermometer.n_restarts) == (3, 1)
-
-
-def test_outliers_of_both_signs_are_not_accepted_as_a_step():
+    # A reading 6 to 30 sd from its prediction counts as 6 sd away; farther away it is not used.
+    thermometer = settled()
+    assert thermometer.update(600 * SECOND_NS, 20.015)
+    assert abs(thermometer.temperature - 20.0) < 0.004
     thermometer = settled()
     for k in range(8):
         assert not thermometer.update((600 + k) * SECOND_NS, 60.0 if k % 2 else -20.0)
@@ -230,7 +219,7 @@ def test_outliers_of_both_signs_are_not_accepted_as_a_step():
     assert thermometer.temperature == pytest.approx(20.0, abs=0.002)
 
 
-def test_a_gap_increases_the_variance_and_a_long_gap_restarts_the_estimate():
+def test_a_gap_increases_the_variance_or_restarts_the_estimate_and_changes_are_dated():
     thermometer = settled()
     narrow = thermometer.var_temperature
     thermometer.update(900 * SECOND_NS, 20.0)
@@ -240,25 +229,20 @@ def test_a_gap_increases_the_variance_and_a_long_gap_restarts_the_estimate():
     assert thermometer.n_restarts == 1
     assert not thermometer.is_ready
     assert (thermometer.temperature, thermometer.rate) == (25.0, 0.0)
-
-
-def test_the_noise_is_estimated_if_the_setting_is_too_small():
-    # WHY: sensors on a die have a noise of 0.1 K; with the noise set to 5 mK all readings were
-    # taken for outliers. WHAT: the ratio of true to set noise is estimated to 20 %, as some noise
-    # is taken for rate changes; the claimed variance is at least half of the squared error.
-    thermometer = Thermometer(ThermometerSettings(0.005))
-    rng = np.random.default_rng(3)
-    out = run(thermometer, np.arange(4000.0), read(np.full(4000, 20.0), 0.125, 0.0, rng))
-    assert math.sqrt(thermometer._noise_scale) == pytest.approx(25.0, rel=0.2)
-    assert np.mean((out[1000:, 0] - 20.0) ** 2 / out[1000:, 2]) < 2.0
-
-
-def test_the_time_of_the_last_changed_reading_is_kept():
     thermometer = settled()
     for k in range(600, 700):
         thermometer.update(k * SECOND_NS, 20.0)
     assert thermometer.changed_ns == 600 * SECOND_NS
     assert thermometer.stamp_ns == 699 * SECOND_NS
+
+
+def test_the_noise_is_estimated_if_the_setting_is_too_small():
+    # WHY: readings with a noise of 0.1 K, stated as 5 mK, were all taken for outliers.
+    thermometer = Thermometer(ThermometerSettings(0.005))
+    rng = np.random.default_rng(3)
+    out = run(thermometer, np.arange(4000.0), read(np.full(4000, 20.0), 0.125, 0.0, rng))
+    assert math.sqrt(thermometer._noise_scale) == pytest.approx(25.0, rel=0.2)
+    assert np.mean((out[1000:, 0] - 20.0) ** 2 / out[1000:, 2]) < 2.0
 
 
 def test_the_extrapolation_is_linear_for_5_s_and_then_constant():
@@ -281,7 +265,7 @@ def test_the_extrapolation_is_linear_for_5_s_and_then_constant():
     assert thermometer.at(last_ns - SECOND_NS)[0] == pytest.approx(temperature - 0.01, abs=1e-5)
 
 
-def test_one_reading_is_a_temperature_without_a_rate():
+def test_one_reading_is_a_temperature_without_a_rate_also_after_a_reset():
     thermometer = Thermometer(ThermometerSettings(0.01))
     nothing = thermometer.at(0)
     assert np.isnan(nothing[:2]).all()
@@ -289,9 +273,6 @@ def test_one_reading_is_a_temperature_without_a_rate():
     assert thermometer.update(5, 21.0)
     assert thermometer.at(10**9) == (21.0, 0.0, 0.01**2)
     assert not thermometer.is_ready
-
-
-def test_reset_removes_the_effect_of_all_readings():
     thermometer = settled()
     thermometer.reset()
     assert thermometer.stamp_ns is None

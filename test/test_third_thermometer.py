@@ -1,11 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-A third thermometer, on the lid, is found in the bags, fitted, used by replay, and reduces errors.
-
-Electronics that are switched at random warm the lid by 5 K, but board and case by 0.1 K only, so
-only the thermometer on the lid shows when the lid changes the biases.
-"""
+"""A third thermometer, on a lid warmed by electronics, shows when the lid changes the biases."""
 
 import math
 from dataclasses import replace
@@ -60,7 +55,6 @@ def record(path, run):
 
 def fitted(bags):
     sources, _ = fit_sources(bags)
-    # Three groups of columns suffice, because the lid's effect has no lag.
     groups = ('curve', 'gradient', 'board')
     return fit(sources, FitOptions(gravity=STANDARD_GRAVITY, groups=groups)).calibration
 
@@ -92,8 +86,7 @@ def test_a_third_thermometer_reduces_the_error_to_the_noise(runs, tmp_path):
         index = np.searchsorted(runs[-1].accel_stamp_ns, corrected.accel_stamp_ns)
         error = corrected.accel - truth.specific_force
         use = truth.cycle_s[index] > 600.0
-        # Compare the scatter of means over 60 s: errors of the constants do not change the
-        # scatter, and noise is small.
+        # The scatter of means over 60 s contains no errors of the constants.
         n = int(use.sum()) // 120 * 120
         means = error[use][:n].reshape(-1, 120, 3).mean(axis=1)
         errors[sees_lid] = float(np.sqrt(np.mean(np.var(means, axis=0)))) / MICRO_G

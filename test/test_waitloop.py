@@ -1,22 +1,35 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The loop of waitloop.py uses undocumented parts of rclpy; the installed rclpy has them."""
+"""The loop of waitloop.py and the Fast DDS profile of the node work with the installed rclpy."""
 
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
 import threading
 import time
+from pathlib import Path
+from subprocess import PIPE
 
 import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
 
+from builders import calibration
 from geometry_msgs.msg import Vector3Stamped
-from rclpy.impl.implementation_singleton import rclpy_implementation
+from live_node import lossless
+from node_process import NodeProcess
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
-from ros_helpers import DEEP, TIMEOUT, bare_node
+from ros_helpers import DEEP, TIMEOUT, Driver, bare_node, stamp_of, standing
+from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
+from thermo_comp.ros.process import LOCAL_PROFILE, PROFILE, VARIABLE, use_profile
 from thermo_comp.ros.waitloop import RCLError, WaitLoop, overrides
+from thermo_comp.unit.calibration_file import save_calibration
 
 RELIABLE = QoSProfile(depth=2000)
 BEST_EFFORT = QoSProfile(depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -29,19 +42,20 @@ def node():
 
 
 class Running:
-    def __init__(self, node):
-        self.loop = WaitLoop(node)
-        self.raw = self.loop.subscribe(Vector3Stamped, 'samples', QoSProfile(depth=2000))
+    def __init__(self, node, qos=RELIABLE, interval_s=None, rest_s=0.0):
+        self.loop = WaitLoop(node, rest_s)
+        self.raw = self.loop.subscribe(Vector3Stamped, 'samples', qos)
+        self.interval_s = interval_s
         self.messages = []
-        self.received_ns = []
         self.news = threading.Condition()
         self.thread = threading.Thread(target=self.loop.run, args=(self.take,), daemon=True)
 
     def take(self):
-        messages, received_ns, _ = self.raw.drain()
+        messages = self.raw.drain()[0]
         with self.news:
             self.messages += messages
-            self.received_ns += received_ns
+            if self.interval_s is not None:
+                self.raw.interval_ns = int(self.interval_s * 1e9)
             self.news.notify_all()
 
     def wait_for(self, condition):
@@ -58,22 +72,19 @@ class Running:
         assert not self.thread.is_alive()
 
 
-def test_rclpy_has_the_undocumented_attributes_in_use():
-    for path in (
-        *(f'WaitSet.{name}' for name in ('clear_entities', 'add_subscription', 'add_service')),
-        *('WaitSet.add_guard_condition', 'WaitSet.wait', 'WaitSet.is_ready'),
-        *('Subscription.take_message', 'Subscription.pointer', 'Subscription.get_publisher_count'),
-        *('Service.service_take_request', 'Publisher.publish_raw'),
-    ):
-        kind, name = path.split('.')
-        assert hasattr(getattr(rclpy_implementation, kind), name), f'rclpy._rclpy lost {path}'
-    assert issubclass(rclpy_implementation.RCLError, RuntimeError)
-    assert issubclass(RCLError, Exception)
-
-
-def test_names_of_parameters_that_the_user_set_are_returned(node):
+def test_names_of_set_parameters_are_returned_and_qos_can_be_overridden(node):
     node.declare_parameter('known', 1)
     assert overrides(node) == {'mispelt': 1, 'known': 2}
+    loop = WaitLoop(node)
+    node.declare_parameter('qos_overrides./others.subscription.depth', 3)
+    qos = QoSProfile(depth=7)
+    loop.subscribe(Vector3Stamped, 'samples', qos)
+    loop.subscribe(Vector3Stamped, 'others', qos)
+    # rclpy writes overrides into the given QoS profile, so each subscription needs a copy.
+    assert qos.depth == 7
+    assert node.get_parameter('qos_overrides./samples.subscription.depth').value == 7
+    reliability = node.get_parameter('qos_overrides./samples.subscription.reliability')
+    assert ReliabilityPolicy[reliability.value.upper()] is ReliabilityPolicy.RELIABLE
 
 
 def test_messages_lost_by_a_full_queue_are_counted(node, peer):
@@ -133,13 +144,6 @@ def test_a_periodic_function_is_called_with_and_without_samples(node, peer):
     assert len(called) <= n_called + 1
 
 
-def test_the_loop_stops_when_the_context_is_shut_down(node):
-    with Running(node) as running:
-        node.context.shutdown()
-        running.thread.join(TIMEOUT)
-        assert not running.thread.is_alive()
-
-
 def test_a_subscription_can_be_removed_while_the_loop_runs(node, peer):
     running = Running(node)
     other = running.loop.subscribe(Vector3Stamped, 'others', DEEP)
@@ -158,17 +162,11 @@ def test_a_subscription_can_be_removed_while_the_loop_runs(node, peer):
     assert all(subscription.topic != 'others' for subscription in node.subscriptions)
 
 
-def test_qos_of_a_subscription_can_be_overridden(node):
-    loop = WaitLoop(node)
-    node.declare_parameter('qos_overrides./others.subscription.depth', 3)
-    qos = QoSProfile(depth=7)
-    loop.subscribe(Vector3Stamped, 'samples', qos)
-    loop.subscribe(Vector3Stamped, 'others', qos)
-    # rclpy writes overrides into the given QoS profile, so each subscription needs a copy.
-    assert qos.depth == 7
-    assert node.get_parameter('qos_overrides./samples.subscription.depth').value == 7
-    reliability = node.get_parameter('qos_overrides./samples.subscription.reliability')
-    assert ReliabilityPolicy[reliability.value.upper()] is ReliabilityPolicy.RELIABLE
+def test_the_loop_stops_when_the_context_is_shut_down(node):
+    with Running(node) as running:
+        node.context.shutdown()
+        running.thread.join(TIMEOUT)
+        assert not running.thread.is_alive()
 
 
 @pytest.mark.parametrize(
@@ -184,32 +182,150 @@ def test_qos_of_a_subscription_can_be_overridden(node):
 def test_the_loop_pauses_only_for_frequent_best_effort_messages(
     node, peer, monkeypatch, qos, interval_s, is_resting
 ):
-    rest_s = 1000.0
-    rests = []
+    rest_s, rests = 1000.0, []
     monkeypatch.setattr('thermo_comp.ros.waitloop.time.sleep', rests.append)
-    loop = WaitLoop(node, rest_s)
-    raw = loop.subscribe(Vector3Stamped, 'samples', qos)
-    n_taken = 0
-    news = threading.Condition()
-
-    def take():
-        nonlocal n_taken
-        with news:
-            n_taken += len(raw.drain()[0])
-            if interval_s is not None:
-                raw.interval_ns = int(interval_s * 1e9)
-            news.notify_all()
-
-    thread = threading.Thread(target=loop.run, args=(take,), daemon=True)
-    thread.start()
-    publisher = peer.publisher(Vector3Stamped, 'samples')
-    peer.poll(raw.subscription.get_publisher_count, 'the publisher')
-    for n_sent in range(1, 6):
-        publisher.publish(Vector3Stamped())
-        with news:
-            assert news.wait_for(lambda n=n_sent: n_taken == n, TIMEOUT)
-    loop.stop()
-    thread.join(TIMEOUT)
-    assert not thread.is_alive()
+    with Running(node, qos, interval_s, rest_s) as running:
+        publisher = peer.publisher(Vector3Stamped, 'samples')
+        peer.poll(running.raw.subscription.get_publisher_count, 'the publisher')
+        for n_sent in range(1, 6):
+            publisher.publish(Vector3Stamped())
+            running.wait_for(lambda n=n_sent: len(running.messages) == n)
     assert bool(rests) == is_resting
     assert all(0.0 < rest <= rest_s for rest in rests)
+
+
+CYCLE_NS = 10_000_000
+N_SAMPLES = 300
+#: Number of samples to send before the test fails because the node has not found its peers.
+N_TRIED = 5000
+OTHER = """\
+<dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"><profiles>
+  <data_reader profile_name="other"/>
+</profiles></dds>
+"""
+
+#: A program with a reliable and a best-effort subscription, which prints the stamps of each.
+RECEIVER = """
+import json, select, sys, time
+import rclpy
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Imu
+
+rclpy.init()
+node = rclpy.create_node('receiver')
+heard = {}
+
+
+def stamp(message):
+    return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+
+
+for reliability in (ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT):
+    stamps = heard[reliability] = []
+    qos = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=reliability)
+    hear = lambda message, stamps=stamps: stamps.append(stamp(message))
+    node.create_subscription(Imu, 'imu/data_raw', hear, qos)
+reliable = heard[ReliabilityPolicy.RELIABLE]
+while not all(heard.values()):
+    rclpy.spin_once(node)
+print('ready', flush=True)
+while not select.select([sys.stdin], [], [], 0)[0]:
+    rclpy.spin_once(node, timeout_sec=0.01)
+last, end = int(sys.stdin.readline()), time.monotonic() + 30.0
+while reliable[-1] != last and time.monotonic() < end:
+    rclpy.spin_once(node, timeout_sec=0.1)
+print(json.dumps(list(heard.values())), flush=True)
+"""
+
+
+def event_wakes(pid):
+    """Return how often the middleware's thread for timed events has been woken so far."""
+    tasks = Path(f'/proc/{pid}/task').iterdir()
+    (thread,) = (task for task in tasks if (task / 'comm').read_text().startswith('dds.ev'))
+    lines = (thread / 'status').read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith('voluntary'))
+
+
+def send(driver, first, last, pause_s):
+    pause = threading.Event()
+    for k in range(first, last):
+        if k % 100 == 0:
+            driver.temperatures(k * CYCLE_NS, 20.0, 20.0)
+        driver.counts(k * CYCLE_NS, *standing(k))
+        pause.wait(pause_s)
+
+
+@pytest.fixture
+def node_arguments(tmp_path):
+    unit = tmp_path / 'unit.yaml'
+    save_calibration(calibration(), unit)
+    return [*lossless(), '-p', f'calibration_file:={unit}']
+
+
+def wakes_per_sample(peer, drivers, node_arguments):
+    """Run the node with a reliable subscriber; return wake-ups of its event thread per sample."""
+    with NodeProcess(*node_arguments) as node:
+        heard = peer.listen(Imu, 'imu/data_raw')
+        # All nodes get the same driver, because a node ignores a topic with two publishers.
+        drivers[:] = drivers or [Driver(peer)]
+        first = 0
+        while not heard:
+            assert first < N_TRIED, node.said
+            send(drivers[0], first, first + 100, 0.001)
+            first += 100
+        before, last = event_wakes(node.process.pid), first + N_SAMPLES
+        send(drivers[0], first, last, 0.001)
+        newest_ns = (last - 1) * CYCLE_NS
+        peer.wait_for(lambda: stamp_of(heard[-1]) == newest_ns, 'the last sample')
+        return (event_wakes(node.process.pid) - before) / N_SAMPLES
+
+
+def test_samples_do_not_wake_the_event_thread(peer, node_arguments, tmp_path, monkeypatch):
+    # With another Fast DDS profile each sample, or group of them, wakes the node's event thread.
+    other = tmp_path / 'other.xml'
+    other.write_text(OTHER)
+    monkeypatch.setenv(VARIABLE, str(other))
+    drivers = []
+    by_default = wakes_per_sample(peer, drivers, node_arguments)
+    # With the node's profile 700 samples per second wake its event thread 50 times per second.
+    monkeypatch.delenv(VARIABLE)
+    assert wakes_per_sample(peer, drivers, node_arguments) < 0.5 * by_default
+
+
+def test_samples_lost_by_dds_are_repeated(peer, node_arguments, monkeypatch):
+    # The receiver stops while twice as many samples are sent as its shared memory holds (512).
+    monkeypatch.delenv(VARIABLE, raising=False)
+    command = [sys.executable, '-c', RECEIVER]
+    with (
+        NodeProcess(*node_arguments) as node,
+        subprocess.Popen(command, stdin=PIPE, stdout=PIPE, text=True) as receiver,
+    ):
+        driver = Driver(peer)
+        first = 0
+        while not select.select([receiver.stdout], [], [], 0.0)[0]:
+            assert first < N_TRIED, node.said
+            send(driver, first, first + 1, 0.01)
+            first += 1
+        receiver.send_signal(signal.SIGSTOP)
+        last = first + 1000
+        send(driver, first, last, 0.001)
+        receiver.send_signal(signal.SIGCONT)
+        print((last - 1) * CYCLE_NS, file=receiver.stdin, flush=True)
+        assert receiver.stdout.readline() == 'ready\n'
+        reliable, best_effort = json.loads(receiver.stdout.readline())
+    assert reliable[-1000:] == [k * CYCLE_NS for k in range(first, last)]
+    assert len(set(best_effort) & set(reliable[-1000:])) < 1000
+
+
+def test_a_dds_profile_set_by_the_user_replaces_that_of_the_node(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv(VARIABLE, 'mine.xml')
+    use_profile()
+    assert os.environ[VARIABLE] == 'mine.xml'
+    monkeypatch.delenv(VARIABLE)
+    (tmp_path / LOCAL_PROFILE).write_text(OTHER)
+    use_profile()
+    assert VARIABLE not in os.environ
+    (tmp_path / LOCAL_PROFILE).unlink()
+    use_profile()
+    assert os.environ[VARIABLE] == str(PROFILE)
