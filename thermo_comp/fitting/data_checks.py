@@ -348,7 +348,7 @@ def judge_result(
     Check the residuals of a fit; `overall`: statistics of the residuals of all windows.
 
     norms: ``|f| - g`` of each window, shape (n,) [m/s^2]
-    slow: sd of the bias offset of a mounting or turn-on [m/s^2]
+    slow: sd of the bias offset of a mounting or turn-on, fitted to the bags [m/s^2]
     """
     drift = within_positions(norms[:, None], fit.windows.data.position)
     span, noise = float(np.ptp(fit.windows.temperature)), fit.selected.score.noise

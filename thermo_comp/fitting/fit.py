@@ -315,7 +315,7 @@ def _fit(
     claim = claim_of(fit, options.gravity_sd, offset_sd)
     residuals, in_sample, left_out = residual_rows(fit)
     findings += enforce(data_checks.judge_constants(fit, residuals[-1].raw.rms, options), options)
-    findings += data_checks.judge_result(fit, residuals[-1], in_sample, claim.offset_sd, options)
+    findings += data_checks.judge_result(fit, residuals[-1], in_sample, fit.offset_sd, options)
     findings += data_checks.judge_mountings(fit, claim.offset_sd, options)
     try:
         nonlinearity = of_file(fit.regression, terms, options)

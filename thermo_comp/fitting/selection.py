@@ -95,6 +95,15 @@ class Fit(NamedTuple):
         """The fit of the chosen model."""
         return self.selected.posterior
 
+    @property
+    def offset_sd(self) -> float:
+        """
+        Sd of the bias offset of a mounting after a new turn-on as fitted to the bags [m/s^2]. The
+        published sd also includes values that the bags do not exclude.
+        """
+        prior = self.posterior.prior
+        return float(np.hypot(prior.offset_sd, self.regression.has_turn_ons * prior.turn_on_sd))
+
 
 def _best(chosen: Trial, trials: Sequence[Trial]) -> Trial:
     """Return the best model: each trial that is better than the chosen model replaces it."""
