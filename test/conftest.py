@@ -25,11 +25,11 @@ from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# On a busy machine BLAS threads wait for each other: use one. OpenBLAS reads this variable early.
+# Use one BLAS thread: on a busy machine several wait for each other. numpy's import reads this.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
-# Each worker of a test run uses a separate DDS domain, limited to this machine, which follows from
-# the id of the run and the number of the worker. Domains 0 and from 81 on have other users.
+# Each worker of a test run uses its own DDS domain, limited to this machine. The id of the run and
+# the number of the worker give the domain. Users have domain 0, benchmarks 81 and above.
 _RUN = os.environ.get('PYTEST_XDIST_TESTRUNUID', str(os.getpid()))
 _WORKER = int(os.environ.get('PYTEST_XDIST_WORKER', 'gw0').removeprefix('gw'))
 os.environ['ROS_DOMAIN_ID'] = str(1 + (zlib.crc32(_RUN.encode()) % 20) * 4 + _WORKER % 4)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the bench that sends a bag to a node process, in lots, and waits for each to be counted."""
+"""Owns the fault bench: it sends a bag in lots, and waits until the node has counted each lot."""
 
 import struct
 import threading

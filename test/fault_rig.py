@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the bag of the fault tests, of a unit with only effects of its calibration, and changes."""
+"""Owns the bag of the fault tests and functions that insert faults; all other errors are noise."""
 
 import math
 from collections.abc import Callable

@@ -21,7 +21,7 @@ ZERO = np.zeros(3)
 
 
 def rests(calibration, attitudes, error, days=20, seed=1, turn_on=20.0 * MICRO_G, rate=0.0):
-    """Simulate 3 starts a day of 4 windows, in a ramp of `rate` [K/s]; `error(day)` [m/s^2]."""
+    """Simulate 3 starts a day of 4 windows at `rate` [K/s]; `error(day)`: bias error [m/s^2]."""
     rng = np.random.default_rng(seed)
     correction = Correction(calibration)
     M, logged = np.array(calibration.misalignment), []

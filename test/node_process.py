@@ -11,12 +11,12 @@ from pathlib import Path
 
 _STOPPING_S = 10.0  # time for the node to end [s]
 
-#: Environment of processes that a test kills: their shared memory may crash other nodes.
+#: For processes that a test kills: UDP, as the shared memory they leave may crash other nodes.
 OVER_UDP = {'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4'}
 
 
 class NodeProcess:
-    """The node in a process that ends with the `with` block; `environment`: added variables."""
+    """A node process, ended by the `with` block; `environment`: added environment variables."""
 
     def __init__(self, *ros_args, **environment):
         self._ros_args = ros_args

@@ -50,7 +50,7 @@ def slow(bag):
 
 
 def sources_of(bags):
-    """Return the sources of bags of benchmarks/strangers_units.py with board and case."""
+    """Return fit sources with board and case readings of bags of strangers_units.py."""
     sources = []
     for number, bag in enumerate(bags):
         arrays = [bag.time_s, bag.samples]

@@ -180,7 +180,7 @@ def test_the_columns_equal_the_derivatives_of_the_measured_force(rng):
         np.testing.assert_allclose(coverage.norm_columns(up)[:, k], slope, atol=1e-9)
 
 
-def test_none_or_two_opposite_positions_determine_no_other_constants():
+def test_without_positions_all_and_with_two_opposite_faces_seven_constants_keep_their_prior_sd():
     covariance = coverage.constants_covariance(NOTHING, np.empty(0))
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), PRIOR_SD)
     # Along an axis the variance of |f| is the sum of the variances of its bias and scale.

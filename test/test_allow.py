@@ -160,7 +160,8 @@ def test_one_bag_in_kelvins_or_with_a_constant_axis_is_refused_by_name(rng):
     in_kelvins(rests[4])
     with pytest.raises(FitError, match=r'^bag4: temperature/board reads 2\d+\S* degC .* kelvins'):
         fit(sources_of(rests), FORCE)
-    # WHY: in one position the y axis was constant; the fit attributed its drift to all positions.
+    # WHY: the y axis was constant in one position, and the fit attributed the missing drift of y
+    # to all positions.
     rests = rests_of(rng)
     rests[4].accel[:, 1] = rests[4].level[1]
     with pytest.raises(FitError, match=r'^bag4: y reads exactly \S+ for 0\.\d+ h: the axis is'):

@@ -102,7 +102,7 @@ def test_equal_readings_in_any_form_give_equal_output(arrays):
         np.testing.assert_array_equal(same.covariance, out.covariance)
 
 
-def test_unusable_samples_give_rows_of_nan_and_empty_arrays_empty_arrays(arrays):
+def test_unusable_samples_give_rows_of_nan_and_empty_arrays_give_empty_arrays(arrays):
     counts = arrays['counts'].copy()
     counts[7, 1], counts[9, 2] = np.nan, 32767.0
     board = np.where(arrays['time_s'] < 0.55, np.nan, arrays['board'])

@@ -37,7 +37,7 @@ NOISE = 1e-4**2 / 0.01 + (1.0 / 6.0) / 300.0**2
 
 
 def test_the_offset_is_half_the_sum_of_signed_counts():
-    # Offset = sum / 2, scale = difference / 2; Golovach's Eq. (3) and (4) have them exchanged.
+    # Counts at +-g: offset = sum / 2, scale = difference / 2 (Golovach's Eq. (3), (4): exchanged).
     plus, minus = 300.0 * GRAVITY + 12.0, -300.0 * GRAVITY + 12.0
     axis = AxisReference((plus - minus) / 2.0 / GRAVITY, (plus + minus) / 2.0)
     compensator = Compensator(calibration(axes=Axes(*[axis] * 3)))
@@ -195,7 +195,7 @@ def test_a_reading_with_a_near_stamp_confirms_a_sample_20_s_ahead(is_read):
 
 @pytest.mark.parametrize('ahead_s', [0, 10**6])
 def test_a_full_queue_has_4096_readings_and_keeps_the_newest(ahead_s):
-    # WHY: readings of a case thermometer whose clock is ahead displaced all board readings.
+    # WHY: case readings with a clock ahead filled the queue: new board readings were dropped.
     config = CompensatorConfig(gravity_tolerance_m_s2=0.0)
     compensator = Compensator(thermal_calibration(), config)
     for k in range(10_000):
@@ -268,7 +268,8 @@ def test_another_transition_time_during_a_transition_causes_no_step_of_the_outpu
 
 
 def test_a_new_transition_time_does_not_restart_the_checks_of_gravity_and_sample_rate(rng):
-    # WHY: after a change of any parameter samples with a wrong |f| were published for 13 s.
+    # WHY: a change of any parameter restarted the check of |f|, and samples with a wrong |f| were
+    # published for 13 s.
     compensator = Compensator(calibration(), CompensatorConfig())
 
     def published(seconds, size):

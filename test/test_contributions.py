@@ -18,7 +18,7 @@ from thermo_comp.fitting.initial_triad import within_positions
 from thermo_comp.fitting.unknowns import Noise
 from thermo_comp.unit.gravity import MICRO_G
 
-#: Values so small that no effect of them is visible, but random numbers are drawn for them.
+#: A tilt sd without visible effect, but not 0, so that all truths draw the same random numbers.
 NOTHING = Truth(tilt_sd=1e-15)
 
 
@@ -39,7 +39,7 @@ def settled(truth):
 
 
 def added(truth):
-    """Return what initial lag states, tilts and offsets add to the readings."""
+    """Return the effects of initial lag states, tilts and offsets on the readings."""
     with_effects, _ = table(truth)
     without, _ = table(replace(truth, start_sd=0.0, offset_sd=0.0, tilt_sd=NOTHING.tilt_sd))
     return (with_effects.mean - without.mean) / NOMINAL
@@ -65,7 +65,8 @@ def test_each_unknown_explains_what_it_adds_to_the_readings(key, name, truth):
     # The noise of a mean over 60 windows is 0.26 ug.
     hidden = truth.sigma[0] / np.sqrt(60.0)
     assert rms(true) > 5.0 * hidden
-    # |f| shows a third of the 72 offsets, less the nine constants: their sd is uncertain by 18 %.
+    # |f| determines 24 combinations of the 72 offsets, of which 9 act like changes of the
+    # constants: the sd of 15 numbers is uncertain by 1 / sqrt(2 * 15) = 18 %.
     share = {'offset_sd': 0.36}.get(key, 0.05)
     assert getattr(found, name) == pytest.approx(rms(true), rel=share)
     for other in ('initial_lag_states', 'support_tilt', 'mounting_offsets', 'slow_noise'):
@@ -112,7 +113,7 @@ def test_starts_and_tilts_larger_than_the_response_are_findings(name, value, exp
     if expected:
         assert 'explain 90 ug RMS' in found[0].message
         assert 'thermal response of the unit, 60 ug' in found[0].message
-    # Below the white noise of a window nothing is explained.
+    # Effects below the white noise of a window give no finding.
     assert not list(judge_contributions(values, 100.0 * MICRO_G))
 
 

@@ -107,7 +107,7 @@ def test_an_offset_of_raw_words_is_subtracted(tmp_path):
 
 @pytest.mark.parametrize('unit', ['ms', 'us'])
 def test_times_of_a_counter_of_32_bits_continue_after_its_overflow(tmp_path, unit):
-    # WHY: Arduino's micros() overflows after 71.6 min, and the fit used only the part before.
+    # WHY: Arduino's micros() overflows to 0 after 71.6 min; the fit used only samples before it.
     path, _ = table(tmp_path / 'log.csv')
     lines = path.read_text().splitlines()
     ticks = [(2**32 - 2000 + 10 * k) % 2**32 for k in range(400)]

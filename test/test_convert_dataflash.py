@@ -136,7 +136,7 @@ HALF_US = 2_000_000 + N // 2 * STEP_US
     [
         ([(0.0, 1000), (1.0, HALF_US)], slice(0, N // 2), 50),
         ([(1.0, 1000), (0.0, HALF_US)], slice(N // 2, N), 50),
-        # WHY: a log in which ArduPilot learns (2), and then uses (1), the correction was refused.
+        # WHY: a log was refused if INS_TCAL1_ENABLE changed from 2 (learn) to 1 (correct).
         ([(2.0, 1000), (1.0, HALF_US + N // 4 * STEP_US)], slice(0, 3 * N // 4), 25),
     ],
 )

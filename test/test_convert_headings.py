@@ -356,7 +356,7 @@ def test_the_norm_at_rest_and_a_plausible_sample_rate_show_the_units(
 
 
 def test_the_speed_of_a_turn_by_hand_shows_the_unit_of_times(tmp_path, rng):
-    # WHY: 1 Hz was taken for 1 kHz. A turn by 180 deg takes 1 s at 1 Hz, and 0.8 s at 1 kHz.
+    # WHY: 1 Hz was taken for 1 kHz. A turn by hand takes one interval of 1 s, or 800 of 1 ms.
     angle = np.repeat([0.0, np.pi, 0.0], [400, 800, 400])
     ramp = np.clip((np.arange(1600) - 400) / 800, 0.0, 1.0) * np.pi
     for turned, unit in ((angle, 's'), (ramp, 'ms')):

@@ -71,7 +71,7 @@ def write_two_imus(path, rng, gyro_every=1):
 
 
 def write_old(path, force, step_us, celsius=31.5, warming=0.0):
-    """Write samples in the format without times of samples, which has a single stamp."""
+    """Write samples in the old format: a stamp per message, no separate times of samples."""
     log = UlogWriter(OLD_ACCEL)
     number = log.subscribe('sensor_accel', 0)
     for k, row in enumerate(force):
@@ -225,7 +225,7 @@ def test_samples_compensated_by_px4_are_left_out(tmp_path, rng, begin):
     force = write_combined(path, rng, {'TC_A_ENABLE': 1 - begin}, TC_A_ENABLE=begin)
     read = read_autopilot(path)
     assert 'TC_A_ENABLE was 1 for 50 % of the samples' in read.chosen
-    # A changed parameter has the stamp of the message before it: leave out the sample there.
+    # A changed parameter has the stamp of the message before it: do not compare this sample.
     n = min(len(read.accel), N // 2) - 1
     part = slice(-n, None) if begin else slice(n)
     np.testing.assert_array_equal(read.accel[part], force[part])

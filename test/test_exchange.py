@@ -167,7 +167,8 @@ def test_exports_of_counts_and_of_m_s2_to_px4_have_the_offset_in_m_s2(cubic):
     assert any('the driver must divide counts by K' in note for note in ours.notes)
     for name, value in numbers(expected.text, '\t').items():
         assert numbers(ours.text, '\t')[name] == pytest.approx(value, rel=1e-8, abs=1e-12)
-    # WHY: PX4 takes readings as m/s^2. For a stated attitude the offset contains the scale error.
+    # WHY: PX4 subtracts the offset from readings that it takes as m/s^2. The offset for a stated
+    # attitude must contain the effect of the scale error.
     axes = Axes(*(AxisReference(0.995, bias) for bias in (0.1, -0.2, 0.3)))
     calibration = replace(cubic, axes=axes)
     plain = export_calibration(calibration, 'px4')

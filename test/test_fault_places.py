@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The published covariance covers faults at any time of a ramp (tested without DDS)."""
+"""Errors are below five claimed sd for faults at any time of a ramp (tested without DDS)."""
 
 import math
 import re

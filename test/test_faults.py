@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The output for each row of the fault table agrees with the truth, also some rows over DDS."""
+"""The outputs for all rows of the fault table agree with the truth, for some also over DDS."""
 
 from copy import deepcopy
 from dataclasses import asdict, fields

@@ -134,7 +134,7 @@ def test_a_full_scale_that_the_bags_do_not_show_is_named(one_position):
 
 
 def test_after_soaks_in_one_position_the_drift_error_is_within_three_claimed_sd(rng):
-    # WHY: |f| in one attitude does not separate bias and scale: a wrong bias slope had an sd of 0.
+    # WHY: in one attitude |f| does not separate bias and scale; a wrong bias slope had an sd of 0.
     slope = 0.1 * SLOPE
     bags = []
     for celsius in (5.0, 20.0, 35.0):
@@ -161,7 +161,8 @@ def test_rests_at_three_temperatures_give_the_bias_slope_despite_a_warm_up_of_th
     # |f| of a rest has a noise of 1 ug; its temperature is uncertain by 0.1 K due to the warm-up.
     np.testing.assert_allclose(slopes, 0.1 * MG * SLOPE, atol=0.002 * MG)
     assert 'misfit' not in findings_of(result)
-    # Soaks do not determine weights of lags: the root of their summed variances is 0.5 to 1 slope.
+    # Soaks do not determine the weights of lags, which may be as large as the bias slope: the root
+    # of their summed variances is 0.5 to 1 times the bias slope.
     variance, layout = np.diag(calibration.posterior.covariance()), parameter_layout(calibration)
     of_lags = [variance[block.response : block.end].sum() for block in layout.bias]
     assert 0.5 < np.sqrt(np.mean(of_lags) / np.mean(slopes**2)) < 1.0
@@ -184,7 +185,7 @@ def test_the_drift_error_of_a_sensor_that_follows_half_of_a_warm_up_is_within_th
 
 
 def test_tilts_of_two_supports_are_not_taken_for_a_scale_slope_of_a_level_axis(rng):
-    # WHY: a support tilt of 4 urad/K was fitted as a slope of 137 ppm/K of the scale factor.
+    # WHY: a support tilt of 4 urad/K was fitted as a scale slope of 137 ppm/K of a level axis.
     bags = []
     for up, tilt in (((1.0, 0.0, 0.03), 4e-6), ((0.0, 1.0, -0.03), -4e-6)):
         rest = Rest(rng, level=tuple(GRAVITY * np.array(up)), sd=0.1 * MG)
@@ -195,7 +196,8 @@ def test_tilts_of_two_supports_are_not_taken_for_a_scale_slope_of_a_level_axis(r
     at = np.array([0.0, 10.0])
     # 15000 samples (noise 0.1 mg) determine the mean bias slope of the two rests to 1 ug/K.
     assert np.diff(z.bias_function.value(at))[0] == pytest.approx(MG, abs=0.01 * MG)
-    # At 0.03 g 1 ug/K is a scale slope of 33 ppm/K; two rests give sqrt(2) * 33 = 47 ppm/K.
+    # At 0.03 g a drift error of 1 ug/K is a scale slope of 33 ppm/K; the errors of two rests give
+    # sqrt(2) * 33 = 47 ppm/K.
     assert abs(np.diff(z.scale_function.value(at))[0]) < 10.0 * 47e-6
 
 
@@ -265,7 +267,8 @@ def test_the_bias_sd_of_one_recording_contains_the_sd_of_a_turn_on(rng):
 
 @pytest.mark.slow
 def test_the_claimed_variance_of_a_curve_contains_that_of_turn_ons_at_each_temperature(rng):
-    # WHY: turn-ons at three temperatures counted as errors of the mean bias, not of the curve.
+    # WHY: turn-on offsets at three temperatures were taken for errors of the mean bias alone: the
+    # claimed variance was only 1.6 to 1.9 times the variance of a turn-on.
     turn_on, ups, dwell = 5e-3, positions(9, 3), 600
     bags = []
     for celsius in (-15.0, 20.0, 55.0):
@@ -278,8 +281,9 @@ def test_the_claimed_variance_of_a_curve_contains_that_of_turn_ons_at_each_tempe
     unit = tc.fit(bags, gravity=GRAVITY, input='m/s^2', mounting_sd=turn_on)
     for bag in (bags[0], bags[2]):
         out = unit.correct(bag.time_s, bag.counts, board=bag.temperatures['board'])
-        # For turn-ons of variance V a line fitted to three temperatures has 5/6 V at its ends, a
-        # parabola V; the next turn-on adds V, nine mountings V/3 for bias and V/3 for scale.
+        # If turn-ons have variance V, a line through three temperatures has a variance of 5/6 V at
+        # its ends, a parabola V; the next turn-on adds V, nine mountings V/3 for bias, V/3 for
+        # scale.
         variance = np.diagonal(out.covariance[-dwell:].mean(axis=0)) - 1e-3**2
         assert ((1.0 + 5.0 / 6.0) * turn_on**2 < variance).all()
         assert (variance < (1.0 + 1.0 + 2.0 / 3.0) * turn_on**2).all()
@@ -375,8 +379,8 @@ def test_an_update_by_three_positions_has_errors_near_the_claimed_sd(rng):
 
 @pytest.mark.parametrize('size', [1, 6])
 def test_turn_ons_between_six_faces_are_not_taken_for_a_misalignment(rng, size):
-    # WHY: with a turn-on (sd 1 mg) in each of six faces the fit found misalignments of 20 mrad.
-    # For three turn-ons it assumed 18 offsets, so the claimed sd of M was 5 to 12 mrad.
+    # WHY: turn-on offsets (sd 1 mg) were fitted as misalignments of 20 mrad. For three turn-ons of
+    # six faces the fit assumed 18 independent offsets: the claimed sd of M was 5 to 12 mrad.
     M = np.array([[1.0, 0.0, 0.0], [2e-3, 1.0, 0.0], [-2e-3, 1e-3, 1.0]])
     sensed = np.linalg.inv(M)
     ups = np.tile(FACES, (3, 1)) + 0.03 * rng.standard_normal((18, 3))
@@ -411,7 +415,7 @@ def test_the_claimed_sd_from_six_faces_contains_the_cross_axis_sensitivity_of_a_
 
 
 def test_left_out_norms_of_faces_laid_by_hand_show_a_misalignment_of_20_mrad():
-    # WHY: with an sd of M of 2.5 mrad the fit estimated one element of 20 mrad as 10 mrad.
+    # WHY: with a prior sd of 2.5 mrad for M an element of 20 mrad was estimated as 10 mrad.
     rng = np.random.default_rng(2)
     up = np.tile(FACES, (2, 1)) + np.radians(2.0) * rng.standard_normal((12, 3))
     up /= np.linalg.norm(up, axis=1)[:, np.newaxis]

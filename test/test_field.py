@@ -35,7 +35,7 @@ def test_derivatives_of_a_rest_by_all_parameters_agree_with_finite_differences()
     layout = parameter_layout(unit)
     levels = {level for block in layout.scale for level in (block.static, block.dynamic)}
     levels |= {block.static for block in layout.bias}
-    # Every second parameter: each kind of parameter is tested either in the bias or in the scale.
+    # Every second parameter tests each kind in bias or scale, as both have odd numbers of them.
     for k in range(0, layout.n_parameters, 2):
         step = 1e-7
         moved = values.copy()
@@ -167,7 +167,8 @@ def test_the_sd_of_an_old_calibration_aged_to_the_last_rest_includes_the_random_
     residual = unit.static.x.residual_sd_m_s2
     assert x.claimed_sd == pytest.approx(np.hypot(10.0 * MICRO_G, residual), rel=0.01)
     assert z.claimed_sd == pytest.approx(np.hypot(np.sqrt(200.0) * MICRO_G, residual), rel=0.01)
-    # Between half and all of the variance is attributed to the biases of x and y.
+    # Rests in one attitude do not separate bias and scale: the ageing model attributes half to all
+    # of the variance of the random walk to the biases of x and y.
     for axis in (x, y):
         assert 0.5 < axis.present_sd / (329.0 * MICRO_G) < 1.5
     # At the last rest the force sd of z must equal |random walk of z| within two turn-on sd.
@@ -219,7 +220,7 @@ def test_ageing_is_not_taken_for_a_change_of_gravity_or_of_the_unit(kind):
 
 @pytest.mark.parametrize('first', [0, 10])
 def test_samples_of_another_unit_are_refused(first):
-    # The second unit has other scales by 1 to 2 % and other biases by 0.3 to 1.4 mg.
+    # The scales of the second unit differ by 1 to 2 %, its biases by 0.3 to 1.4 mg.
     unit = field_units.calibration()
     history = field_units.live('carried', 3, 20, field_units.Process())
     mixed = [
@@ -273,7 +274,7 @@ def test_a_contradicting_turn_on_is_left_out_and_stamps_may_be_in_wrong_order(rn
 
 
 def test_a_wrong_clock_at_the_start_of_the_node_does_not_change_the_update(tmp_path, rng):
-    # Sample stamps are right; start times of no start, of all starts or of the last are wrong.
+    # Sample stamps are right; start times of no, of all or of only the last start are wrong.
     unit = known()
     logged = rests(unit, upright, jump_of(300.0, 10.0))
     image = {start.start_ns: int(1.6e18 + 5e8 * rng.standard_normal()) for start, _ in logged}
@@ -389,7 +390,7 @@ def test_derivatives_of_a_rest_by_initial_lag_states_agree_with_finite_differenc
 
 
 def test_an_unknown_regime_after_a_turn_on_does_not_increase_the_noise_of_a_rest():
-    # The scatter of turn-ons is estimated, so the noise of a rest must not contain it.
+    # The ageing model estimates the scatter of turn-ons: the noise of a rest must not contain it.
     unit = field_units.calibration()
     logged = field_units.live('level', 1, 3, field_units.Process()).rests
     unknown = [(s, replace(r, state=(*r.state[:4], 1.0, *r.state[5:]))) for s, r in logged]
@@ -426,7 +427,7 @@ def test_unknown_initial_lag_states_are_not_taken_for_scatter_of_rests(rng, lags
     assert ageing.lags == pytest.approx(lags, abs=0.25)
 
 
-def test_of_too_many_turn_ons_the_newest_are_used_and_fewer_than_three_are_refused(monkeypatch):
+def test_the_newest_of_too_many_turn_ons_are_used_and_fewer_than_three_are_refused(monkeypatch):
     unit = known()
     series = series_of(rests(unit, upright, no_error), unit)
     everything = rows_of(series, MICRO_G)

@@ -67,7 +67,7 @@ def test_a_knee_in_the_curve_of_the_bias_is_found_only_if_there_is_one(monkeypat
     knees = [term.knee_k for term in unit.response if term.group == 'bend']
     # The fit tries knees every 1 K, and uses the two that are next to the true knee.
     assert min(abs(20.0 + knee - KNEE_C) for knee in knees) < 1.0
-    # Two knees 1 K apart beside the true knee give an error of at most 5 ug, in 1 K of 22 K.
+    # Two knees 1 K apart around the true knee cause an error of up to 5 ug, in 1 K of the 22 K.
     assert left < 1.5
     # The bends of a part end at its highest temperature in the bags, whatever their knees.
     bends = [term for term in unit.response if term.group == 'bend']
@@ -106,7 +106,8 @@ def columns_of(slopes, shift=0.0):
 @pytest.mark.slow
 @pytest.mark.parametrize('shift', [300.0, -20000.0])
 def test_a_changed_unit_is_updated_although_its_drift_contradicts_the_prior(shift, monkeypatch):
-    # WHY: the drift contradicted the prior, so all new bags were excluded: errors of 35 sd.
+    # WHY: the drift contradicted the prior, so an update used no new bag and kept the old
+    # constants, whose error was 35 claimed sd.
     monkeypatch.setitem(globals(), 'KNEE_C', 5.0)
     options = {'gravity': G, 'input': 'm/s^2', 'groups': ('curve',)}
     old = tc.fit(columns_of([SLOPE] * len(UPS)), mounting_sd=1e-7, **options)

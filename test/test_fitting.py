@@ -164,7 +164,8 @@ def test_the_error_of_the_compensator_is_that_stated_by_the_fit(response):
 
 
 def test_slow_noise_for_an_unmodelled_drift_leaves_the_white_noise():
-    # WHY: the file stated a noise of 0.3, not 5 ug/sqrt(Hz), so no window counted as still.
+    # WHY: the file stated a white noise of 0.3 instead of 5 ug/sqrt(Hz), so that no window of the
+    # node's check of |f| counted as still.
     paper = fitted(OWN_LAGS, positions(2, 1), 1, model='golovach')
     stated = np.array(paper.calibration.noise_density_m_s2_sqrt_hz) / MICRO_G
     np.testing.assert_allclose(stated, 5.0, rtol=0.4)

@@ -152,7 +152,8 @@ def score(drift, norms=(), by_thermometer=0.0):
 
 
 def test_few_norms_that_both_models_predict_do_not_select_the_model():
-    # WHY: the fit rejected a curve because of only four left-out |f|: the force error was 7 mg.
+    # WHY: only four left-out |f| of a MEMS in six faces could be predicted with and without a
+    # curve; for these four the fit rejected the curve: the force error was 7 mg.
     constants = score(20.0, [22.4, 457.7, 54.6, 26.1])
     curve = score(20.0, [16.8, 21.0, 22.5, 25.2])
     assert not is_better(constants, curve)
@@ -162,7 +163,8 @@ def test_few_norms_that_both_models_predict_do_not_select_the_model():
 
 
 def test_a_larger_model_must_not_explain_the_errors_of_a_coarse_thermometer():
-    # WHY: errors by steps of 1 K are equal in all bags: knees doubled the error in other programs.
+    # WHY: readings in steps of 1 K have equal errors in all bags of a temperature program: knees
+    # that fitted these errors doubled the drift error in other programs.
     by_thermometer = 49.0
     curve, parts, bends = (score(drift, (), by_thermometer) for drift in (120.0, 46.0, 20.0))
     assert is_better(curve, parts)

@@ -97,7 +97,7 @@ def test_exchanged_thermometers_in_one_bag_of_many_are_reported_with_its_name(go
 
 
 def test_the_noise_of_soaks_is_not_taken_for_a_ramp_or_for_exchanged_sensors(good, rng):
-    # WHY: bags of soaks were refused: noise gave rates and gradients as of exchanged sensors.
+    # WHY: bags of soaks were refused: noise gave rates and gradients like exchanged thermometers.
     windows, up = good
     noise = rng.standard_normal(len(windows.rate))
     soaks = 5.0 + 15.0 * (windows.data.position % 3)

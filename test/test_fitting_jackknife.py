@@ -22,7 +22,7 @@ from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 
 def ratios_to_sd(seed, effect_sd):
-    """Return error / fit's sd and error / claimed sd of weights; sections change the biases."""
+    """Return errors of weights / fitted and / claimed sd; `effect_sd`: sd of section biases."""
     truth, rng = fitting_truth.Truth(), np.random.default_rng(seed)
     windows, up = fitting_truth.table_of(truth, 12, rng, n_windows=24)
     effect = effect_sd * rng.standard_normal((N_SECTIONS, 3))
@@ -78,7 +78,7 @@ def ratio(path):
     options = FitOptions(gravity=STANDARD_GRAVITY, input='m/s^2')
     short = {'window_s': 1.0, 'cell_s': 0.2, 'min_rest_s': 1.0, 'fewest_windows': FEWEST_WINDOWS}
     whole = reduce_source(source_of(stamps, accel, name=path.stem), full_scale=None, **short)
-    # A jackknife does not observe the sd of turn-ons, so each position is fitted as a recording.
+    # A jackknife cannot show the sd of turn-ons: each position is fitted as a separate recording.
     result = fit_bags([replace(whole, intervals=[each]) for each in whole.intervals], options)
     posterior = result.fit.posterior
     calibration, data = result.calibration, result.fit.windows.data

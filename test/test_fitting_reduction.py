@@ -173,7 +173,7 @@ def test_glitches_are_counted_and_end_no_rest(rng):
 
 
 def test_samples_in_bursts_are_a_rest_and_several_with_one_stamp_are_reported(rng):
-    # WHY: without averages between bursts a unit at rest was reported as worn or driven.
+    # WHY: no samples were averaged between bursts: a unit at rest was reported as worn or driven.
     whole = block(still(rng, 600.0, UP))
     number = np.arange(len(whole.accel))
     for size in (20, 100, 200):
@@ -307,7 +307,7 @@ def test_thermometer_settings_are_estimated_from_readings(quantum, noise, rng):
 @pytest.mark.parametrize(('noise', 'found'), [(0.02, 0.02), (0.05, 0.05), (0.09, 0.09), (0, 0.01)])
 def test_readings_that_alternate_at_edges_of_1_k_steps_show_their_noise(noise, found, rng):
     learned = learn_thermometer([soak_ramp_soak(1.0, noise, rng)], ThermometerSettings())
-    # Noise shows only at the two slowest crossings of edges; without it 0.01 quanta are assumed.
+    # Only the two slowest crossings of edges show noise; without noise 0.01 quanta are assumed.
     assert learned.noise_sd_c == pytest.approx(found, rel=0.3 if noise else 1e-6)
 
 

@@ -185,7 +185,7 @@ def test_mode_covariance_and_evidence_agree_with_dense_linear_algebra(solved):
         known = np.log(precision[precision > 0.0]).sum()
         determinants = dense.determinant + np.linalg.slogdet(hessian)[1] - known
         beside.append(mode.log_evidence + 0.5 * (at @ at + determinants))
-    # The evidence contains a constant, which does not depend on `start_variance_ratio`.
+    # The evidence differs from this formula by a constant independent of `start_variance_ratio`.
     assert beside[1] == pytest.approx(beside[0], abs=1e-3)
 
 
@@ -218,8 +218,8 @@ def refit_of(whole, regression, prior, kept):
     return replace(mode, weights=mode.weights / units)
 
 
-#: The left-out score is computed by linear steps, exactly with LINEAR. With PRODUCTS it neglects
-#: (change of an initial lag state) * (change of this lag's weight).
+#: The left-out score linearises the model, which is exact with the groups LINEAR. With PRODUCTS it
+#: neglects (change of an initial lag state) * (change of this lag's weight).
 LINEAR, PRODUCTS = ('curve',), ('curve', 'board')
 
 
@@ -286,7 +286,7 @@ def test_a_position_that_alone_determines_a_parameter_has_no_left_out_norm(rng):
     score = score_of(regression, mode)
     assert np.isnan(score.force).all()
     assert np.isnan(score.norms.square).all()
-    # The drift of a left-out position is predicted: it does not depend on bias and scale.
+    # The drift of a left-out position does not depend on bias and scale, so it is predicted.
     assert np.isfinite(score.positions.square).all()
     np.testing.assert_allclose(mode.state.misalignment, 0.0, atol=1e-6)
     places = mode.layout.misalignment
@@ -352,7 +352,7 @@ def test_published_huygens_coefficients_come_back(rng):
 
 @pytest.mark.parametrize('noise', [Noise(), Noise(0.5, 1500.0)])
 def test_scores_of_inactive_columns_agree_with_a_fit_in_which_they_are_active(noise):
-    # A fit with the inactive columns would give weights S^-1 Q with the covariance S^-1.
+    # Active columns would have weights S^-1 Q of covariance S^-1 (S: sparsity, Q: quality factor).
     truth, asked = Truth(noise=noise), np.isin(GROUPS, ('board', 'idle'))
     windows, up = table_of(truth, 12, np.random.default_rng(4), n_windows=30)
     regression, state = begin(without_starts(windows), up)
@@ -382,7 +382,7 @@ def test_scores_of_inactive_columns_agree_with_a_fit_in_which_they_are_active(no
 
 
 def test_inactive_and_active_columns_share_initial_lag_states(solved):
-    # WHY: the prior of the sum of initial lag states was left out of the sparsity factor.
+    # WHY: the sparsity factor, without the prior of the sum of lag states, was 50 times too large.
     regression, prior, mode = solved
     of_scale = np.isin(GROUPS, ('board',)) * [[0.0], [1.0]]
     without = replace(prior, column_sd=np.where(of_scale > 0.0, 0.0, prior.column_sd))

@@ -102,7 +102,7 @@ def test_only_columns_with_an_effect_are_chosen_and_each_trial_has_a_left_out_er
 
 @pytest.mark.parametrize('where', ['one bag', 'one section', 'all'])
 def test_a_group_that_explains_one_bag_or_section_is_not_chosen(where):
-    # The evidence always favours 'idle', the left-out error only if its effect is everywhere.
+    # The evidence always favours 'idle', the left-out error only if all bags and sections show it.
     truth = Truth()
     windows, up = table_of(truth, 10, np.random.default_rng(5), n_windows=30)
     rows = {
@@ -118,7 +118,8 @@ def test_a_group_that_explains_one_bag_or_section_is_not_chosen(where):
 
 @pytest.mark.parametrize(('n_positions', 'step_s'), [(10, 120.0), (12, 60.0), (12, 240.0)])
 def test_a_lag_is_found_although_a_curve_without_the_lag_is_rejected(n_positions, step_s):
-    # WHY: the group 'curve' without 'board' was rejected, and so the lag was not found.
+    # WHY: a bias that depends on a lagged temperature needs the groups 'curve' and 'board'
+    # together; 'curve' without 'board' was rejected, and so the lag was not found.
     slope = 2e-5 * np.array([1.0, -2.0, 1.5])
     on_bias = np.outer(slope, [1.0, 0.0, 0.0, -1.0, 0.0, 0.0])
     truth = Truth(on_bias=on_bias, on_scale=np.zeros((3, 6)))
@@ -178,7 +179,8 @@ def test_rounding_removes_no_correlation_time_from_the_search():
 
 
 def test_the_prior_sd_of_columns_is_that_of_true_weights_below_the_steepest_plausible_slope(calm):
-    # Prior variance of a column: sum of its squared weights / 3. The hyperprior changes it by 3 %.
+    # Prior variance of a column: sum of its squared weights / 3. The hyperprior moves ln sd by 3 %
+    # of its distance to the hyperprior's centre.
     regression, chosen, truth = calm
     true = np.sqrt(np.mean((truth.on_bias * regression.rms) ** 2, axis=0))
     np.testing.assert_allclose(chosen.posterior.prior.column_sd[0, :4], true[:4], rtol=0.25)
@@ -274,7 +276,7 @@ def test_outliers_do_not_shift_the_fit(calm):
 
 
 def test_quantised_window_means_are_not_down_weighted_as_outliers():
-    # A converter that carries remainders gives mostly equal means: one step is no outlier.
+    # Carried remainders make most means equal: a mean that differs by one step is no outlier.
     windows, up = table_of(Truth(), 9, np.random.default_rng(2))
     regression, state = begin(windows, up)
     prior = prior_of(Truth(), (), offset_sd=1e-9)
@@ -316,7 +318,7 @@ def test_the_variance_of_initial_lag_states_is_estimated(start_sd, lower, upper)
 
 @pytest.mark.parametrize('offset', [0.0, 30.0])
 def test_the_evidence_selects_the_sd_of_an_informative_prior(calm, offset):
-    # The unit differs from the mean of the prior by 0 or by 30 sd: its sd, or 100 times, is right.
+    # The unit is 0 or 30 sd from the prior's mean: the fit selects the prior's sd or 100 times it.
     _, selected, truth = calm
     state = selected.posterior.state
     regression, _ = begin(calm[0].windows, state.up)
@@ -382,12 +384,12 @@ def test_the_sd_of_gravity_adds_a_common_error_to_all_scale_factors():
 
 
 def test_the_drift_of_scale_factors_determines_the_sd_of_turn_on_offsets():
-    # WHY: the estimated sd was 5 ug, not 300 ug, and the constants were wrong by 75 claimed sd.
+    # WHY: the estimated sd of turn-ons was 5, not 300 ug: the constants were off by 75 claimed sd.
     on_scale = np.outer([1.0, -0.7, 1.3], [1e-4, 0.0, 0.0, 0.0, 0.0, 0.0])
     truth = Truth(offset_sd=300.0 * MICRO, sigma=np.full(3, 0.5 * MICRO), on_scale=on_scale)
     _, regression, selection = forced(truth, 9, 2, 60)
     posterior = selection.posterior
-    # Of the 27 offsets 18 combinations are determined: their sd is uncertain by 17 %.
+    # Of the 27 offsets 18 combinations are determined: the estimated sd has an error of 17 %.
     assert posterior.prior.offset_sd == pytest.approx(300.0 * MICRO, rel=0.5)
     for errors in truth.errors(regression, posterior).values():
         # The RMS of three standard normal errors exceeds 2 with a probability of 0.7 %.
@@ -410,6 +412,7 @@ def test_windows_that_the_model_misses_count_in_the_lack_of_fit_in_spite_of_thei
     fit = Fit(table, regression, chosen)
     points, _ = lack_of_fit(fit, claim_of(fit))
     widest = np.max([point.sd_m_s2 for point in points], axis=0)
-    # The bump is in half of a bin: RMS 71 ug, of which curve and means take up to a half.
+    # The bump of 100 ug is in half of the windows of a bin: 71 ug RMS, of which the curve and the
+    # means of positions fit up to a half.
     assert (widest > 35.0 * MICRO).all()
     assert (widest < 100.0 * MICRO).all()

@@ -67,7 +67,8 @@ def test_a_rest_partly_in_the_range_of_the_model_is_used_there_only(bags):
 
 
 def test_the_sets_differ_only_with_soaks_at_several_temperatures(bags):
-    # WHY: 4 static windows of 1035 hardly determine the static curves: an error of 341, not 21 ug.
+    # WHY: static curves that only 4 of 1035 windows determine had an error of 341 ug; equal curves
+    # in both regimes have 21 ug.
     ramps = windows_of(bags)
     soaks = replace(ramps, weight=1.0 * (np.abs(ramps.rate) > 1e-3))
     of_sets = np.array(ramps.data.groups) == 'set'
@@ -110,7 +111,7 @@ def test_columns_of_the_fit_equal_those_of_the_tracker(bags):
     mean = np.array([phi[np.abs(seconds - t) <= 30.0].mean(axis=0) for t in time])
     scale = np.sqrt(np.mean(phi**2, axis=0)) + 1e-9
     late = time > 300.0
-    # Lags of the tracker follow estimates, not readings: plays reverse at slightly other times.
+    # The tracker's lags follow estimates, not readings: plays reverse slightly earlier or later.
     np.testing.assert_allclose(rows[late, n_sets:] / scale, mean[late] / scale, atol=0.05)
 
 
@@ -121,7 +122,7 @@ def test_columns_sections_and_initial_lag_states_agree_with_formulas(bags):
     assert data.groups[:6] == ('curve',) * 3 + ('set',) * 3
     np.testing.assert_allclose(data.columns[:, [0, 3]], np.column_stack((t, w)), atol=1e-9)
     assert data.in_scale[:6].tolist() == [True, True, True, False, True, True]
-    # An initial lag state decays as exp(-time / tau), in a product of lag and t times t.
+    # An initial lag state decays as exp(-time / tau), and in a column lag * t as t times this.
     taus = [lag.tau_s for lag in memory_of(bank()).lags]
     for k, column in enumerate(bank(), start=6):
         lag = data.lag[k]

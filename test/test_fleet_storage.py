@@ -173,7 +173,7 @@ class TestDiscovery:
         assert [name for unit in units for name in unit.bags] == ['unit/1.mcap']
 
     def test_a_folder_that_cannot_be_read_is_named(self, tmp_path, monkeypatch):
-        # WHY: without permission for its folder a unit was left out, and the exit code was 0.
+        # WHY: a unit whose folder was not readable was left out, and the exit code was 0.
         unread = '.hidden', 'lost+found'
         write_unit(tmp_path / 'u1', 1, 1)
         for name in ('u2', *unread):
@@ -325,7 +325,8 @@ class TestRow:
         assert row['chosen'] == '/imu/raw, its only Vector3Stamped, is taken for counts'
 
     def test_the_row_has_no_sd_of_a_slope_that_the_positions_do_not_determine(self, tmp_path):
-        # WHY: a fit of one position stated the slope of the bias with an sd of 0.06 ug/K.
+        # WHY: a fit of one position stated the sum of the slopes of bias and scale as the slope of
+        # the bias, with an sd of 0.06 ug/K.
         write_unit(tmp_path / 'u', 1, 1)
         row = processed(tmp_path).row
         assert [row[f'bias_slope_sd_{axis}_ug_k'] for axis in 'xyz'] == [None] * 3

@@ -109,7 +109,7 @@ def test_a_curve_that_is_not_finite_is_refused(bad):
 
 
 def slope_and_lag(variances):
-    """Make a unit with a bias slope and a lag of 600 s; `variances`: of the first parameters."""
+    """Make a unit with a bias slope and a lag of 600 s; `variances` of its first parameters."""
     unit = calibration(
         static=regime_set(*[axis_set((0.0, 0.3), residual_sd_m_s2=3e-5)] * 3),
         dynamic=regime_set(*[axis_set((0.0, 0.3))] * 3),

@@ -42,7 +42,7 @@ def test_levelling_makes_the_force_vertical(rng):
 
 
 def test_the_sd_of_the_filter_equals_the_closed_form_for_white_noise(rng):
-    # The variance has parts by levelling and by noise with the impulse response sin(w t) / w.
+    # The position variance is that of levelling plus that of noise (impulse response sin(w t)/w).
     density, dt = 1e-4, 0.5
     force = G * UP + rng.normal(0.0, density / np.sqrt(dt), (40_000, 3))
     free = fly(Model(force, density, 0.0), dt, UP, G, 0.0)

@@ -130,7 +130,8 @@ def test_a_move_between_parts_gives_two_rests_and_parts_without_a_rest_are_joine
 
 
 def test_a_split_recording_gives_the_calibration_of_the_whole_recording():
-    # WHY: each part was fitted with a separate turn-on and lag states: an error of 6 claimed sd.
+    # WHY: each part was fitted with a separate turn-on and separate lag states: the claimed sd was
+    # 6 times that of a fit to the whole recordings.
     bag = thermo_comp.read(ROOT / 'bags/fit/01.mcap')
     parts = []
     for begin_s in np.arange(0.0, bag.time_s[-1], 1800.0):

@@ -258,7 +258,7 @@ class TestVerdict:
         assert '300 ug RMS on positions left out, limit 100 ug' in limited.reason
         assert judge(windows, unit, 100.0 * MICRO_G).verdict == 'valid'
 
-    def test_the_error_found_stands_beside_that_on_data_left_out_of_the_fit(self, cli, tmp_path):
+    def test_the_error_is_printed_beside_that_on_data_left_out_of_the_fit(self, cli, tmp_path):
         # 2 counts on z are an error of 2 / 300 m/s^2 = 680 ug; without noise there is no drift.
         bag = resting(tmp_path / 'bag.mcap', 25.0, error=2.0)
         path = tmp_path / 'it.yaml'

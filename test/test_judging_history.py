@@ -162,16 +162,17 @@ def test_forecasts_agree_with_the_simulated_future_of_units():
         for rows in field_watch.forecasts(kind, 3, 20).values():
             shares += rows[:, 0].tolist()
             ratios.append(float(np.median(rows[:, 3] / rows[:, 1])))
-    # The interval must contain 80 % of the days on which a unit leaves the tolerance, within 6 %.
+    # The interval must contain 80 % of the simulated days on which a unit leaves the tolerance;
+    # the mean of 24 such shares has an error of 6 %.
     assert np.mean(shares) == pytest.approx(0.8, abs=0.12)
-    # The median time of a unit is uncertain by a factor of 1.5, the mean of eight by 1.3.
+    # The median time to the limit is uncertain by a factor of 1.5, the mean of eight by 1.3.
     assert 1.0 / 1.6 < np.exp(np.mean(np.log(ratios))) < 1.6
     assert 0.45 < min(ratios) < max(ratios) < 2.2
 
 
 @pytest.mark.parametrize('attitudes', [upright, pytest.param(in_any_attitude, marks=SLOW)])
 def test_the_verdict_follows_the_true_error_on_each_day(attitudes):
-    # The RMS error is 1.5 times the limit on days 20 to 34, 20 times on day 12, or else 0.6 times.
+    # The RMS error is 1.5 times the limit on days 20 to 34, 20 times on day 12, else 0.6 times.
     unit = known()
     limit = LIMIT * np.sqrt(np.mean(series_of(rests(unit, attitudes, no_error), unit).claim ** 2))
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A fit advises the bag that separates two terms which its bags do not tell apart."""
+"""A fit recommends a bag that separates two terms whose effects its bags do not separate."""
 
 from functools import cache
 
@@ -37,29 +37,30 @@ def inflation_of(result, *groups):
     return pair.inflation
 
 
-def test_bags_of_one_environment_do_not_tell_lags_of_board_and_gradient():
+def test_bags_of_one_environment_do_not_separate_lags_of_board_and_gradient():
     result = fitted(chamber()[1])
-    # Thermometers and initial lag states limit the correlation.
+    # Thermometers and unknown initial lag states limit the correlation of the two lags.
     assert inflation_of(result, 'board', 'gradient_lag') > 300.0
     (message,) = advice_of(result)
     assert 'do not tell a lag of the board temperature from a lag of T_case - T_board' in message
     assert 'such as with the fan off' in message
     assert any(note.startswith('alike: ') for note in result.calibration.provenance.notes)
-    # The unit is plain: it starts in a soak, and the supports are rigid.
+    # These effects are below the noise: the unit starts in a soak, and its supports are rigid.
     noise = result.fit.selected.score.noise
     assert max(result.contributions.initial_lag_states, result.contributions.support_tilt) < noise
     assert result.contributions.thermal_response > 50.0 * noise
 
 
-def test_a_bag_without_fan_tells_lags_of_board_and_gradient():
+def test_a_bag_without_fan_separates_lags_of_board_and_gradient():
     unit, bags = chamber()
     rng = rng_of('alike', 'still')
     still = record(unit, HALF, spread(1, rng)[0], rng, environment=STILL_AIR)
     result = fitted((*bags, still))
     assert all(finding.name != 'environment' for finding in result.findings)
     assert not advice_of(result)
-    # Without fan the gradient of a ramp is 1 / 0.7 times as large. The share of one bag in ten
-    # changes the columns by an RMS of 0.3 * 0.43 = 0.13, an inflation of 60.
+    # Without fan the gradient of a ramp is 1 / 0.7 = 1.43 times as large. One such bag in ten
+    # makes the columns differ by 0.3 * 0.43 = 0.13 RMS, as sqrt(0.1 * 0.9) = 0.3: the inflation is
+    # 0.13^-2 = 60.
     assert 30.0 < inflation_of(result, 'board', 'gradient_lag') < 90.0
 
 
@@ -87,7 +88,7 @@ def test_one_attitude_in_the_chamber_does_not_separate_bias_and_scale():
         (('bias', 'scale'), 0.996, 5, False),
     ],
 )
-def test_the_level_of_the_advice(parts, correlation, n_directions, is_advised):
+def test_an_inflation_above_100_gives_advice(parts, correlation, n_directions, is_advised):
     groups = ('curve', 'curve') if 'scale' in parts else ('board', 'gradient')
     pairs = [
         Likeness(groups, parts, 'x', correlation),

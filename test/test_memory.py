@@ -182,7 +182,7 @@ def test_the_prior_of_the_initial_state_of_two_stages_is_that_of_a_random_walk(r
 
 
 def test_the_hysteresis_loop_of_a_play_agrees_with_the_formula():
-    # The output is v - 1 while v rises, v + 1 while v falls, constant for 2 K after a reversal.
+    # For an input v a play is v - 1 in rises, v + 1 in falls, constant for 2 K after a reversal.
     memory = ThermalMemory(MemorySpec(plays=((0.0, 1.0),)))
     way = np.concatenate((np.linspace(0, 5, 51), np.linspace(5, 0, 51), np.linspace(0, 5, 51)))
     P = []

@@ -85,7 +85,7 @@ def test_a_nonlinearity_without_terms_changes_no_bit_and_with_a_slope_needs_a_th
     before, _ = stream(Compensator(plain, UNCHECKED), events)
     np.testing.assert_array_equal(stream(Compensator(empty, UNCHECKED), events)[0], before)
     assert 'nonlinearity: null' in dump_calibration(plain)
-    # WHY: if only a nonlinear term had a slope, the calibration needed no board temperature.
+    # WHY: if only a nonlinear term had a slope, `needs_temperature` was false.
     for slope in (0.0, 1e-7):
         square = NonlinearTerm('square', (1e-5,) * 3, (0.0, 0.0, slope), 1e-4)
         value = calibration(nonlinearity=Nonlinearity((0.0, 20.0), 1e-5, (square,)))

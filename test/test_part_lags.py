@@ -105,7 +105,7 @@ def test_lags_of_parts_coupled_to_board_and_case_are_fitted():
     parts = {term.part for term in calibration.response if term.kind == 'board'}
     assert {part.second_tau_s for part in parts} == {0.0}
     taus, _, shares, leads = np.array(sorted(parts)).T
-    # Ramps determine time constants to 1 %, and the share of T_case in what parts lag to 0.01.
+    # Ramps determine time constants to 1 %, and the share of T_case in a part's input to 0.01.
     assert taus == pytest.approx(unit.part_s, rel=0.02)
     assert shares == pytest.approx(case_share, abs=0.02)
     assert not leads.any()
@@ -115,7 +115,7 @@ def test_lags_of_parts_coupled_to_board_and_case_are_fitted():
 @pytest.mark.slow
 @pytest.mark.parametrize('sensors', [('board',), ('board', 'case')])
 def test_lags_of_the_thermometers_themselves_are_fitted(sensors):
-    # WHY: without the thermometer lag in the model the error of |f| was 57 ug, its sd 2 ug.
+    # WHY: a model without thermometer lags had an error of |f| of 57 ug with a claimed sd of 2 ug.
     given = {'part_s': PARTS_S, 'thermometer_s': 60.0, 'sensors': sensors}
     unit, study = study_of('slow thermometer', **given)
     calibration = strangers.fitted(study)
@@ -196,7 +196,8 @@ def test_no_lag_is_fitted_to_a_unit_without_lags():
 
 @pytest.mark.slow
 def test_the_lags_of_parts_are_found_beside_an_effect_of_the_gradient():
-    # WHY: a lag of 223 s, not 163 s, was fitted: in a soak the force error was 167 ug.
+    # WHY: an effect of the gradient was fitted by a lag of 223 s instead of 163 s: in a soak the
+    # force error was 167 ug, the claimed sd 15 ug.
     (study,) = cases.gradient(1)
     calibration = strangers.fitted(study)
     assert {term.group for term in calibration.response} == {'part', 'gradient'}
@@ -256,7 +257,7 @@ def test_norms_of_soaks_determine_the_curve_over_temperature(grade):
 
 @pytest.mark.slow
 def test_six_faces_in_three_soaks_determine_the_curve_at_other_temperatures():
-    # WHY: the fit found misalignments of 0.3 rad (true: 0), or divided by zero.
+    # WHY: the fit found misalignments of 0.3 rad (true: 0); with a `mounting_sd` it divided by 0.
     _, study = study_of(
         'faces in soaks', 1, up=FACES.repeat(3, axis=0), corners=SOAKS, held=program(19.0, 90.0),
         grade=lambda rng: replace(cases.consumer_grade(rng), misalignment=np.zeros(3)),
@@ -274,7 +275,7 @@ def test_six_faces_in_three_soaks_determine_the_curve_at_other_temperatures():
         # WHY: the lags fitted to warm-ups did not hold in a cool-down: the force error was 180 ug.
         ('only warm', {'up': 10, 'corners': program(5, 20, (35, 0.8, 40)), 'part_s': PARTS_S / 2.0,
                        'held': program(33, 20, (10, 0.8, 40))}, 'norm', 2.0),
-        # WHY: soaks at two temperatures do not determine a curve: the claimed sd was 1/8.
+        # WHY: two soak temperatures do not determine a curve: the claimed sd was 1/8 of the error.
         ('two soaks', {'up': 18, 'corners': SOAKS[::2], 'held': program(19.0, 90.0),
                        'grade': cases.consumer_grade}, 'ratio', 2.0),
         # WHY: with each axis vertical at one temperature only, force errors were 15 claimed sd.
@@ -303,7 +304,7 @@ def test_one_bag_of_ramps_beside_soaks_determines_the_lags():
 
 @pytest.mark.slow
 def test_a_bias_decay_after_power_on_is_not_fitted_by_a_lag():
-    # WHY: lags were fitted to the decay: in bags with other starts the force error was 1.7 mg.
+    # WHY: lags fitted a bias decay after power-on: from other starts the force error was 1.7 mg.
     rng = rng_of('power-on', 4)
     unit = cases.consumer_grade(rng)
 
@@ -332,7 +333,8 @@ def test_lags_of_a_unit_with_a_hidden_node_or_in_soaks_only_are_those_of_the_ban
         calibration = strangers.fitted(replace(study, bags=study.bags[:n]), **options)
         lags = {term.tau_s for term in calibration.response if term.kind == 'board'}
         assert lags <= {*FINE_TAUS}
-    # A large difference of case and board in a later ramp is not reported as a loose thermometer.
+    # Soaks do not show how far case and board differ in ramps, so a large difference in a later
+    # ramp must not be reported as a loose thermometer.
     assert calibration.rest_gradient_range_k is None
 
 

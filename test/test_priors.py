@@ -93,7 +93,8 @@ def test_a_population_has_the_mean_of_its_units_and_their_scatter():
 
 
 def test_the_scatter_of_an_axis_is_averaged_over_the_axes_of_three_units(rng):
-    # WHY: on one axis siblings had nearly equal biases by chance: the error was 363, not 77 ug.
+    # WHY: by chance three siblings had nearly equal biases on one axis: with their prior the force
+    # error of a fit was 363 ug, without a prior 77 ug.
     layout = parameter_layout(rich_calibration())
     deviations = rng.standard_normal((3, layout.n_parameters))
     level = layout.bias[1].static
@@ -129,7 +130,8 @@ def test_chance_correlations_between_parameters_of_twelve_units_are_reduced(rng)
 
 @pytest.mark.slow
 def test_equal_curves_of_both_sets_stay_equal_in_a_population():
-    # WHY: equal curves of both regimes were not fully correlated: the error was 3.1, not 0.7 ug.
+    # WHY: in the prior from siblings equal curves of both regimes were not fully correlated: a fit
+    # had an error of 3.1 ug with this prior, and of 0.7 ug without a prior.
     prior = population(siblings())
     covariance, layout = prior.posterior.covariance(), parameter_layout(prior)
     for block in (*layout.bias, *layout.scale):
@@ -178,7 +180,7 @@ def test_three_positions_reduce_the_sd_of_an_aged_calibration():
     later = [source(record) for record in test_of(9, 9, 12)]
     options = replace(OPTIONS, serial='unit-9', prior=old, ageing_bias=1e-4, ageing_scale=2e-5)
     new = fit(later, options).calibration
-    # Three positions determine three of the six sums bias +- scale * g: half of the variance.
+    # Three positions determine three of the six sums bias +- scale * g: half the variance remains.
     grown = np.mean(sd_of_levels(old) ** 2 + options.ageing_bias**2)
     assert np.mean(sd_of_levels(new) ** 2) < 0.75 * grown
     bias = [(a.bias - b.bias) / a.scale_factor for a, b in zip(new.axes, old.axes, strict=True)]
@@ -208,7 +210,7 @@ def test_rests_at_one_temperature_correct_a_bias_change_and_keep_the_response():
     pairs = (old, held_out), (old, [*map(aged, held_out)]), (new, [*map(aged, held_out)])
     left = [np.sqrt(np.mean([left_by(unit, r) ** 2 for r in records])) for unit, records in pairs]
     assert left[1] > 10.0 * left[0]
-    # Six means of |f| determine three biases to 10 ug (1 sd), or to 20 ug with three scales.
+    # Six means of |f| determine three biases to 10 ug (1 sd), with three scale factors to 20 ug.
     sd = float(sd_of_levels(new).max())
     assert sd < 20e-6 * STANDARD_GRAVITY
     assert left[2] < np.hypot(left[0], sd)
@@ -254,7 +256,7 @@ def test_three_faces_halve_the_error_of_a_change_of_bias_or_scale(kind):
     bias, bias_sd, scale, scale_sd = after(changed, np.eye(3))
     wrong = np.array([bias / STANDARD_GRAVITY, scale])
     wrong[('bias', 'scale').index(kind)] -= change
-    # The rests determine only the sum of bias and scale errors, to some ug: each gets a half.
+    # Rests determine only the sum of bias and scale errors, to some ug: each gets half the change.
     assert np.abs(wrong.sum(axis=0)).max() < 10e-6
     assert np.abs(np.abs(wrong) / np.abs(change) - 0.5).max() < 0.1
     assert (np.abs(wrong) < 2.0 * np.array([bias_sd / STANDARD_GRAVITY, scale_sd])).all()

@@ -283,7 +283,7 @@ def test_the_only_topic_of_a_type_is_used_and_of_two_both_are_named(tmp_path):
             '/imu/ticks, its only Vector3Stamped, is taken for counts; '
             '/imu/die, its only Temperature, is taken for board'
         )
-    # No board is chosen by type if a topic is named, or there are two, or it is the case's.
+    # No board topic is chosen by type if one is named, if there are two, or if it is the case's.
     with pytest.raises(RecordingError, match='my/die: no such topic'):
         open_recording(path, Topics(board='my/die'), require=('board',))
     for topics in (('imu/die', 'baro/air'), ('temperature/case',), ('x/temperature/case',)):

@@ -226,7 +226,7 @@ def test_arguments_of_wrong_shape_or_type_and_messages_without_a_definition_are_
 
 @pytest.mark.parametrize('name', ['bag', 'bag.mcap'])
 def test_regime_topics_of_a_bag_have_the_qos_of_the_node(tmp_path, name):
-    # WHY: `regime/stamped` was volatile, so a subscriber that joined later got no regime.
+    # WHY: a bag had `regime/stamped` as volatile: a subscriber that joined later got no regime.
     with BagWriter(tmp_path / name) as bag:
         bag.write_raw('imu0/regime/dynamic', BOOL, [1], [b''])
         for topic in ('imu0/regime/stamped', '/diagnostics'):

@@ -85,7 +85,7 @@ def test_the_onset_of_a_ramp_is_detected_early(sensor, median_s, late_s):
     ('sensor', 'threshold'), [('1 mK', 9.65), pytest.param('10 mK', 8.87, marks=pytest.mark.slow)]
 )
 def test_the_onset_delay_is_below_twice_that_of_a_cusum_test(sensor, threshold):
-    # A CUSUM that knows the ramp is fastest. `threshold`: for one false alarm in 50 h.
+    # A CUSUM that knows the ramp has the least delay; `threshold` gives one false alarm in 50 h.
     noise = SENSORS[sensor][0]
     rng = np.random.default_rng(4)
     k = np.arange(1.0, 121.0)
@@ -131,7 +131,7 @@ def test_each_ramp_switches_the_regime_to_dynamic_once(noise, quantum, rate_k_mi
     ],
 )
 def test_three_soaks_of_5_h_have_at_most_two_false_alarms(sensor):
-    # At 0.02 false alarms per hour more than two in 15 h have a probability of 0.4 %.
+    # At the default of 0.02 false alarms per hour more than two in 15 h have p = 0.4 %.
     noise, quantum = SENSORS[sensor]
     n_openings = 0
     for seed in range(3):
@@ -234,7 +234,8 @@ def test_the_dynamic_regime_ends_by_the_case_or_the_board(sensor):
     assert [regime for _, regime, _ in early] == [STATIC, DYNAMIC, STATIC]
     assert early[1] == late[1]
     assert late[2][0] - early[2][0] == pytest.approx(earlier, abs=300.0)
-    # With 'case' the regime switches as without a board; without a case both settings are equal.
+    # With end condition 'case' the board has no effect. Without a case thermometer both end
+    # conditions use the board thermometer.
     assert early == switches(board_too, t, case, None)
     t, board = t[:3000], board[:3000]
     assert switches(case_alone, t, None, board) == switches(board_too, t, None, board)

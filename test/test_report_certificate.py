@@ -201,7 +201,7 @@ def test_the_lack_of_fit_is_a_row_of_the_budget_and_not_part_of_the_model():
     windows, standards, lines = with_lack(1e-3, 2e-3)
     # The variance of the lack of fit is linear between 15 and 30 degC, and equal on all axes.
     variance = 1e-6 + 3e-6 * np.clip((windows.board - 15.0) / 15.0, 0.0, 1.0)
-    # In the first five minutes of a bag the regime may be unknown: both sets count.
+    # In the first five minutes of a bag the regime may be unknown: the variances of both sets add.
     known = windows.time > 300.0
     np.testing.assert_allclose(windows.lack_sd[known] ** 2, variance[known], rtol=0.01)
     assert (windows.lack_sd**2 / variance).max() == pytest.approx(2.0, rel=0.01)
@@ -350,7 +350,8 @@ def test_conformity_is_stated_only_with_a_tolerance():
 
 
 def test_a_fit_in_one_pose_states_that_the_error_on_data_left_out_is_a_drift(cli, tmp_path):
-    # WHY: the certificate called the drift |f| - g in another attitude; the file had no value.
+    # WHY: after a fit to one pose the certificate called the drift of left-out data an error |f| -
+    # g in other positions, and the calibration file did not contain this drift.
     bag, page, unit = write_bag(tmp_path / '01.mcap'), tmp_path / 'fit.html', tmp_path / 'fit.yaml'
     given = ('--gravity', '9.80665', '--groups', 'curve,set', '--report', page, '--json')
     facts = json.loads(cli('fit', bag, '-o', unit, *given).stdout)

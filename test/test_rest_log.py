@@ -292,7 +292,7 @@ def test_a_killed_node_damages_at_most_one_line_of_its_rest_log(tmp_path, unit, 
 
 
 def test_a_rest_has_the_temperature_at_its_own_time_at_any_speed_of_playing(tmp_path, unit, peer):
-    # WHY: the thermal state was that at the end of a block: in a ramp an error of 0.75 K.
+    # WHY: a rest got the thermal state at the end of its block of samples: 0.75 K off in a ramp.
     folder, rate_k_s = tmp_path / 'rests', 0.02
     words = node_arguments(unit, f'rest_log:={folder}', 'diagnostics_period:=1.0')
     with node_in_thread(*words) as node:

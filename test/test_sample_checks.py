@@ -311,7 +311,7 @@ def steps(rng, *, offset, at_s=20.0, ramp_s=0.0, rate_hz=2.5, scatter=0.0):
 @pytest.mark.parametrize('rate_hz', [2.5, 5.0, 10.0])
 @pytest.mark.parametrize('offset', [0.3, -3.0, 15.0])
 def test_a_step_at_rest_refutes_the_calibration_within_a_second(rng, rate_hz, offset):
-    # WHY: a calibration was refuted only 5 s after a step, with a mean of samples before it.
+    # WHY: a step of |f| was reported after 5 s, with a mean that included samples before it.
     after_s, result = steps(rng, offset=offset, rate_hz=rate_hz)
     assert after_s < 1.0
     assert result.residual == pytest.approx(offset, abs=5 * NOISE_SD)

@@ -266,7 +266,8 @@ def test_the_true_thermal_model_leaves_only_noise(kind):
         norms.append(np.linalg.norm(force, axis=1) - STANDARD_GRAVITY / MICRO_G)
     vector = np.sqrt(np.mean(np.concatenate(errors)))
     if kind == 'slow-noise':
-        # In 7.3 h a random walk has a mean square of 9 * 7.3 / 2 ug^2, up to a factor of 2.
+        # In 7.3 h the random walk of an axis has a mean square of 9 * 7.3 / 2 ug^2; three runs
+        # determine the RMS to a factor of 2.
         assert 4.0 < vector < 20.0
     else:
         # The RMS of 1311 means is uncertain by 2 % (|f|) and 1.2 % (vector); limits: 5 sd.

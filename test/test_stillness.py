@@ -47,7 +47,7 @@ def hover(rng, seconds, vibration):
     return accel, gyro + np.radians(2.0) + np.radians(0.5) * rng.standard_normal(gyro.shape)
 
 
-def test_of_a_flight_only_the_time_on_the_ground_is_a_rest(rng):
+def test_only_the_time_on_the_ground_is_a_rest_of_a_flight(rng):
     accel, gyro = hover(rng, 120.0, vibration=1.0)
     for rate in (gyro, None):
         with pytest.raises(FitError, match=r'log: no still interval: .* scatter by at least 9\d'):

@@ -35,7 +35,7 @@ def test_a_lag_is_known_after_some_time_and_without_readings_follows_the_board()
     settled_s = TAU_S * math.log(1.5 / MEMORY_SETTLED_SD)
     assert not tracker.is_settled(round((settled_s - 10.0) * 1e9))
     assert tracker.is_settled(round((settled_s + 10.0) * 1e9))
-    # WHY: without any reading of the case the lag had an error of 3 claimed sds.
+    # WHY: without case readings the gradient itself was used as its lag: an error of 3 claimed sd.
     spec = MemorySpec(lags=(('case', 600.0),))
     tracker = ThermalTracker(DetectorSettings(), spec, board_lag_s=500.0)
     feed(tracker, 20.0 + np.maximum(np.arange(1301) - 1000.0, 0.0) / 60.0)

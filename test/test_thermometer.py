@@ -120,7 +120,8 @@ def test_a_change_between_steps_of_1_k_determines_the_temperature():
 
 @pytest.mark.parametrize(('quantum', 'lag_s'), [(0.1, 120.0), (0.5, 180.0), (1.0, 600.0)])
 def test_equal_readings_each_minute_keep_the_error_below_1_5_quanta(quantum, lag_s):
-    # WHY: equal readings more than a quantum from the prediction had no weight: an sd of 24 K.
+    # WHY: when the prediction was more than a quantum from the reading, equal readings had no
+    # weight, and the claimed sd rose to 24 K within an hour of soak.
     t = np.arange(-3600.0, 9000.0, 60.0)
     truth = 20.0 + lagged(t, [(0.0, 1.0), (1200.0, 0.0)], lag_s)
     thermometer = Thermometer(ThermometerSettings(0.01 * quantum, quantum, lag_s=lag_s))
@@ -219,7 +220,7 @@ def test_a_far_reading_has_little_weight_and_a_lasting_step_is_accepted_after_fo
     assert thermometer.temperature == pytest.approx(20.0, abs=0.002)
 
 
-def test_a_gap_increases_the_variance_or_restarts_the_estimate_and_changes_are_dated():
+def test_a_gap_increases_the_variance_or_restarts_and_changed_ns_is_the_stamp_of_a_change():
     thermometer = settled()
     narrow = thermometer.var_temperature
     thermometer.update(900 * SECOND_NS, 20.0)
@@ -237,7 +238,7 @@ def test_a_gap_increases_the_variance_or_restarts_the_estimate_and_changes_are_d
 
 
 def test_the_noise_is_estimated_if_the_setting_is_too_small():
-    # WHY: readings with a noise of 0.1 K, stated as 5 mK, were all taken for outliers.
+    # WHY: readings with a noise of 0.1 K (setting: 5 mK) were all taken for outliers.
     thermometer = Thermometer(ThermometerSettings(0.005))
     rng = np.random.default_rng(3)
     out = run(thermometer, np.arange(4000.0), read(np.full(4000, 20.0), 0.125, 0.0, rng))

@@ -50,12 +50,12 @@ def test_the_claimed_sd_of_lags_covers_a_start_in_a_ramp():
         at_1_hz(unit, *[10.0 + rate / 60.0 * np.minimum(np.arange(61), end)] * 2)[2]
         for rate, end in ((0.0, 60), (1.0, 60), (1.0, 40))
     )
-    # 30 counts/K over 300 counts per m/s^2; after 60 s a lag error has decayed to 1 / e.
+    # A lag error of 1 K is 30 / 300 m/s^2; after 60 s (tau) it has decayed to 1 / e.
     left = 30.0 / 300.0 / math.e
     assert soak == pytest.approx(0.387 * left, rel=0.2)
     assert ramps == pytest.approx([math.hypot(1.0, 0.387) * left] * 2, rel=0.2)
     # WHY: after a start in a ramp with a case 5 K above the board a lagged gradient was wrong by
-    # five claimed sds. A ramp that begins over a lag (600 s) after the start does not matter.
+    # five claimed sds. A ramp that begins 600 s (tau) after the start does not increase the sd.
     response = (term('gradient_lag', (30.0, 0.0, 0.0), tau_s=600.0),)
     unit = replace(calibration(response=response), board_lag_s=300.0)
     risen = (np.maximum(np.arange(761) - begin, 0) / 60.0 for begin in (0, 700))
@@ -95,7 +95,7 @@ def test_beyond_1_g_the_covariance_includes_an_unknown_k2():
 
 @pytest.mark.parametrize('fault', ['both stand still', 'swapped topics'])
 def test_the_claimed_sd_covers_thermometer_errors_for_parts_that_lag_the_board(fault):
-    # WHY: the claimed sd lacked lasting errors of T_board, which a lagging part shows.
+    # WHY: the claimed sd lacked lasting errors of T_board, which act through a lagging part.
     per_kelvin, axis = 30.0, axis_set((0.0, 30.0))
     part = term('board', (-per_kelvin, 0.0, 0.0), tau_s=600.0)
     parts = regime_set(x=axis, rate_range_k_min=(-5.0, 5.0))
@@ -128,7 +128,8 @@ def test_the_claimed_sd_covers_thermometer_errors_for_parts_that_lag_the_board(f
 
 
 def test_the_lack_of_fit_is_included_in_the_sd_of_bias_and_of_scale():
-    # WHY: the lack of fit increased the sd of the bias only: the scale was certified to 11 ppm.
+    # WHY: the lack of fit increased the sd of the bias only: a certificate stated the scale factor
+    # of an axis that was never along gravity to 11 ppm.
     lacks = LackOfFit(0.0, (0.0, 3e-3, 4e-3)), LackOfFit(20.0, (0.0, 0.0, 0.0))
     plain = calibration()
     lacking = replace(plain, static=replace(plain.static, lack_of_fit=lacks))
@@ -280,7 +281,8 @@ def test_the_claimed_sd_grows_with_the_distance_from_the_range():
 
 
 def test_rates_and_squares_beyond_their_range_increase_the_sd_by_their_distance():
-    # WHY: in a ramp the variance of a unit fitted to soaks, which has that of the lag, grew anew.
+    # WHY: in a ramp the variance of a unit fitted to soaks was multiplied by several hundred,
+    # although it contained the variance of the lag.
     axis = axis_set(residual_sd_m_s2=1e-5)
     soaks = regime_set(axis, rate_range_k_min=(-0.1, 0.1))
     sds = []
@@ -290,9 +292,11 @@ def test_rates_and_squares_beyond_their_range_increase_the_sd_by_their_distance(
         state[BOARD], state[RATE] = 20.0, 2.0 / 60.0
         line = correction.line(state, state, np.zeros(N_ROWS), 0.0)
         sds.append(math.sqrt(line[VARIANCES[0]] - correction.noise[0]))
-    # The rate exceeds 0.1 K/min by 19 times: only the unit without lags gets further variance.
+    # The rate of 2 K/min exceeds the calibrated 0.1 K/min by 19 times 0.1 K/min: only the unit
+    # without lags gets additional variance.
     assert sds == pytest.approx([1e-5 * math.hypot(1.0, 19.0), 1e-5], rel=1e-6)
-    # WHY: of a lag 100 times the largest in the bags the squares were compared: an sd of 0.1 g.
+    # WHY: for a lag of 100 times the largest lag in the bags the ratio of the squares, 10000, was
+    # used: the claimed sd was 0.1 g.
     unit = calibration(response=(term('square', (1.0, 0.0, 0.0), tau_s=600.0, range=(0.0, 0.01)),))
     correction = Correction(unit)
     state = np.zeros(StateLayout(correction.memory).width)

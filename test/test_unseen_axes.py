@@ -49,7 +49,7 @@ def test_axes_never_along_gravity_at_some_temperatures_have_a_larger_sd():
     (lack, _) = thermal_ranges.with_unseen_axes(fit, ((), ()), None)
     assert [point.temperature_c for point in lack] == pytest.approx([-40, -31, -22, -13, -4])
     for point in lack:
-        # From 4 K beyond the range on the slope of the scale has an sd of 5 ppm/K, half of itself.
+        # More than 4 K beyond the range the scale's slope has an sd of 5 ppm/K, half of its value.
         sd = 0.5e-5 * 10.0 * (-4.0 - point.temperature_c)
         assert point.sd_m_s2 == pytest.approx((0.0, sd, sd), abs=1e-12)
     (finding,) = thermal_ranges.judge_unseen_axes(fit, None)
@@ -109,7 +109,8 @@ def test_after_one_cold_bag_the_claimed_sd_covers_the_scale_errors_of_all_axes(n
 @pytest.mark.parametrize('poses', [1, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize('unit', [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_rests_in_one_pose_at_four_temperatures_determine_the_drift_of_level_axes(unit, poses):
-    # WHY: the warm-up of the board alone determined the curve: bias errors of 1 to 4 mg.
+    # WHY: only the warm-up of the board determined the bias curve, but the sensor lags the board:
+    # the bias between the rests was wrong by 1 to 4 mg.
     study = list(cases.returned(unit))[poses - 1]
     calibration = strangers.fitted(study)
     (held,) = map(slow, study.tests[''])
@@ -121,7 +122,7 @@ def test_rests_in_one_pose_at_four_temperatures_determine_the_drift_of_level_axe
 
 
 def test_only_an_attitude_to_which_the_unit_was_returned_is_a_pose():
-    # WHY: parts of one long rest counted as returns to a pose: a random walk became a curve.
+    # WHY: parts of one rest counted as returns to a pose: a random walk was fitted as a curve.
     x, y = np.eye(3)[:2]
 
     def poses(*up, start_ns=range(4)):
@@ -155,7 +156,7 @@ def test_rests_in_one_pose_use_the_mounting_sd_that_the_user_stated():
     ],
 )
 def test_the_claimed_sd_is_right_if_one_ramp_cannot_separate_bias_and_scale(draw, unit, is_cold):
-    # WHY: the drift in the only ramp was attributed to the scale factors, or to a lag.
+    # WHY: the drift in the only ramp, or a lag's effect in warm-ups, was taken for scale changes.
     rng = rng_of('bench beside a ramp', unit)
     imu = draw(rng)
     bench = program(22.0, 5.0)
@@ -218,7 +219,7 @@ def rms(values):
 
 @pytest.mark.slow
 def test_a_lag_is_corrected_at_twice_the_rates_of_the_fit():
-    # WHY: a fit with products of a lag, but without the lag, had errors of over 1.7 mg there.
+    # WHY: a fit with products of a lag, but not the lag, erred by over 1.7 mg at twice the rates.
     rng = np.random.default_rng(2)
     up = (0.0, -20.0), (1200.0, -20.0), (9000.0, 45.0), (10200.0, 45.0)
     down = tuple((t, 25.0 - celsius) for t, celsius in up)
@@ -233,7 +234,7 @@ def test_a_lag_is_corrected_at_twice_the_rates_of_the_fit():
     is_used = at_rest & np.isfinite(out.specific_force).all(axis=1)
     error = (out.specific_force - force)[is_used]
     error = error[: len(error) // 60 * 60].reshape(-1, 60, 3).mean(axis=1)
-    # With products of the lag, but without the lag, the error exceeds the effect of the lag.
+    # A fit with products of the lag, but not the lag, has an error larger than this effect.
     assert rms(of_lag) > 0.5e-3 * GRAVITY
     assert rms(error) < 0.25 * rms(of_lag)
 
@@ -249,7 +250,7 @@ def test_the_claimed_sd_of_a_mems_with_a_single_turn_on_is_0_3_to_1_5_mg():
 
 @pytest.mark.slow
 def test_an_update_after_a_new_turn_on_gives_the_mean_of_both_turn_ons():
-    # WHY: an update took the bias of the later turn-on alone, as the difference seemed ageing.
+    # WHY: an update took the difference of two turn-ons for ageing, and used the later one alone.
     rng = np.random.default_rng(5)
     change = 1e-3 * GRAVITY * np.array([1.0, -0.8, 0.6])
     bags = [turned(rng, ((0.0, 20.0), (5400.0, 20.0)), name)[0] for name in ('one', 'two')]
