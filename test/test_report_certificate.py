@@ -45,7 +45,7 @@ from thermo_comp.unit.prediction import in_a_soak
 pytestmark = pytest.mark.usefixtures('equal_fits_once', 'no_figures')
 
 #: The row of the budget for the error on data left out of the fit.
-LACK = 'lack of fit (left-out data)'
+LACK = 'lack of fit'
 LAB = """
 number: 2026-017
 laboratory: {name: Inertial Lab, address: 1 Street, accreditation: L-1}

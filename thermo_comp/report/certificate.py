@@ -121,7 +121,7 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
         drift = drift_k * _slope(calibration)
         slope = f'{drift_k:g} K times the RMS slope of the bias'
     seconds = f'white noise of a mean over {windows.window_s:g} s'
-    left_out = 'error on data left out of the fit, beyond noise and the sd of the parameters'
+    left_out = 'left-out errors beyond noise and sd of parameters'
     gravity = unclaimed_gravity_sd(evidence, info)
     if gravity is not None and calibration.has_uncertainty:
         gravity = float(np.hypot(gravity, evidence.gravity_sd))
@@ -131,7 +131,7 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
         Contribution('gravity', 'B', gravity, info.gravity.source or in_fit),
         Contribution('attitude', 'A', attitude, 'uncertainty of the misalignment of the axes'),
         Contribution('thermometers', 'B', drift, slope),
-        Contribution('lack of fit (left-out data)', 'A', lack, left_out),
+        Contribution('lack of fit', 'A', lack, left_out),
         Contribution('model', 'A', model, 'rest of the claimed sd of |f|'),
         Contribution('repeatability', 'A', excess, 'RMS of |f| − g beyond the claimed sd'),
     )
