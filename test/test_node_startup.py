@@ -61,7 +61,8 @@ def test_a_node_that_cannot_start_prints_one_line(overrides, text, unit, tmp_pat
     code = main(arguments(*(override.format(tmp=tmp_path, unit=unit) for override in overrides)))
     printed = capfd.readouterr()
     assert code == 1
-    assert printed.out == ''
+    # Fast DDS prints its own error when another process holds the lock of its shared memory.
+    assert [line for line in printed.out.splitlines() if 'RTPS_TRANSPORT_SHM' not in line] == []
     (line,) = printed.err.splitlines()
     assert line.startswith('thermo_comp_node: ')
     assert text in line
