@@ -182,13 +182,16 @@ def _as_a_process(cwd):
 def cli(program):
     """Return a function that runs a command in this process or, with `env`, in a new process."""
     from thermo_comp.cli.app import run as run_command
+    from thermo_comp.text import keep_standard_output
 
     def run(*args, code=0, cwd=None, **env):
         if env:
             return program(*args, code=code, cwd=cwd, **env)
         arguments = [str(argument) for argument in args]
         with _as_a_process(cwd), _caught('stdout', 1) as output, _caught('stderr', 2) as errors:
+            keep_standard_output()
             returned = run_command(arguments)
+            sys.stdout.close()  # writes what it holds
             finished = subprocess.CompletedProcess(arguments, returned, output(), errors())
         return _checked(finished, code)
 

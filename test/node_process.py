@@ -15,6 +15,13 @@ _STOPPING_S = 10.0  # time for the node to end [s]
 OVER_UDP = {'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4'}
 
 
+def without_middleware(text):
+    """Drop lines of Fast DDS, which warn that another process has locked its shared memory."""
+    return ''.join(
+        line for line in text.splitlines(keepends=True) if 'RTPS_TRANSPORT_SHM' not in line
+    )
+
+
 class NodeProcess:
     """A node process, ended by the `with` block; `environment`: added environment variables."""
 
@@ -43,7 +50,8 @@ class NodeProcess:
     @property
     def said(self):
         # `pread` does not change the position at which the node process writes to the file.
-        return os.pread(self._log.fileno(), 1 << 20, 0).decode(errors='replace').strip()
+        text = os.pread(self._log.fileno(), 1 << 20, 0).decode(errors='replace')
+        return without_middleware(text).strip()
 
     def stop(self, number=signal.SIGTERM):
         # `send_signal` sends no signal to a process that has already ended.

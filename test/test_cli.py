@@ -70,6 +70,16 @@ class TestOutput:
         assert 'reading bag' not in finished.stdout + finished.stderr
 
 
+def test_what_a_library_prints_on_descriptor_1_goes_to_standard_error():
+    # WHY: an error that Fast DDS printed stood before the JSON of `record` and `play`.
+    code = (
+        'import os; from thermo_comp.cli import app; '
+        "app.run = lambda _: (os.write(1, b'library'), print('result'), 0)[-1]; app.main([])"
+    )
+    finished = ran(sys.executable, '-c', code, check=True)
+    assert (finished.stdout, finished.stderr) == ('result\n', 'library')
+
+
 def test_a_command_computes_in_one_thread():
     # WHY: BLAS threads waited for each other; on two busy cores a fit took 16 times as long.
     code = (

@@ -272,6 +272,8 @@ def alive(pid):
 
 
 HANGING = """
+from thermo_comp.text import keep_standard_output
+keep_standard_output()
 import threading
 from thermo_comp.ros import node, reader
 reader.read = lambda *_: (print('reads', flush=True), threading.Event().wait())

@@ -62,6 +62,8 @@ def test_samples_of_a_second_publisher_are_never_published(peer, unit):
 
 #: A driver process: once it has a subscriber it sends samples at 100 Hz; frame_id: its name.
 DRIVER = """
+from thermo_comp.text import keep_standard_output
+keep_standard_output()
 import sys, time, rclpy
 from geometry_msgs.msg import Vector3Stamped
 from itertools import count

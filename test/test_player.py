@@ -80,6 +80,8 @@ def test_every_message_played_over_dds_arrives_byte_for_byte(peer, tmp_path, rng
 
 
 SLOW_LISTENER = """
+from thermo_comp.text import keep_standard_output
+keep_standard_output()
 import hashlib, rclpy
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy

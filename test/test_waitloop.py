@@ -206,6 +206,8 @@ OTHER = """\
 
 #: A program with a reliable and a best-effort subscription, which prints the stamps of each.
 RECEIVER = """
+from thermo_comp.text import keep_standard_output
+keep_standard_output()
 import json, select, sys, time
 import rclpy
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy

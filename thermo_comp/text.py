@@ -32,6 +32,21 @@ def hold_standard_streams() -> None:
             setattr(sys, name, os.fdopen(number, 'r' if number == 0 else 'w'))
 
 
+def keep_standard_output() -> None:
+    """
+    Give `sys.stdout` a descriptor of its own; let descriptor 1 lead to standard error.
+
+    Fast DDS prints its errors to descriptor 1, so that a line of it could stand before the JSON of
+    a command.
+    """
+    sys.stdout.flush()
+    results = os.dup(1)
+    os.dup2(2, 1)
+    sys.stdout = os.fdopen(
+        results, 'w', 1 if os.isatty(results) else -1, sys.stdout.encoding, sys.stdout.errors
+    )
+
+
 def valid_serial(serial: str) -> str:
     """Return a serial that may go into files and onto screens, or raise ValueError."""
     if not serial or len(serial) > LONGEST_SERIAL or not serial.isprintable():

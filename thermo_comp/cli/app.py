@@ -21,7 +21,7 @@ from typer import rich_utils
 
 from .. import __version__
 from ..errors import ThermoCompError
-from ..text import hold_standard_streams
+from ..text import hold_standard_streams, keep_standard_output
 from . import bags, convert, fit, fleet, judge, output, record, simulate
 from .shared_options import expanded, option
 
@@ -70,6 +70,7 @@ app.add_typer(_fleet)
 def main(arguments: list[str] | None = None) -> None:
     """Run one command and end the process with the command's exit code."""
     hold_standard_streams()
+    keep_standard_output()
     # On busy cores, operations on small matrices take 16 times longer with several BLAS threads.
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # SIGTERM runs clean-up code
