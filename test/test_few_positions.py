@@ -425,6 +425,18 @@ def test_left_out_norms_of_faces_laid_by_hand_show_a_misalignment_of_20_mrad():
     np.testing.assert_allclose(calibration.misalignment, true, atol=4e-3)
 
 
+def test_a_clearly_larger_evidence_shows_the_misalignment_of_faces_laid_with_tilts_of_1_deg():
+    # WHY: left-out |f| did not decide, and an element of M was wrong by 8 mrad.
+    rng = np.random.default_rng(508)
+    up = np.tile(FACES, (2, 1)) + np.radians(1.0) * rng.standard_normal((12, 3))
+    up /= np.linalg.norm(up, axis=1)[:, np.newaxis]
+    true = np.eye(3)
+    true[[1, 2, 2], [0, 0, 1]] = 0.01 * rng.standard_normal(3)
+    calibration = fit([turned(rng, up @ np.linalg.inv(true).T)], OPTIONS).calibration
+    # The eight rests that show an element have a noise of 45 ug: its sd is 1 mrad.
+    np.testing.assert_allclose(calibration.misalignment, true, atol=4e-3)
+
+
 def test_six_attitudes_that_hardly_determine_the_scale_factors_give_scale_factors_near_1(rng):
     # The squared x, y and z components of the attitudes are almost linearly dependent.
     up = [[-7, 88, 48], [14, -89, -44], [87, -16, 47], [-32, 39, -86], [-56, -45, 70],

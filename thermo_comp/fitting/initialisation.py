@@ -30,7 +30,7 @@ from .options import FitOptions
 from .priors import informative_priors, offset_sd_of, with_calibration
 from .reduction import ReducedBag
 from .regression import Regression
-from .selection import LARGE_OFFSETS, Fit, Selected, fit_all, select
+from .selection import LARGE_OFFSETS, Fit, Selected, better_start, fit_all, select
 from .unknowns import BIAS_SD, SCALE_SD, InformativePrior, Prior, State, misalignment_scale
 from .windows import CURVE, PART, SET, ThermalWindows
 
@@ -155,15 +155,13 @@ def _selected(
 ) -> Selected:
     """
     Select the model. If `_with_faces` has reduced the misalignment sd, also select the model with
-    the sensor's sd: this model is kept if its errors of left-out |f| are clearly smaller.
+    the sensor's sd, and choose between both models as between initial sds of mounting offsets.
     """
     selected = select(regression, state, prior, candidates, progress)
     if not prior.unseen_misalignment_sd:
         return selected
     full = replace(prior, misalignment_sd=prior.unseen_misalignment_sd, unseen_misalignment_sd=0.0)
-    other = select(regression, state, full, candidates, progress)
-    norms = selected.score.norms.gain_of(other.score.norms)
-    return other if norms is not None and norms[0] > 2.0 * norms[1] else selected
+    return better_start([selected, select(regression, state, full, candidates, progress)])
 
 
 def _updating_priors(

@@ -352,7 +352,9 @@ def _is_drift_determined(
 def _is_norm_determined(point: Point, posterior: PosteriorMode, root: Floats, p: int) -> bool:
     """
     Whether the fit without position `p`, of covariance ``root @ root.T``, determines |f| in `p`:
-    the variance of |f| is below 10 times (variance by the fit of all positions + offset variance).
+    the variance of |f| is below 10 times (variance by the fit of all positions + offset variance),
+    or below the variance of usual mounting offsets. In few poses the variance is not compared with
+    that of usual offsets, because there the prior of bias and scale makes it small.
     """
     if not point.regression.gravity:
         return False
@@ -360,7 +362,8 @@ def _is_norm_determined(point: Point, posterior: PosteriorMode, root: Floats, p:
     by_all = float(np.sum((along @ posterior.root) ** 2)) + point.prior.offset_sd**2
     if point.regression.has_turn_ons:
         by_all += point.prior.turn_on_sd**2
-    return float(np.sum((along @ root) ** 2)) < 10.0 * by_all
+    usual_sd = 0.0 if point.regression.windows.n_poses else point.prior.offset_scale
+    return float(np.sum((along @ root) ** 2)) < max(10.0 * by_all, usual_sd**2)
 
 
 def _by_sections(

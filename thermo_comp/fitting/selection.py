@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -103,6 +103,9 @@ class Fit(NamedTuple):
         """
         prior = self.posterior.prior
         return float(np.hypot(prior.offset_sd, self.regression.has_turn_ons * prior.turn_on_sd))
+
+
+_Model = TypeVar('_Model', Trial, Selected)
 
 
 def _best(chosen: Trial, trials: Sequence[Trial]) -> Trial:
@@ -236,12 +239,13 @@ class Growth:
         return [self.extended(chosen, groups, typical) for groups in tried]
 
 
-def better_start(fits: Sequence[Trial]) -> Trial:
+def better_start(fits: Sequence[_Model]) -> _Model:
     """
-    Choose by left-out data between fits begun with a small and with a large prior sd of mounting
-    offsets. If left-out data do not decide, the fit begun with the large prior sd is chosen only
-    if its log density is larger by `CLEAR_GAIN`. Mounting offsets and misalignments explain |f| in
-    few positions equally well, but only misalignments predict |f| in a new position.
+    Choose by left-out data between the first and the last fit, which begin with a small and with a
+    large prior sd of mounting offsets, or of the misalignment. If left-out data do not decide, the
+    fit with the large prior sd is chosen only if its log density is larger by `CLEAR_GAIN`.
+    Mounting offsets and misalignments explain |f| in few positions equally well, but only
+    misalignments predict |f| in a new position.
     """
     small, large = fits[0], fits[-1]
     evidence_gain = log_density(large.posterior) - log_density(small.posterior)
