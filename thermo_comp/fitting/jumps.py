@@ -134,7 +134,7 @@ def _examine(
     step_sd = np.hypot(sd * relative_sd * _sd_growth(residual, sd), by_rounding)
     if r:
         is_step = np.abs(step) > _STEP_SDS * step_sd
-        # The change of the mean level must exceed half of the step within one sample, and 4 sd.
+        # The change of the mean level must exceed half of the step in one sample, and 4 of its sd.
         is_step &= lasting * np.sign(step) > 0.5 * np.abs(step)
         is_step &= np.abs(lasting) > 4.0 * lasting_sd
     else:

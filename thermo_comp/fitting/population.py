@@ -168,7 +168,7 @@ def _in_one_stage(column: Column, tau_s: float) -> Column:
 
 def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
     """
-    Return pairs (column of the bank of time constants, factor) whose sum approximates `column`.
+    Return columns with time constants of the bank, and factors; their sum approximates `column`.
 
     Parts of two units of a type have different time constants, so a lag is interpolated between
     the lags of the bank, which is common to all units; a lag of 0 s has the value 0. A lag of two

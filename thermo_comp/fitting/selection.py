@@ -207,7 +207,7 @@ class Growth:
         return chosen
 
     def trials(self, chosen: Trial, groups: Sequence[str]) -> list[Trial]:
-        """Fit the chosen model plus groups of columns: up to 4 choices with large gains."""
+        """Fit the chosen model plus a set of groups, for each of up to 4 sets with large gains."""
         absent = [group for group in groups if group in self.free and group not in chosen.groups]
         if not absent:
             return []

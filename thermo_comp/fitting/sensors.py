@@ -262,7 +262,7 @@ def averaged(
     Average readings over steps of time if there are at least two per step, as from IMU drivers.
 
     Return the bag with mean readings, and the settings with the noise of a mean reading.
-    `inputs`: the thermometers, the board's first; all others have the settings of the case's.
+    `inputs`: the thermometers, first that of the board; the others have the settings of the case.
     """
     temperatures = {**bag.temperatures}
     settings = [detector.board, detector.case]
