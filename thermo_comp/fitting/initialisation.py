@@ -346,7 +346,7 @@ def _typical_slopes(steepness: float, steepest: Floats, gravity: float) -> Float
 
 
 def _steepness(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool) -> float:
-    """Return the RMS slope of the readings over temperature, as of the bias [m/s^2 per K]."""
+    """Return the RMS change of a reading per kelvin, attributed to the bias [m/s^2 per K]."""
     data, start = windows.data, problem.start
     within = within_positions(data.mean / start.scale, data.position)
     drift = float(np.sqrt(np.mean(within**2, axis=0)).max())

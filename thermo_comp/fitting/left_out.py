@@ -122,7 +122,7 @@ class Score:
         determine the drift, without its section
     halves: drift of left-out halves of the test, at temperatures that occur in the other half
     noise: white noise of a window, RMS of the axes [m/s^2]
-    by_thermometer: error of a window due to the board thermometer's steps, RMS of axes [m/s^2]
+    by_thermometer: error of a window due to a coarse board thermometer, RMS of the axes [m/s^2]
     settled: expected error of the bias at settled temperatures [m/s^2] (`settled_error`), or 0
     """
 

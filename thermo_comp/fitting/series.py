@@ -51,7 +51,7 @@ class Whitener:
         self._n = len(position)
         since = np.diff(time[self._row], axis=0, prepend=time[self._row[:1]])
         self._interval = interval = np.where(self._is_there, since, 0.0)
-        #: Correlation times to try [s]: 3 windows to a sixth of a position, by half a decade.
+        #: Correlation times to try [s]: half decades from 3 windows to a sixth of a position.
         self.times_s: list[float] = []
         span_s = float(np.median(interval.sum(axis=0)))
         typical_s = float(np.median(interval[1:][self._is_there[1:]])) if n_steps > 1 else 1.0
