@@ -70,12 +70,13 @@ def constant_calibration(
             f'an axis ({axes}) reads the same in all positions: the axis is dead, or the unit was '
             'never turned about another axis'
         )
-    # Half the readings' range is below 1 g if no axis was held up and down: try 1.3 times it, too.
+    # If no axis was held both up and down, half the range of the readings is below 1 g. The fit
+    # therefore also begins from a scale factor 1.3 times as large.
     scales = (float(np.max(half)) * spread / gravity for spread in (1.0, 1.3))
     starts = (np.where(half * 4.0 > np.max(half), scale, half / gravity) for scale in scales)
     tried = (_refine(means, gravity, bias, scale, misalignment_sd) for scale in starts)
     calibration, rms = min(tried, key=lambda fitted: fitted[1])
-    # Readings that lie on no ellipsoid may fit a large ellipsoid with a far centre: refuse it.
+    # Readings that lie on no ellipsoid may fit a large ellipsoid with a far centre: refuse this.
     is_around = np.all(np.abs(calibration.bias - bias) < 2.0 * np.max(half))
     if not (is_around and rms < largest_rms):
         raise FitError(
@@ -135,18 +136,18 @@ def block_means(values: Floats, weight: Floats, first: Ints) -> Floats:
 
 def white_noise_of(windows: Windows, scale: Floats) -> Floats:
     """
-    Return the white noise of a window on each axis [m/s^2], shape (3,), from second differences,
-    which do not depend on a linear drift; 0 if no position has three windows.
+    Return the sd of the white noise of a window's mean on each axis [m/s^2], shape (3,), from
+    second differences, which contain no linear drift; 0 if no position has three windows.
 
-    In fast ramps second differences contain a part of the drift. If the noise from fourth or sixth
-    differences is below 70 % of the noise from second differences, the smallest noise is used.
+    In fast ramps second differences contain a part of the drift. If fourth or sixth differences
+    give less than 70 % of the noise that second differences give, the smallest noise is used.
     """
     position, noises = windows.position, []
     for order in (2, 4, 6):
-        bend = np.diff(windows.mean / scale, n=order, axis=0)
+        differences = np.diff(windows.mean / scale, n=order, axis=0)
         is_within = position[order:] == position[:-order]
         if is_within.any():
-            size = np.median(np.abs(bend[is_within]), axis=0)
+            size = np.median(np.abs(differences[is_within]), axis=0)
             noises.append(size / (0.6745 * np.sqrt(comb(2 * order, order))))
     if not noises:
         return np.zeros(3)
@@ -156,8 +157,8 @@ def white_noise_of(windows: Windows, scale: Floats) -> Floats:
 
 def thermometer_error_of(windows: Windows, scale: Floats, *, beyond_noise: bool = False) -> Floats:
     """
-    Return the error of a window on each axis due to the error of the board temperature [m/s^2],
-    (3,): the sd of the temperature times the slope, within positions, of samples over temperature.
+    Return the sd of a window's error on each axis due to errors of the board temperature [m/s^2],
+    shape (3,): sd of the temperature times slope of the samples over temperature in a position.
 
     `beyond_noise`: subtract the variance of a reading's noise from that of the temperature; the
     remaining error is due to coarse steps of the readings, or to long intervals between readings

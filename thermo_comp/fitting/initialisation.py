@@ -45,9 +45,9 @@ class Problem:
     The input of a fit besides the windows.
 
     start: initial bias, scale and misalignment, without effects of temperature
-    up: directions of the positions, shape (n_positions, 3)
-    is_by_settled: whether models must not increase the expected bias error at settled temperatures
-    has_pieces: whether the positions are pieces of rests, of about an hour (`refit_checks`)
+    up: attitudes of the positions, upward unit vectors, shape (n_positions, 3)
+    is_by_settled: whether the selection refuses a model with a larger `left_out.settled_error`
+    has_pieces: whether each position is a piece, of about an hour, of a rest (`refit_checks`)
     """
 
     bags: Sequence[ReducedBag]
@@ -68,9 +68,9 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     """
     Fit the windows, with or without a prior calibration.
 
-    Without a prior, if the positions are whole rests and temperature changes more between than
-    within positions, the curve is fitted twice: to the means of the positions, and to all
-    windows. The fit to the means is returned unless the other fit is better on left-out data.
+    Without a prior, if the positions are whole rests, and the temperature changes more from one
+    position to the next than within a position, there are two fits: one to the means of the
+    positions, one to all windows. The second fit is returned if it is better on left-out data.
     """
     if problem.options.prior is not None:
         return _regress(windows, problem)
@@ -88,20 +88,21 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     # Both regressions report progress from 0.7 to 0.95: map each to its half of this range.
     first = replace(problem, progress=lambda part: problem.progress(0.35 + 0.5 * part))
     second = replace(problem, progress=lambda part: problem.progress(0.475 + 0.5 * part))
-    fit, of_drifts = _regress(at_rest, first, is_at_rest=True), _regress(windows, second)
-    if not is_better(fit.selected.score, of_drifts.selected.score):
-        return fit
-    has_curve = any(trial.is_chosen and CURVE in trial.groups for trial in fit.selected.trials)
-    if not has_curve or not rests.is_constant(windows, windows.data.bag):
-        return of_drifts
-    return of_drifts._replace(of_means=fit.posterior.state)
+    of_means, fit = _regress(at_rest, first, is_at_rest=True), _regress(windows, second)
+    if not is_better(of_means.selected.score, fit.selected.score):
+        return of_means
+    trials = of_means.selected.trials
+    has_curve = any(trial.is_chosen and CURVE in trial.groups for trial in trials)
+    if has_curve and rests.is_constant(windows, windows.data.bag):
+        return fit._replace(of_means=of_means.posterior.state)
+    return fit
 
 
 def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = False) -> Fit:
     """Fit the windows; `is_at_rest`: whether the columns are set constant in each position."""
     data, options, start = windows.data, problem.options, problem.start
     earlier, n_directions = options.prior, problem.n_directions
-    # With a prior calibration, drifts in one heated attitude do separate bias and scale.
+    # With a prior calibration, the drifts in one heated attitude separate bias and scale.
     is_bench = earlier is None and rests.is_bench(windows, problem.up)
     has_poses = n_directions < POSITIONS_NEEDED and rests.is_constant(windows, data.position)
     if (has_poses or n_directions == 1) and earlier is None and data.forces is None:
@@ -117,7 +118,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     state = initial_state(regression, start, problem.up)
     prior = _initial_prior(windows, problem)
     if n_directions >= POSITIONS_NEEDED and not data.has_turn_ons:
-        # Turn-on offsets are no unknowns here, and M would explain them: reduce the prior sd of M.
+        # The fit has no turn-on offsets, so M would explain them: reduce the prior sd of M.
         prior = _with_faces(prior, problem.up)
     steepness = _steepness(windows, problem, is_at_rest=is_at_rest)
     candidates = _candidates(windows, problem, steepness, is_bench=is_bench)
@@ -154,8 +155,8 @@ def _selected(
     progress: Callable[[float], None],
 ) -> Selected:
     """
-    Select the model. If `_with_faces` has reduced the misalignment sd, also select the model with
-    the sensor's sd, and choose between both models as between initial sds of mounting offsets.
+    Select the model. If `_with_faces` reduced the prior sd of the misalignment, also select one
+    with the larger sd, and choose between both by `better_start`.
     """
     selected = select(regression, state, prior, candidates, progress)
     if not prior.unseen_misalignment_sd:
@@ -173,14 +174,14 @@ def _updating_priors(
     prior: Prior,
 ) -> tuple[Prior, list[InformativePrior]]:
     """
-    Return `prior` with the prior calibration's constants and weights, for the largest amount of
-    ageing; and the informative priors for smaller amounts of ageing.
+    Return `prior` with the informative prior, from the calibration `earlier`, for the largest
+    amount of ageing; and the informative priors for smaller amounts of ageing.
     """
     data, noise = regression.windows, _noise_in_1_hz(windows, regression.nominal_scale)
     *others, widest = informative_priors(
         earlier, regression, state, windows.model, options, LARGE_OFFSETS * _mounting_scale(noise)
     )
-    # Few windows may be fitted exactly: assume at least half of the prior calibration's noise.
+    # A fit of few windows may have no residual: assume at least half of the calibration's noise.
     window_s = windows.typical_count * earlier.unit.cycle_time_s
     least_sigma = 0.5 * float(np.min(earlier.noise_density_m_s2_sqrt_hz)) / window_s**0.5
     prior = replace(
@@ -209,7 +210,7 @@ def _initial_prior(windows: ThermalWindows, problem: Problem) -> Prior:
     """Return the prior of the constants and of the noises, without columns."""
     data, start, options = windows.data, problem.start, problem.options
     drift = within_positions(data.mean / start.scale, data.position)
-    # Smallest initial sd of mounting offsets, and of white noise: 1 ug [m/s^2].
+    # Smallest initial sd of mounting offsets, and of white noise [m/s^2]: 1 ug.
     small_sd = 1e-5
     sigma = max(float(np.sqrt(np.mean(drift**2))), small_sd)
     noise = _noise_in_1_hz(windows, start.scale)
@@ -218,14 +219,11 @@ def _initial_prior(windows: ThermalWindows, problem: Problem) -> Prior:
     rounding_sd = float(np.sqrt(np.mean(np.square(roundings))))
     misalignment_sd = misalignment_scale(noise)
     prior = Prior(
-        bias_sd=np.full(3, BIAS_SD),
-        scale_sd=SCALE_SD,
         misalignment_sd=misalignment_sd,
         column_sd=np.zeros((2, len(data.groups))),
         offset_sd=max(small_sd, rounding_sd),
         sigma=np.full(3, sigma),
-        # The three axes of a sensor have similar scale factors: the prior mean of each axis is the
-        # geometric mean of the three.
+        # The axes of a sensor have similar scale factors: the prior mean is their geometric mean.
         scale_mean=np.exp(np.mean(np.log(start.scale))) / start.scale,
         offset_scale=max(_mounting_scale(noise), 3.0 * rounding_sd),
         misalignment_scale=misalignment_sd,
@@ -246,12 +244,12 @@ def _with_faces(prior: Prior, up: Floats) -> Prior:
     """
     by_element = up[:, [1, 2, 2]] * up[:, [0, 0, 1]]
     # Reduced sd of an element of M [rad]: the cross-axis sensitivity of good consumer MEMS.
-    of_faces, sd = 2.5e-3, prior.misalignment_scale
-    # The RMS product of two components of `up` is below 0.1 if the vertical is near the axes, and
-    # 0.3 if the vertical is between two axes.
-    if float(np.sqrt(np.mean(by_element**2))) >= 0.1 or sd <= of_faces:
+    reduced_sd, sd = 2.5e-3, prior.misalignment_scale
+    # The RMS product of two components of `up` is below 0.1 if an axis is near the vertical in all
+    # positions, and 0.3 if the vertical is in the middle between two axes.
+    if float(np.sqrt(np.mean(by_element**2))) >= 0.1 or sd <= reduced_sd:
         return prior
-    return replace(prior, misalignment_sd=of_faces, unseen_misalignment_sd=sd)
+    return replace(prior, misalignment_sd=reduced_sd, unseen_misalignment_sd=sd)
 
 
 def _narrowed(prior: Prior, regression: Regression, state: State) -> Prior:
@@ -263,8 +261,8 @@ def _narrowed(prior: Prior, regression: Regression, state: State) -> Prior:
     norms = np.linalg.norm(position_means(regression.windows) / regression.nominal_scale, axis=1)
     limit = 5.0 * float(np.abs(norms - regression.norms(state)).max())
     ratios = limit / BIAS_SD, limit / regression.gravity / SCALE_SD
-    bias, scale = np.clip(ratios, 0.05, 1.0).tolist()
-    return replace(prior, bias_sd=bias * prior.bias_sd, scale_sd=scale * prior.scale_sd)
+    by_bias, by_scale = np.clip(ratios, 0.05, 1.0).tolist()
+    return replace(prior, bias_sd=by_bias * prior.bias_sd, scale_sd=by_scale * prior.scale_sd)
 
 
 def _is_slow(windows: ThermalWindows) -> Bools:
@@ -279,8 +277,9 @@ def _is_slow(windows: ThermalWindows) -> Bools:
 
 
 def _noise_in_1_hz(windows: ThermalWindows, scale: Floats) -> float:
-    """Return the samples' noise in a 1 Hz bandwidth [m/s^2], median of axes; 0 if unknown."""
-    data, inner = windows.data, windows.data.inner
+    """Return the sd of the noise in a 1 Hz bandwidth [m/s^2], median of axes; 0 if unknown."""
+    data = windows.data
+    inner = np.flatnonzero(data.position[2:] == data.position[:-2])
     if not len(inner):
         return 0.0
     step_s = np.median(np.diff(data.time)[inner])
@@ -319,8 +318,7 @@ def _candidates(
         fixed[1] = parts[1] & np.isin(groups, (CURVE, PART))
     forced = np.isin(groups, options.forced)
     if options.model == 'golovach':
-        # All columns of both sets of Golovach's paper are kept, with ten times the largest prior
-        # sd of a slope, which is almost a flat prior.
+        # Keep all columns of Golovach's model, with a nearly flat prior: 10 times the largest sd.
         slopes, forced, fixed = 10.0 * STEEPEST, np.ones_like(forced), np.ones_like(fixed)
     typical, largest = (np.outer(sd, data.kelvins) * parts for sd in (slopes, steepest))
     if not windows.was_measured:
@@ -332,9 +330,8 @@ def _candidates(
 
 def _steepest(n_directions: int) -> Floats:
     """Return the largest prior sd of slopes of bias and scale, given the number of attitudes."""
-    # For two to eight attitudes the prior sd of the scale factor's slope is halved. A drift of a
-    # nearly level axis is more often a tilt of the support than a slope of the scale factor, which
-    # would have to be several hundred ppm/K.
+    # For two to eight attitudes the prior sd of the scale factor's slope is halved. The drift of a
+    # nearly level axis is more often a tilt of the support than a slope of several hundred ppm/K.
     is_few = 1 < n_directions < POSITIONS_FOR_MISALIGNMENT
     return STEEPEST * (1.0, 0.5 if is_few else 1.0)
 
@@ -364,8 +361,8 @@ def _steepness(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool) -
         powers = np.vander(sizes / sizes.max(), 4)
         errors -= powers @ np.linalg.lstsq(powers, errors, rcond=None)[0]
     if is_at_rest:
-        # Divide the RMS error of |f| by the RMS error of |f| that slopes of bias and scale of size
-        # 1 would cause, both without the part that a constant bias and scale explain.
+        # Divide the sd of the errors of |f| by the RMS error of |f| that slopes of bias and scale
+        # of size 1 would cause, less the part that a constant bias and scale explain.
         constants = norm_columns(force / norms[:, None])[:, :6]
         celsius = windows.temperature[data.edges[:-1]]
         of_slopes = (celsius - celsius.mean())[:, None] * constants
@@ -382,7 +379,7 @@ def sizes_of(windows: ThermalWindows, options: FitOptions) -> Floats:
 
 
 def initial_triad(windows: ThermalWindows, options: FitOptions) -> ConstantCalibration:
-    """Fit constant bias, scale and M; in few attitudes only one scale (for m/s^2 input: 1)."""
+    """Fit constant bias, scale and M; with few attitudes, one scale (1 if input is in m/s^2)."""
     means, gravity = position_means(windows.data), sizes_of(windows, options)
     norms = np.linalg.norm(means, axis=1)
     if not norms.all() or (len(means) > 1 and not means.any(axis=0).all()):

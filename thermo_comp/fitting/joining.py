@@ -28,7 +28,7 @@ def joined(bags: Sequence[ReducedBag]) -> list[ReducedBag]:
     for bag in sorted(bags, key=lambda bag: bag.start_ns):
         before = [recording for recording in recordings if _continues(recording[-1], bag)]
         if before:
-            # Simulated recordings may end at one stamp: choose by the change of the readings.
+            # Several simulated recordings may end here: take that of the smallest step.
             min(before, key=lambda recording: _step(recording[-1], bag)).append(bag)
         else:
             recordings.append([bag])
@@ -45,9 +45,9 @@ def _continues(part: ReducedBag, bag: ReducedBag) -> bool:
     is_at_1g = bag.source.force is None and part.source.force is None
     is_of_unit = bag.source.serial == part.source.serial
     # Parts overlap by at most 3 s, and by at most a tenth of a part; recordings whose stamps begin
-    # at 0 overlap more. The gap between parts is at most 60 s, to turn the unit and restart the
-    # recorder, or two sample intervals if longer. If the unit is switched off and on in the gap,
-    # the fit takes the offset of each turn-on for an offset of a mounting.
+    # at 0 overlap more. The gap between parts, in which the unit is turned and the recorder is
+    # restarted, is at most 60 s or, if longer, two sample intervals. If the unit is switched off
+    # and on in the gap, the fit takes the offset of each turn-on for an offset of a mounting.
     overlap_s = min(3.0, 1e-10 * (part.end_ns - part.start_ns))
     is_next = -overlap_s < gap_s < max(60.0, 2.0 * bag.cycle_s)
     return bool(is_next and is_alike and is_at_1g and is_of_unit)
@@ -116,7 +116,7 @@ def _intervals(parts: Sequence[ReducedBag]) -> tuple[StillInterval, ...]:
         shift_s = 1e-9 * (part.start_ns - parts[0].start_ns)
         is_alike = abs(part.window_s - parts[0].window_s) < 0.01 * parts[0].window_s
         for number, rest in enumerate(part.intervals):
-            # Windows count as whole only if within 1 % as long as windows of the first part.
+            # Windows count as whole if their length is within 1 % of that in the first part.
             n_whole = rest.n_whole if is_alike else 0
             shifted = replace(rest, time=rest.time + shift_s, n_whole=n_whole)
             is_first = bool(result) and number == 0
@@ -129,10 +129,10 @@ def _intervals(parts: Sequence[ReducedBag]) -> tuple[StillInterval, ...]:
 
 def _is_one_rest(before: StillInterval, after: StillInterval, window_s: float) -> bool:
     """
-    Whether a rest continues in the next part: the gap between the parts is at most three windows
-    long, and on each axis the step over the gap is at most five times the RMS, or twice the
-    largest (most may be 0 by rounding), of the steps between successive windows, up to 20 windows
-    on each side of the gap. With fewer than 10 steps between windows the result is False.
+    Whether a rest continues in the next part: the gap is at most three windows long, and on each
+    axis the step over the gap is at most five times the RMS of the steps between successive
+    windows or, as rounding may set most steps to 0, twice the largest of these steps. Up to 20
+    windows on each side of the gap are used; with fewer than 10 steps the result is False.
     """
     gap_s = 1e-9 * (after.start_ns - before.end_ns)
     means = before.mean[: before.n_whole][-20:], after.mean[:20]

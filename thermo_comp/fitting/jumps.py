@@ -6,15 +6,14 @@ Owns the detection of jumps: steps in the reading of an accelerometer at rest.
 The reading of a sensor can step within one sample, if a die relaxes or a piece slips. The
 temperature does not step, so no function of temperature describes a jump, and a fit to data across
 a jump gives a wrong curve. A jump differs from a rotation of the unit in two ways: the samples
-before and after a jump scatter no more than at rest; and either the norm of the reading, which is
-almost constant in a rotation, changes, or a gyroscope measures no rotation during the jump. A
-steep curve over temperature changes the reading more slowly than a jump.
+before and after a jump scatter no more than at rest; and either the norm of the reading changes
+(in a rotation it is almost constant), or a gyroscope measures no rotation during the jump. A steep
+curve over temperature changes the reading more slowly than a jump.
 
 If a sensor has a low-pass filter, neighbouring samples have a correlation r, and the slow noise of
 the samples hides a step. The noise of the differences ``a_i - r a_(i-1)`` is white (generalised
-least squares for first-order noise), so a step within one sample is significant in these
-differences. A decaying shock is as significant as a step, so for a jump the mean levels of the
-quiet samples before and after the step must differ, too.
+least squares for first-order noise), so a step within one sample is significant in them. As a
+decaying shock is significant, too, the mean levels before and after a jump must also differ.
 """
 
 from __future__ import annotations
@@ -33,8 +32,7 @@ from .sources import angular_velocity
 _MARGIN_S = 10.0
 # Smallest number of samples before a step, and after it, for a test of the step.
 _FEWEST_SAMPLES = 8
-# Smallest significant ratio of a step to its sd. Steps fitted to noise alone, at all possible
-# times, reach a ratio of about 5.
+# Smallest significant ratio of a step to its sd; noise alone gives ratios of up to about 5.
 _STEP_SDS = 8.0
 
 
@@ -105,11 +103,11 @@ def _beside_gaps(
 
 
 def _margin(samples: Floats, quiet_sd: Floats) -> float:
-    """Return how long [s] to average beside a gap: 60 time constants of the noise, 10 to 100 s."""
+    """Return the time [s] to average beside a gap: 60 correlation times of noise, in 10..100 s."""
     time, accel = samples[:, 0], samples[:, 1:4]
     if len(time) < 2 * _FEWEST_SAMPLES:
         return _MARGIN_S
-    _, r = _place_and_colour(time, accel, quiet_sd)
+    _, r = _place_and_correlation(time, accel, quiet_sd)
     tau = -float(np.median(np.diff(time))) / np.log(r) if r else 0.0
     return float(np.clip(60.0 * tau, _MARGIN_S, 100.0))
 
@@ -124,19 +122,19 @@ def _examine(
     if min(before.sum(), after.sum()) < _FEWEST_SAMPLES:
         return None
     beside = before | after
-    at, r = _place_and_colour(time, accel, quiet_sd)
+    at, r = _place_and_correlation(time, accel, quiet_sd)
+    # The change of the mean level from before to after the gap, without the samples in the gap.
     lasting, relative_sd, residual = _step(time[beside], accel[beside], time[at])
     # The step is the difference of two mean levels, each with an error of rounding.
     by_rounding = 2.0**0.5 * rounding_sd
-    lasting_sd = np.hypot(quiet_sd * relative_sd * _correlation(residual, quiet_sd), by_rounding)
+    lasting_sd = np.hypot(quiet_sd * relative_sd * _sd_growth(residual, quiet_sd), by_rounding)
     step, relative_sd, residual = _step(time, accel, time[at], r)
     # The scatter within half a second underestimates the noise of means if noise is correlated.
     sd = np.sqrt(np.mean(residual**2, axis=0)) if r else quiet_sd
-    step_sd = np.hypot(sd * relative_sd * _correlation(residual, sd), by_rounding)
+    step_sd = np.hypot(sd * relative_sd * _sd_growth(residual, sd), by_rounding)
     if r:
         is_step = np.abs(step) > _STEP_SDS * step_sd
-        # The change of the mean level must be at least half of the step within one sample, and
-        # exceed 4 sd of this change.
+        # The change of the mean level must exceed half of the step in one sample, and 4 of its sd.
         is_step &= lasting * np.sign(step) > 0.5 * np.abs(step)
         is_step &= np.abs(lasting) > 4.0 * lasting_sd
     else:
@@ -160,19 +158,19 @@ def _examine(
     # If someone handled the unit, the samples scatter by far more than twice the quiet noise.
     if not is_no_turn or np.any(spread > 2.0 * quiet_sd):
         return None
-    (x, y, z), warmed = step.tolist(), _temperature_step(bag, time[0], time[at], time[-1])
-    return Jump(float(time[at]), float(time[at] - time[at - 1]), (x, y, z), along, *warmed)
+    (x, y, z), of_board = step.tolist(), _temperature_step(bag, time[0], time[at], time[-1])
+    return Jump(float(time[at]), float(time[at] - time[at - 1]), (x, y, z), along, *of_board)
 
 
 def _is_gradual(
-    time: Floats, accel: Floats, place_and_colour: tuple[int, float], sd: Floats, bag: ReducedBag
+    time: Floats, accel: Floats, step: tuple[int, float], sd: Floats, bag: ReducedBag
 ) -> bool:
     """
-    Whether a change over 0.1 K or more of the board temperature explains the samples better than a
-    step: by a factor of e^2 in likelihood. In a ramp a steep curve over temperature changes the
-    bias gradually, without a step.
+    Whether a linear change while the board temperature changes by 0.1 K or more explains the
+    samples better than a step, by a factor of e^2 in likelihood. In a ramp a steep curve over
+    temperature changes the bias gradually. `step`: the result of `_place_and_correlation`
     """
-    (at, r), sd = place_and_colour, np.maximum(sd, 1e-9)
+    (at, r), sd = step, np.maximum(sd, 1e-9)
     board_s, board = _readings(bag, time[0], time[-1])
     if len(board) < _FEWEST_SAMPLES:
         return False
@@ -188,8 +186,8 @@ def _is_gradual(
     return bool(min(chi2, default=np.inf) < of_step - 4.0)
 
 
-def _correlation(residual: Floats, sd: Floats) -> Floats:
-    """Return sd of the mean of `residual` / its sd for white noise of sd `sd`, >= 1, (3,)."""
+def _sd_growth(residual: Floats, sd: Floats) -> Floats:
+    """Return the sd of the mean of `residual`, divided by that of white noise of sd `sd`, (3,)."""
     # A lag-1 correlation r of the means of 40 pieces multiplies the variance of the mean of all
     # pieces by (1 + r) / (1 - r).
     size = max(len(residual) // 40, 1)
@@ -218,7 +216,7 @@ def _readings(bag: ReducedBag, begin: float, end: float) -> tuple[Floats, Floats
     return time[use], np.asarray(bag.board.value[use], dtype=np.float64)
 
 
-def _place_and_colour(time: Floats, accel: Floats, quiet_sd: Floats) -> tuple[int, float]:
+def _place_and_correlation(time: Floats, accel: Floats, quiet_sd: Floats) -> tuple[int, float]:
     """
     Find the first sample after a step, and the lag-1 correlation of the noise.
 
@@ -270,8 +268,8 @@ def _step(
     time: Floats, values: Floats, at: float, r: float = 0.0, duration_s: float = 0.0
 ) -> tuple[Floats, float, Floats]:
     """
-    Fit a step, or a change over `duration_s` about `at`, and a linear drift; return the step, its
-    sd in noise sds, residuals (n, k).
+    Fit a step at the time `at`, or a linear change over `duration_s` about `at`, and a linear
+    drift; return the step, its sd divided by that of the noise, and the residuals (n, k).
     """
     trend = _trend(time, r)
     part = np.clip((time - at) / duration_s + 0.5, 0.0, 1.0) if duration_s else time >= at
@@ -291,6 +289,6 @@ def _trend(time: Floats, r: float) -> Floats:
 
 def _turn(time: Floats, gyro: Floats, at: int) -> float:
     """Return the rotation within 1 s of a step [rad], by rates less their median on each side."""
-    about_level = [side - np.median(side, axis=0) for side in (gyro[:at], gyro[at:])]
-    angles = np.concatenate(about_level)[1:] * np.diff(time)[:, None]
+    rates = [side - np.median(side, axis=0) for side in (gyro[:at], gyro[at:])]
+    angles = np.concatenate(rates)[1:] * np.diff(time)[:, None]
     return float(np.linalg.norm(angles[np.abs(time[1:] - time[at]) <= 1.0].sum(axis=0)))

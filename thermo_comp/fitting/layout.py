@@ -74,8 +74,8 @@ class Layout:
     @cached_property
     def columns(self) -> Ints:
         """
-        Indices of the columns of a position's equations (for unknowns of the position, its bag and
-        the unit, and for the residual) in the order of `Tangent`, for each axis, shape (3, k).
+        Indices of the columns of a position's equations that belong to each axis, in the order of
+        `Tangent`: unknowns of the position, of its bag and of the unit, residual; shape (3, k).
         """
         n_own, r = self.own.shape[1], self.start.shape[1]
         starts = np.tile(n_own + np.arange(r), (3, 1))
@@ -85,7 +85,7 @@ class Layout:
 
     @cached_property
     def unit(self) -> Ints:
-        """Indices of the unknowns of the unit and, the last, of the residual, by axis, (3, k)."""
+        """Indices, by axis, of the unknowns of the unit; the last is the residual's, (3, k)."""
         common = np.append(self.shared, self.n_unit)
         return np.hstack((self.axis, np.tile(common, (3, 1))))
 
@@ -113,8 +113,8 @@ class Layout:
 
     def by_weights(self, columns: Floats, force: Floats) -> Iterator[tuple[Floats, Ints]]:
         """
-        Yield, for each axis, the derivatives of readings w.r.t. the active weights, and indices of
-        these weights; `columns`: shape (n, m); `force` along the axes: shape (n, 3) or (3,).
+        Yield, for each axis, the derivatives of the readings w.r.t. the active weights, and the
+        indices of these weights; `columns`: (n, m); `force` along the axes: (n, 3) or (3,).
         """
         in_bias, in_scale = self.used
         for axis in range(3):
@@ -133,8 +133,8 @@ def lay_out(
     forces: Forces | None,
 ) -> Layout:
     """
-    Assign an index to every unknown, given the active columns of bias and scale, shape (2, m), and
-    the active nonlinear coefficients, shape (2 k,).
+    Assign an index to every unknown; `used`: active columns of bias and scale, shape (2, m);
+    `active`: active nonlinear coefficients, shape (2 k,).
     """
     n = 0
 
@@ -177,10 +177,10 @@ class Normal(NamedTuple):
     """
     Normal equations of each axis without the prior; the order of unknowns is that of `Tangent`.
 
-    local: products of the derivatives w.r.t. the unknowns of positions and bags with all
+    local: products of the derivatives w.r.t. the unknowns of a position and its bag with all
         derivatives and the residual, shape (n_positions, 3, n_local, k + 1)
-    unit: products of the derivatives w.r.t. the unknowns of the unit, and of the residual, with
-        each other, summed over the positions, shape (3, n, n)
+    unit: sums, over the positions, of the products of the derivatives w.r.t. the unknowns of the
+        unit, and of the residual, with each other, shape (3, n, n)
     """
 
     local: Floats
@@ -204,10 +204,10 @@ class Tangent:
     The derivative of the readings w.r.t. an unknown is a factor times a base series, or times one
     of the combinations `combined` of base series. For axis i, position p and unknown u the
     derivative is ``factor[p, i, u]`` times series ``place[u]``: a base series or, from index
-    n_base on, one of `combined`. The unknowns of an axis, in this order, are those of the position
-    (2 of the attitude, stretch, offset, tilts), then those of the bag (initial lag states, turn-on
-    offset), then those of the unit (kappa, bias, weights, nonlinear coefficients, radius, 3 of the
-    misalignment, 2 of each pose). The last element is for the residual, measured minus predicted.
+    n_base on, one of `combined`. The order of the unknowns of an axis is: those of the position
+    (2 of the attitude, stretch, offset, tilts), of the bag (initial lag states, turn-on offset),
+    and of the unit (kappa, bias, weights, nonlinear coefficients, radius, 3 of the misalignment, 2
+    of each pose). The last element is for the residual, measured minus predicted.
 
     combined: the combinations of base series, shape (n_positions, 3, n_base, n_combined)
     place: index of the series of each unknown, shape (k + 1,)
@@ -270,8 +270,7 @@ class Tangent:
     def of(self, rows: Floats) -> Floats:
         """
         Return the derivatives of m linear functions of the readings, such as the mean, shape
-        (n_positions, 3, m, k + 1). `rows`: values of the functions for each base series, shape
-        (n_positions, m, n_base)
+        (n_positions, 3, m, k + 1); `rows`: the functions of base series, (n_positions, m, n_base).
         """
         combined = rows[:, None] @ self.combined
         of_base = np.broadcast_to(rows[:, None], (*combined.shape[:3], rows.shape[2]))

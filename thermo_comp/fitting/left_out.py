@@ -34,6 +34,7 @@ import numpy as np
 from ..typing import Floats, Ints
 from .elimination import inverse_root
 from .initial_triad import thermometer_error_of, white_noise_of
+from .layout import Layout
 from .regression import Point, PosteriorMode, Regression
 
 # Smallest number of windows of a position for a score of the position's drift.
@@ -81,16 +82,14 @@ class Folds:
         that are scored for both models; None without such folds.
 
         The result is the more significant of two estimates of the log ratio, or 0 if their signs
-        differ: the mean over the folds, which few folds of large errors hardly change; and the log
-        ratio of sums of squares (jackknife error), which folds of small errors hardly change.
+        differ. The mean over the folds depends little on a few folds of large errors; the log
+        ratio of sums of squares (with a jackknife error) depends little on folds of small errors.
         """
         is_scored = np.isfinite(self.square) & np.isfinite(other.square)
         n = int(is_scored.sum())
         if not n:
             return None
-        before, after = (
-            (folds.square * folds.windows)[is_scored] + 1e-300 for folds in (self, other)
-        )
+        before, after = ((f.square * f.windows)[is_scored] + 1e-300 for f in (self, other))
         of_sums = float(np.log(before.sum() / after.sum()))
         if n == 1:
             # One fold gives no standard error: return the largest log ratio that counts as equal.
@@ -118,10 +117,9 @@ class Score:
 
     positions, sections: drift of left-out positions, and of left-out sections of the test
     norms: ``|f| - g`` of left-out positions in which the other positions determine |f|
-    force: force in each window, corrected by a fit without the window's position; NaN if |f| of
-        this position is not scored, shape (n, 3)
-    drift: drift of each window by a fit without its position or, if that fit does not determine
-        the drift, without its section, shape (n, 3)
+    force: force in each window by a fit without its position, (n, 3); NaN if |f| is not scored
+    drift: drift of each window, (n, 3), by a fit without its position or, if that fit does not
+        determine the drift, without its section
     halves: drift of left-out halves of the test, at temperatures that occur in the other half
     noise: white noise of a window, RMS of the axes [m/s^2]
     by_thermometer: error of a window due to a coarse board thermometer, RMS of the axes [m/s^2]
@@ -176,18 +174,18 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
 
     The gain is the sum of the log ratios (`Folds.gain_of`) of the drift of positions and of
     sections. If the drifts of both models agree to 5 %, the gain is the log ratio of the errors of
-    left-out |f|, if this ratio exceeds two standard errors. `by_halves`: whether larger errors of
-    left-out halves of the chamber program, a sign of too many columns, exclude a gain. Larger
-    errors of left-out |f| exclude a gain; so does a larger expected error of the bias at settled
-    temperatures, unless noise explains the drift. A drift that noise explains need not
-    decrease for a gain, because the drift of left-out soaks contains no effects of ramps.
+    left-out |f|, if this ratio exceeds two standard errors. There is no gain if `after` has a
+    larger error of left-out |f|; of the bias at settled temperatures, as expected, unless noise
+    explains the drift; or, with `by_halves`, of left-out halves of the program, a sign of too many
+    columns. A drift that noise explains need not decrease for a gain, because the drift of
+    left-out soaks contains no effects of ramps.
     """
     *drifts, norms = _beyond_thermometer(before, after)
-    drift = [gain for gain in drifts if gain]
-    must_gain = [
-        gain
-        for gain, first, second in zip(drifts, before.kinds, after.kinds, strict=False)
-        if gain and (gain[0] > gain[1] or not second.is_noise(first, after.noise))
+    drift = [ratio for ratio in drifts if ratio]
+    must_decrease = [
+        ratio
+        for ratio, first, second in zip(drifts, before.kinds, after.kinds, strict=False)
+        if ratio and (ratio[0] > ratio[1] or not second.is_noise(first, after.noise))
     ]
     # The RMS error of left-out halves may rise by a quarter, which is its usual scatter.
     is_worse_by_halves = by_halves and after.halves.rms > 1.25 * before.halves.rms
@@ -195,25 +193,25 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
         return 0.0
     if after.exceeds_noise and after.settled > before.settled:
         return 0.0
-    total = sum(gain for gain, _ in drift)
-    is_sure = bool(must_gain) and all(gain > error for gain, error in must_gain)
+    total = sum(ratio for ratio, _ in drift)
+    is_sure = bool(must_decrease) and all(ratio > error for ratio, error in must_decrease)
     if is_sure and total > _NEGLIGIBLE_LOG_RATIO * len(drift):
         return total
-    if norms is None or not all(abs(gain) < _NEGLIGIBLE_LOG_RATIO for gain, _ in drift):
+    if norms is None or not all(abs(ratio) < _NEGLIGIBLE_LOG_RATIO for ratio, _ in drift):
         return 0.0
     return norms[0] if norms[0] > max(2.0 * norms[1], _NEGLIGIBLE_LOG_RATIO) else 0.0
 
 
 def is_worse_by_norms(before: Score, after: Score) -> bool:
-    """Whether errors of left-out |f| are larger in `after`, by more than a standard error."""
+    """Whether errors of left-out |f| are larger in `after` by more than a standard error."""
     norms = before.norms.gain_of(after.norms)
     return norms is not None and norms[0] < -norms[1]
 
 
 def is_undecided(before: Score, after: Score) -> bool:
     """
-    Whether left-out data do not decide between two models, of which `after` is not better. The
-    drifts agree to 5 %; errors of |f| are smaller in `after` by more than one standard error, or
+    Whether left-out data do not decide between two models, of which `after` is not better: the
+    drifts agree to 5 %; the errors of |f| are smaller in `after` by more than a standard error, or
     cannot be compared (no fold is scored for both, or a coarse thermometer explains the errors).
     """
     *drift, norms = _beyond_thermometer(before, after)
@@ -230,13 +228,14 @@ def is_near(chosen: Score, other: Score) -> bool:
 def _beyond_thermometer(before: Score, after: Score) -> list[tuple[float, float] | None]:
     """
     Return the log ratio of mean square errors, `before` / `after` (`Folds.gain_of`), for each kind
-    of folds, None if a coarse thermometer explains the errors. Thermometer errors repeat in all
-    bags of one chamber program: a model that fits them is better on left-out bags, but fails in
-    another program.
+    of folds; None if a coarse thermometer explains the errors. Thermometer errors repeat in all
+    bags of one chamber program: a model that fits these errors is better on left-out bags, but
+    fails in another program.
     """
-    is_known = before.norms.rms > _NOISE_RATIO * before.by_thermometer
-    keep = (not before.is_by_thermometer, not before.is_by_thermometer, is_known)
-    return [gain if kept else None for gain, kept in zip(_gains(before, after), keep, strict=True)]
+    is_norm_kept = before.norms.rms > _NOISE_RATIO * before.by_thermometer
+    keep = (not before.is_by_thermometer, not before.is_by_thermometer, is_norm_kept)
+    ratios = _gains(before, after)
+    return [ratio if kept else None for ratio, kept in zip(ratios, keep, strict=True)]
 
 
 def _gains(before: Score, after: Score) -> list[tuple[float, float] | None]:
@@ -271,17 +270,18 @@ def settled_error(
     Return the expected error of the bias after all lags settled [m/s^2]; inf without bias columns.
 
     In bags that all begin at one temperature the lags change together with the board temperature,
-    so the bias after the lags have settled is extrapolated from such bags. The expected error of
-    the settled bias is the root sum of squares of its posterior sd and of ``excess * growth``;
-    `excess`: left-out drift beyond the noise [m/s^2]; growth: ratio of the posterior sd to the sd
-    of the bias in the windows, at least 1. `settled`: columns at settled temperatures, (k, m).
+    so the bias after the lags have settled is extrapolated from such bags. Its expected error is
+    the root sum of squares of its posterior sd and of ``excess * growth``. `excess`: left-out
+    drift beyond the noise [m/s^2]; growth: ratio of this posterior sd to that of the bias in the
+    windows, at least 1. `settled`: columns at settled temperatures, shape (k, m).
     """
     if not posterior.layout.used[0].any():
         return np.inf
     # 500 windows are sufficient to compute the RMS, over the windows, of the bias sd.
     seen = regression.columns[:: max(len(regression.columns) // 500, 1)]
+    layout, root = posterior.layout, posterior.root
     sd, seen_sd = (
-        _sd_of_changes(posterior, columns - columns.mean(axis=0))
+        float(np.sqrt(_variance(layout, columns, np.zeros(3), root) / (3 * len(columns))))
         for columns in (settled / regression.rms, seen)
     )
     # `seen_sd`, the sd of the bias in the windows, is 0 if no column changes in the windows.
@@ -289,17 +289,19 @@ def settled_error(
     return float(np.hypot(sd, excess * growth))
 
 
-def _sd_of_changes(posterior: PosteriorMode, columns: Floats) -> float:
-    """Return the sd of the bias, RMS over the axes and the rows of `columns`, (k, m) [m/s^2]."""
-    parts = posterior.layout.by_weights(columns, np.zeros(3))
-    square = sum(float(np.sum((part @ posterior.root[at]) ** 2)) for part, at in parts)
-    return float(np.sqrt(square / (3 * len(columns))))
+def _variance(layout: Layout, columns: Floats, force: Floats, root: Floats) -> float:
+    """
+    Return the variance of the readings less their mean over k windows, summed over windows and
+    axes; `columns`: (k, m); `force`: along the axes, (3,); `root`: root of the covariance
+    """
+    parts = layout.by_weights(columns - columns.mean(axis=0), force)
+    return sum(float(np.sum((along @ root[at]) ** 2)) for along, at in parts)
 
 
 def _by_positions(
     regression: Regression, posterior: PosteriorMode
 ) -> tuple[Folds, Folds, Floats, Floats]:
-    """Leave out mountings; return errors of drift and of |f|, and force and drift by window."""
+    """Leave out mountings; return `positions`, `norms`, `force` and `drift` of the `Score`."""
     windows, share = regression.windows, regression.weight / regression.windows.weight
     point, edges = regression.at(posterior.state, posterior.prior), windows.edges
     counts = np.diff(edges).astype(np.float64)
@@ -314,11 +316,11 @@ def _by_positions(
         for p in places.tolist():
             rows = slice(edges[p], edges[p + 1])
             corrected, weight = regression.force(state, rows), share[rows]
-            is_known = _is_drift_determined(point, posterior, root, rows)
+            is_known = _determines_drift(point, posterior, root, rows)
             if counts[p] >= _FEWEST_WINDOWS and is_known:
                 drift[rows] = corrected - np.average(corrected, axis=0, weights=weight)
                 squares[p] = np.average(np.mean(drift[rows] ** 2, axis=1), weights=weight)
-            if _is_norm_determined(point, posterior, root, p):
+            if _determines_norm(point, posterior, root, p):
                 force[rows] = corrected
                 error = np.linalg.norm(corrected, axis=1) - sizes[p]
                 norms[p] = np.average(error**2, weights=weight)
@@ -326,35 +328,29 @@ def _by_positions(
     return of_drift, of_norm, force, drift
 
 
-def _is_drift_determined(
-    point: Point, posterior: PosteriorMode, root: Floats, rows: slice
-) -> bool:
+def _determines_drift(point: Point, posterior: PosteriorMode, root: Floats, rows: slice) -> bool:
     """
     Whether the fit without a position, of covariance ``root @ root.T``, determines the drift in
-    `rows`: its variance is below 10 times (variance by the fit of all positions + noise).
+    `rows`: the variance of the drift is below 10 times (variance by the fit to all data + noise).
     """
     regression, sigma = point.regression, point.prior.sigma
     if not point.layout.used[0].any():
         return True
     # Use every k-th window of the position: 50 windows are sufficient for the variance.
     some = regression.columns[rows][:: max((rows.stop - rows.start) // 50, 1)]
-    some = some - some.mean(axis=0)
-    p = regression.windows.position[rows.start]
-    force = regression.along(point.state)[p]
-    by_others = by_all = 0.0
-    for along, at in point.layout.by_weights(some, force):
-        by_others += float(np.sum((along @ root[at]) ** 2))
-        by_all += float(np.sum((along @ posterior.root[at]) ** 2))
+    force = regression.along(point.state)[regression.windows.position[rows.start]]
+    by_others = _variance(point.layout, some, force, root)
+    by_all = _variance(point.layout, some, force, posterior.root)
     noise = float(np.sum(sigma**2)) * len(some)
     return by_others < 10.0 * (by_all + noise)
 
 
-def _is_norm_determined(point: Point, posterior: PosteriorMode, root: Floats, p: int) -> bool:
+def _determines_norm(point: Point, posterior: PosteriorMode, root: Floats, p: int) -> bool:
     """
     Whether the fit without position `p`, of covariance ``root @ root.T``, determines |f| in `p`:
-    the variance of |f| is below 10 times (variance by the fit of all positions + offset variance),
-    or below the variance of usual mounting offsets. In few poses the variance is not compared with
-    that of usual offsets, because there the prior of bias and scale makes it small.
+    the variance of |f| is below 10 times (variance by the fit to all data + offset variance), or
+    below the variance of usual mounting offsets. In few poses only the former counts, because
+    there the prior of bias and scale makes the variance small.
     """
     if not point.regression.gravity:
         return False

@@ -1,12 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the correlation of the columns of two terms in the bags, and the advice which further bag
-would show which of the two terms the unit has.
+Owns the correlation of two terms' columns in the bags, and the advice which bag separates them.
 
-In bags of one environment the board follows the case by one law. A lag of the board temperature is
-then proportional to a lag of the gradient T_case - T_board, and both describe the bags equally
-well. In another environment the ratio of the two lags differs.
+In one environment the board follows the case in the same way in all bags. A lag of the board
+temperature is then proportional to a lag of the gradient T_case - T_board, and both describe the
+bags equally well. In another environment the ratio of the two lags differs.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ _LARGEST_INFLATION = 100.0
 
 
 class _Pair(NamedTuple):
-    """Two terms: group and part of each, their names in messages, and the bag to record."""
+    """The group, the part and the name in messages of two terms; the bag that separates them."""
 
     groups: tuple[str, str]
     parts: tuple[str, str]
@@ -58,8 +57,8 @@ class Likeness:
     The largest correlation of a column of one term with a column of another term, on one axis.
 
     The constants, the curve over temperature and all unknowns of bags and positions are eliminated
-    from the columns first. With both columns in the model, the variance of each weight is
-    `inflation` times the variance with one of the columns.
+    from the columns first. If the model has both columns, the variance of each weight is
+    `inflation` times its variance in a model with one of the columns.
 
     groups, parts: group of columns and part (``bias`` or ``scale``) of each term
     """
@@ -108,10 +107,10 @@ def _likeness(point: Point, groups: NDArray[np.str_], pair: _Pair) -> Likeness |
     root = point.precision[:n] ** -0.5
     # The information about the unknowns, each divided by its prior sd, and the prior itself.
     information = point.reduced.matrix[:n, :n] * np.outer(root, root) + np.eye(n)
-    acts = point.regression.windows.share == 1.0
+    acts = point.regression.windows.share == 1.0  # whether each column acts on an axis, (3, m)
     curve = layout.weights[:, :, groups == CURVE]
     others = np.append(np.setdiff1d(np.arange(n), layout.weights), curve[curve >= 0])
-    found = []
+    result = []
     for axis in range(3):
         terms = []
         for group, part in zip(pair.groups, pair.parts, strict=True):
@@ -125,8 +124,8 @@ def _likeness(point: Point, groups: NDArray[np.str_], pair: _Pair) -> Likeness |
             matrix = information[np.ix_(both, both)] - cross.T @ solved(factor, cross)
             sd = np.sqrt(np.diag(matrix))
             largest = np.abs(matrix[:k, k:] / np.outer(sd[:k], sd[k:])).max()
-            found.append(Likeness(pair.groups, pair.parts, 'xyz'[axis], min(float(largest), 1.0)))
-    return max(found, key=lambda likeness: likeness.correlation, default=None)
+            result.append(Likeness(pair.groups, pair.parts, 'xyz'[axis], min(float(largest), 1.0)))
+    return max(result, key=lambda likeness: likeness.correlation, default=None)
 
 
 def judge_likeness(pairs: Sequence[Likeness], n_directions: int) -> Iterator[Finding]:

@@ -5,7 +5,7 @@ Owns the known |f| of positions that are not at 1 g, and the choice of the nonli
 
 A nonlinear term that the data determine is removed if the term lowers the log evidence by 1 or
 more, or does not decrease the error of left-out |f| by more than a standard error. A term that the
-data do not determine keeps its prior mean and sd approximately.
+data do not determine remains, and keeps approximately its prior mean and sd.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from .thermal_ranges import union
 from .unknowns import State
 from .windows import ThermalWindows
 
-# A coefficient counts as determined by the data if its effective parameters exceed 0.99, that is,
-# if its posterior sd is less than a tenth of its prior sd.
+# The data determine a coefficient if its posterior sd is less than a tenth of its prior sd: if its
+# effective parameters exceed this number.
 _DETERMINED_SHARE = 0.99
 
 _Active = frozenset[int]  # indices of the nonlinear coefficients in use
@@ -41,14 +41,14 @@ _Active = frozenset[int]  # indices of the nonlinear coefficients in use
 @dataclass(frozen=True)
 class Forces:
     """
-    The known magnitude ``|f|^2 = still^2 + spin^2`` of each position, (n_positions,) [m/s^2].
+    The known |f| of each position, ``|f|^2 = still^2 + spin^2``, shape (n_positions,) [m/s^2].
 
     kinds: the k nonlinear terms of the model, in the order of a calibration file; the coefficients
         at the reference temperature of all kinds precede the changes per kelvin of all kinds
     t: board temperature of each window less the reference, shape (n,) [K]
     still: stated |f| of a unit that does not rotate, or gravity
     spin: centripetal acceleration w^2 r at the stated radius; 0 without rotation
-    sd: standard deviation of |f|, except for the error of the radius
+    sd: sd of |f|, without the part due to the error of the radius
     radius_sd: relative standard deviation of the radius; 0 if the radius is not estimated
     """
 
@@ -107,8 +107,8 @@ def with_forces(windows: ThermalWindows, options: FitOptions) -> ThermalWindows:
     """
     Add the stated |f| of the positions, and the nonlinear terms to be fitted, to the windows.
 
-    The windows stay unchanged if |f| is within 1e-3 of gravity in all positions, and neither the
-    options nor the prior have nonlinear terms.
+    The windows stay unchanged if all |f| are within 1e-3 of gravity, and neither the options nor
+    the prior have nonlinear terms.
     """
     still, spin, sd = np.outer((options.gravity, 0.0, 0.0), np.ones(windows.data.n_positions))
     radii = set()
@@ -177,11 +177,11 @@ class _TermFits:
         return frozenset((kind, self._n_kinds + kind))
 
     def loss(self, used: _Active, dropped: _Active) -> float:
-        """Return the loss of log evidence if the coefficients `dropped` are removed."""
+        """Return the decrease of the log evidence if the coefficients `dropped` are removed."""
         return self.posterior(used).log_evidence - self.posterior(used - dropped).log_evidence
 
     def left_out_gain(self, used: _Active, dropped: _Active) -> tuple[float, float]:
-        """Return the log ratio, and its sd, of left-out |f| errors without and with `dropped`."""
+        """Return the log ratio of mean square errors of |f| without / with `dropped`; its sd."""
         return self.score(used - dropped).norms.gain_of(self.score(used).norms) or (0.0, 0.0)
 
     def is_determined(self, used: _Active, at: int) -> bool:
@@ -191,7 +191,7 @@ class _TermFits:
         return bool(share.mean() > _DETERMINED_SHARE)
 
     def thinned(self, used: _Active) -> _Active:
-        """Remove terms that the data determine and that lower the log evidence by `LEAST_GAIN`."""
+        """Remove the determined terms that lower the log evidence by `LEAST_GAIN` or more."""
         kinds = [at for at in sorted(used) if at < self._n_kinds and self.is_determined(used, at)]
         losses = {at: self.loss(used, self.term(at)) for at in kinds}
         worst = min(losses, key=losses.__getitem__, default=None)
@@ -203,7 +203,7 @@ class _TermFits:
 def choose(
     regression: Regression, selected: Selected, options: FitOptions
 ) -> tuple[Selected, tuple[NonlinearTerm, ...]]:
-    """Choose nonlinear terms, and their changes per kelvin; a prior's terms are kept."""
+    """Choose nonlinear terms, and their changes per kelvin; keep all terms of a prior."""
     forces = regression.forces
     if forces is None or options.prior is not None:
         return selected, ()
@@ -234,11 +234,11 @@ def choose(
     for at, of_term in evidence.items():
         places = posterior.layout.nonlinear[:, [at, k + at]]
         determined = max(float(posterior.determined[places[places >= 0]].sum()), 0.0)
-        terms.append(blank_term(forces.kinds[at], float(sd[at]), determined, *of_term))
+        terms.append(_blank_term(forces.kinds[at], float(sd[at]), determined, *of_term))
     return Selected(posterior, score, trials), tuple(terms)
 
 
-def blank_term(kind: Kind, sd: float, *evidence: float) -> NonlinearTerm:
+def _blank_term(kind: Kind, sd: float, *evidence: float) -> NonlinearTerm:
     """Return a nonlinear term with all coefficients 0."""
     return NonlinearTerm(kind, (0.0,) * 3, (0.0,) * 3, sd, *evidence)
 
@@ -250,14 +250,14 @@ def of_file(
     forces = regression.forces
     if forces is None:
         return None
-    known = options.prior.nonlinearity if options.prior else None
+    prior = options.prior.nonlinearity if options.prior else None
     # The calibrated range of |f| extends 1 % beyond the |f| of the positions at both ends.
-    reach = 0.99 * float(forces.sizes.min()), 1.01 * float(forces.sizes.max())
-    if known is None:
-        return Nonlinearity(reach, options.nonlinear_sd('square'), tuple(terms))
-    blank = (replace(term, coefficient=(0.0,) * 3, per_kelvin=(0.0,) * 3) for term in known.terms)
-    reach = union((reach, known.force_range_m_s2))
-    return Nonlinearity(reach, known.beyond_sd_g_g2, tuple(blank))
+    valid = 0.99 * float(forces.sizes.min()), 1.01 * float(forces.sizes.max())
+    if prior is None:
+        return Nonlinearity(valid, options.nonlinear_sd('square'), tuple(terms))
+    blank = (replace(term, coefficient=(0.0,) * 3, per_kelvin=(0.0,) * 3) for term in prior.terms)
+    valid = union((valid, prior.force_range_m_s2))
+    return Nonlinearity(valid, prior.beyond_sd_g_g2, tuple(blank))
 
 
 def with_terms(state: State, calibration: Calibration) -> State:
@@ -278,11 +278,11 @@ def with_blank(calibration: Calibration, options: FitOptions) -> Calibration:
     sd = np.tile(prior_sd(kinds, options), 3)
     factor = np.insert(posterior.matrix, [at] * len(sd), 0.0, axis=0)
     variances = np.insert(posterior.variances, [at] * len(sd), sd**2)
-    terms = tuple(blank_term(kind, options.nonlinear_sd(kind)) for kind in kinds)
-    near = 0.99 * calibration.gravity_m_s2, 1.01 * calibration.gravity_m_s2
+    terms = tuple(_blank_term(kind, options.nonlinear_sd(kind)) for kind in kinds)
+    valid = 0.99 * calibration.gravity_m_s2, 1.01 * calibration.gravity_m_s2
     return replace(
         calibration,
-        nonlinearity=Nonlinearity(near, options.nonlinear_sd('square'), terms),
+        nonlinearity=Nonlinearity(valid, options.nonlinear_sd('square'), terms),
         posterior=Posterior.of(factor, variances),
     )
 

@@ -37,8 +37,8 @@ from .windows import Sets
 COUNTS_FULL_SCALE = 32767.0
 # Families of curves over temperature that are polynomials, of order 1, 2 and 3.
 _POLYNOMIALS = ('linear', 'quadratic', 'cubic')
-#: Groups of columns that the fit selects: the curve, the difference of the static and dynamic
-#: sets, the curves over the temperatures of parts, the groups of the thermal response.
+#: Groups of columns from which the fit selects: the curve, the difference of the static and the
+#: dynamic set, the curves over the temperatures of parts, the groups of the thermal response.
 GROUPS = (
     'curve',
     'set',
@@ -58,15 +58,14 @@ class FitOptions:
     model: 'response' selects from all columns; 'golovach' is the model of Golovach's paper: a
         linear static and a quadratic dynamic set, no response
     static_curve, dynamic_curve: families of static and dynamic curve; None: default of `model`
-    groups, forced: groups of columns that the model may have (None: all), and that it must have
+    groups, forced: groups of columns that the model may have (None: all), and those it must have
     prior: calibration of this unit or of its type, whose columns are used without a selection
     ageing_bias, ageing_scale: sd of the change of bias [m/s^2] and scale [1] since the prior
         calibration; if both are 0, these sds are estimated from the bags
     mounting_sd: sd of the bias offset of a mounting or turn-on [m/s^2], or None to estimate it
     gravity_sd: standard deviation of `gravity` [m/s^2]
     k2_sd, k3_sd: prior sd of the nonlinear terms K2 [g/g^2] and K3 [g/g^3], from a data sheet; if
-        both are None: 100 ug/g^2 and 10 ug/g^3 in a fit of positions that are not all at 1 g, and
-        no nonlinear terms in other fits
+        both are None: 100 ug/g^2 and 10 ug/g^3, or no such terms if all positions are at 1 g
     serial: serial of the unit, or None for the serial of the sources
     input: unit of the samples
     full_scale: magnitude of a saturated sample [input units], or None for 32767 counts or, in
@@ -175,8 +174,8 @@ def _family(name: str, lower: float, upper: float) -> TemperatureFunction:
     if name == 'exponential':
         # Exponentials that grow e-fold in 15 K (leakage currents, which double in 10 K) and 30 K.
         return Exponential(-2.0, (1.0, 1.0), (15.0, 30.0))
-    # The spline has a knot at the reference temperature, and five equidistant knots without those
-    # within 0.3 intervals of the reference temperature.
+    # The spline has a knot at the reference temperature, and those of five equidistant knots that
+    # are farther from the reference temperature than 0.3 of their spacing.
     knots = np.linspace(lower, upper, 5)
     step = max((upper - lower) / 4, 1.0)
     kept = sorted([0.0, *(float(k) for k in knots if abs(k) > 0.3 * step)])
@@ -198,8 +197,7 @@ def normal_gravity(latitude_deg: float, height_m: float) -> float:
     # Constants of WGS 84: gravity at the equator, Somigliana's k, eccentricity squared.
     root = math.sqrt(1.0 - 0.00669437999014 * sine2)
     at_ellipsoid = 9.7803253359 * (1.0 + 0.00193185265241 * sine2) / root
-    # Constants of WGS 84: semi-major axis, flattening, and m, the ratio of centrifugal
-    # acceleration to gravity at the equator.
+    # Constants of WGS 84: semi-major axis, flattening, centrifugal / gravity at the equator (m).
     relative, flattening, m = height_m / 6378137.0, 1.0 / 298.257223563, 0.00344978650684
     slope = 2.0 * (1.0 + flattening + m - 2.0 * flattening * sine2)
     return at_ellipsoid * (1.0 - slope * relative + 3.0 * relative**2)

@@ -46,7 +46,7 @@ class _Shape(NamedTuple):
 
     n_nodes: largest number of nodes of the spline of the bias
     most_noise: largest ratio of the RMS residual to the noise at which noise explains the residual
-    has_stress: whether bias and scale have terms m and m x, for stress between part and board
+    has_stress: whether bias and scale have terms in m and m x, for stress between part and board
     has_gradient: whether the bias also has a term in the gradient T_case - T_board
     """
 
@@ -56,7 +56,7 @@ class _Shape(NamedTuple):
     has_gradient: bool = False
 
 
-# Ratio of the RMS residual to white noise up to which no other shape or lag is tried.
+# Ratio of the RMS residual to the noise up to which no other shape or lag is tried.
 _EXPLAINED_RATIO = 1.1
 # Shapes of curves over part temperature, in the order of trials. A spline of 4 nodes determines a
 # lag best, but cannot describe a kink of the bias, so its limit `most_noise` is low.
@@ -89,8 +89,8 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> list[Part
 
     Returns [] if the model with one lag per axis does not explain the drift of all axes, or if the
     data do not determine a time constant. If the residual exceeds the noise for all shapes of the
-    curves, a second stage might just describe slow noise or a tilt of the support: the result then
-    begins with lags of one stage, if they at least halve the RMS residual of each axis.
+    curves, a second stage may describe slow noise or a tilt of the support: lags of one stage then
+    come first in the result, if they more than halve the RMS residual of each axis.
     """
     data, columns = windows.data, windows.model.columns
     if not windows.has_temperature or not any(column.group == 'board' for column in columns):
@@ -107,9 +107,8 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> list[Part
         subset = _PartCurves(windows, start, shape, 3000)
         lags = [subset.refined(lag, axis) for axis, lag in enumerate(searched)]
         parts, ratio = _PartCurves(windows, start, shape, len(data.time)).parts(lags, noise)
-        # If the residual is above `most_noise` times the white noise, it has a further cause, such
-        # as slow noise: lags are then accepted only if the RMS residual of each axis is at most a
-        # quarter of its RMS residual without a lag.
+        # If the residual is above `most_noise` times the noise, it has a further cause, such as
+        # slow noise: lags must then reduce the RMS residual of each axis to a quarter.
         is_explained = ratio <= shape.most_noise
         if not is_explained and min(map(subset.reduction, lags, range(3))) < 4.0:
             continue
@@ -129,8 +128,8 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> list[Part
 
 class _PartCurves:
     """
-    Bias and scale factor of each axis as functions of x, the temperature of a part, for any lags;
-    every k-th window is used, with the largest k that keeps at least `n_windows` windows.
+    Bias and scale factor of an axis, fitted for any lag as functions of x, the temperature of the
+    part, to every k-th window, with the largest k that keeps at least `n_windows` windows.
     """
 
     def __init__(
@@ -173,27 +172,27 @@ class _PartCurves:
         self._measured = self._centred(data.mean[rows] / start.scale)
 
     def lags(self, noise: Floats) -> list[Part] | None:
-        """Return the lag of each axis, or None if a lag fails `_is_of_use` or `_is_determined`."""
+        """Return the lag of each axis, or None if a lag is not useful or not determined."""
         lags = []
         for axis in range(3):
             lag = self._lag(axis, noise[axis])
-            if not self._is_of_use(lag, axis, noise[axis]) or not self._is_determined(lag, axis):
+            if not self._is_useful(lag, axis, noise[axis]) or not self._is_determined(lag, axis):
                 return None
             lags.append(lag)
         return lags
 
-    def _is_of_use(
+    def _is_useful(
         self, lag: Part, axis: int, noise: float, most_noise: float = 3.0, reduction: float = 4.0
     ) -> bool:
-        """Whether the residual with `lag` is near the noise, or far below the one without lag."""
+        """Whether `lag` leaves a residual near the noise, or far smaller than without a lag."""
         typical = 1.4826 * np.median(np.abs(self._weighted(lag, axis) / self._root_weight[:, 0]))
         return bool(typical <= most_noise * noise or self.reduction(lag, axis) >= reduction)
 
     def _lag(self, axis: int, noise: float) -> Part:
         """
         Return the lag with the smallest RMS residual; 0 s if no lag reduces the residual. If noise
-        does not explain the residual, a lag of two stages or another share of case less board,
-        then both, are tried; each must reduce the RMS residual by more than 5 %.
+        does not explain the residual, a second stage or another share of the gradient, then both,
+        are tried, and kept if they reduce the RMS residual by more than 5 %.
         """
         one_stage = self.one_stage(axis)
         best = self._with_lead(one_stage, axis)
@@ -201,11 +200,11 @@ class _PartCurves:
         if self._square(best, axis) > enough:
             starts = [one_stage]
             if self._has_case:
-                # The residual has several minima, because a larger share v of the gradient gives
-                # an earlier temperature T + v G, which a larger time constant delays.
+                # The residual has several minima, because a larger share v of the gradient, which
+                # makes T + v G earlier, and a larger time constant nearly cancel.
                 along = [self.one_stage(axis, share) for share in (0.3, 0.6, 0.9)]
                 starts.append(min(along, key=lambda lag: self._square(lag, axis)))
-            if not any(self._is_of_use(near, axis, noise, 8.0, 1.5) for near in (best, *starts)):
+            if not any(self._is_useful(near, axis, noise, 8.0, 1.5) for near in (best, *starts)):
                 # The residual is too large for a second stage, or share of the gradient, to help.
                 return best
             lags = [self._searched(axis, _in_two_stages(one_stage), (0.2, 0.4, 0.0, 0.0))]
@@ -216,7 +215,7 @@ class _PartCurves:
                     first = near._replace(tau_s=max(near.tau_s, 15.0))
                     lags.append(self._searched(axis, first, (0.2, 0.0, 0.1, 0.0)))
             best = self._better(axis, best, min(lags, key=lambda lag: self._square(lag, axis)))
-        is_incomplete = self._is_of_use(best, axis, noise) and self._square(best, axis) > enough
+        is_incomplete = self._is_useful(best, axis, noise) and self._square(best, axis) > enough
         if self._has_case and is_incomplete:
             first = best if best.second_tau_s else _in_two_stages(best)
             searched = self._searched(axis, first, (0.2, 0.4, 0.3, 0.0))
@@ -246,8 +245,8 @@ class _PartCurves:
         longer, lead = 0.03 * np.clip(steps, -10.0, 20.0)
         first = lag._replace(tau_s=float(tau * (1.0 + longer)), **{key: float(lead * unit)})
         share_and_lead = (0.1, 0.0) if self._has_case else (0.0, 0.1)
-        found = self._searched(axis, first, (0.1, 0.0, *share_and_lead))
-        return found if self._square(found, axis) <= enough else lag
+        searched = self._searched(axis, first, (0.1, 0.0, *share_and_lead))
+        return searched if self._square(searched, axis) <= enough else lag
 
     def refined(self, lag: Part, axis: int) -> Part:
         """Return the lag with the smallest RMS residual, by a search from `lag` in small steps."""
@@ -265,11 +264,11 @@ class _PartCurves:
         self, axis: int, first: Part, steps: Sequence[float] | Floats, accuracy: float = 0.01
     ) -> Part:
         """
-        Return the lag of the smallest RMS residual by the simplex method, from the lag `first`.
+        Search the lag with the smallest RMS residual by the simplex method, from the lag `first`.
 
         The search is over the logarithms of both time constants, the share of the gradient, and
         lead / first time constant. `steps`: first step in each of these variables, 0 to keep the
-        variable constant; `accuracy`: half of the largest extent of the final simplex.
+        variable constant; `accuracy`: half of the largest extent of the last simplex
         """
         tau, second, share, lead = first
         start = np.array([np.log(tau), np.log(second or 1.0), share, lead / tau])
@@ -290,8 +289,7 @@ class _PartCurves:
         def log_square(values: Floats) -> float:
             return float(np.log(self._square(lag_at(values), axis)))
 
-        minimum = minimize(log_square, simplex[0], method='Nelder-Mead', options=options)
-        return lag_at(minimum.x)
+        return lag_at(minimize(log_square, simplex[0], method='Nelder-Mead', options=options).x)
 
     def one_stage(self, axis: int, sensor_share: float = 0.0) -> Part:
         """Return the lag of one stage with the smallest RMS residual, which may be 0 s."""
@@ -331,7 +329,7 @@ class _PartCurves:
         return float(np.sqrt(self._square(Part(0.0), axis) / self._square(lag, axis)))
 
     def parts(self, lags: Sequence[Part], noise: Floats) -> tuple[Parts, float]:
-        """Return lags with factors of windows' weights, and the ratio of RMS residual to noise."""
+        """Return `Parts` with the given lags, and the largest ratio of RMS residual to noise."""
         weighted = np.column_stack([self._weighted(lag, axis) for axis, lag in enumerate(lags)])
         residual = weighted / self._root_weight
         factors = undisturbed(residual, self._weight, self._position)
@@ -342,10 +340,10 @@ class _PartCurves:
         ratio = float(np.sqrt((square / noise**2).max()))
         x, y, z = (Part(*map(round, lag, (1, 1, 4, 1))) for lag in lags)
         # Other models are tried if the left-out drift is above `most_drift`: 2 sd of the noise, or
-        # 10 sd if noise explains the residual of a shape without stress, because such a shape may
-        # fit all data well but extrapolate badly to left-out data.
-        is_curve = ratio <= self._shape.most_noise and not self._shape.has_stress
-        most_drift = (10.0 if is_curve else 2.0) * float(noise.mean())
+        # 10 sd if noise explains the residual of a shape without stress: such a shape may fit all
+        # data well, although it extrapolates badly to left-out data.
+        is_complete = ratio <= self._shape.most_noise and not self._shape.has_stress
+        most_drift = (10.0 if is_complete else 2.0) * float(noise.mean())
         return Parts((x, y, z), factors, most_drift), ratio
 
     def _square(self, lag: Part, axis: int) -> float:
@@ -375,7 +373,7 @@ class _PartCurves:
                     x += of_case * share * self._gradient(at)
         low, high = float(x.min()), float(x.max())
         span = (high - low) or 1.0
-        # The nodes of the spline of the bias are at least 0.6 K apart, if there are more than 4.
+        # If the spline of the bias has more than 4 nodes, they are at least 0.6 K apart.
         n_nodes = min(max(int(span / 0.6), 4), self._shape.n_nodes)
         nodes = np.linspace(low, low + span, n_nodes)
         knots = np.concatenate((nodes[[0] * 3], nodes, nodes[[-1] * 3]))
@@ -389,7 +387,7 @@ class _PartCurves:
         if self._shape.has_gradient:
             bias.append(self._case[:, None])
         of_scale = self._force[:, [axis]] * np.hstack(scale)
-        # The unknown lag of the part at the start of a bag has an effect that decays with tau.
+        # The effect of the unknown lag of the part at the start of a bag decays with tau.
         begin = self._is_of_bag * np.exp(-self._age / max(lag.tau_s, 1.0))
         return self._centred(np.hstack((*bias, of_scale, begin)))
 

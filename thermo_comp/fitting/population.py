@@ -1,9 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the prior of a type of unit (`population`): a calibration with the mean of the parameters over
-several units, relative to the scale factors; its covariance is the scatter of the parameters plus
-the mean covariance of the units.
+Owns the prior of a type of unit (`population`): a calibration with the mean parameters of several
+units, relative to the scale factors. Its covariance is their scatter plus the mean covariance.
 
 References
 ----------
@@ -45,10 +44,9 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     Make the prior of a type of unit from calibrations of at least three units.
 
     Raises FitError for fewer than three calibrations, two of the same unit, a calibration without
-    covariance, or if the calibrations differ in the input unit, the reference temperature, the
-    sensors or the form of the curves.
+    covariance, or different input units, reference temperatures, sensors or forms of the curves.
     """
-    # Leave out nonlinear terms: they need |f| above 1 g, as in a centrifuge; few units have any.
+    # Leave out nonlinear terms: few units have them, as they need |f| above 1 g.
     calibrations = [without_terms(each) for each in calibrations]
     _check_alike(calibrations)
     keys: dict[Column, list[Column]] = {}
@@ -68,8 +66,7 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     mean = vectors.mean(axis=0)
     deviations = (vectors - mean) / np.sqrt(len(vectors) - 1.0)
     scatter = (1.0 + 1.0 / len(vectors)) * _scatter(deviations, parameter_layout(template), mean_K)
-    # Add the mean covariance of the units, so that a parameter which no unit determines keeps the
-    # variance of its prior.
+    # Add the mean covariance: a parameter that no unit determines keeps its prior variance.
     scatter += np.mean([covariance for _, covariance in units], axis=0)
     return with_parameters(template, mean_K, mean, scatter)
 
@@ -104,11 +101,11 @@ def _scatter(deviations: Floats, layout: ParameterLayout, K: Floats) -> Floats:
     Return the covariance of the parameters over n units; `deviations`: the parameters less their
     mean, divided by sqrt(n - 1), shape (n, p); `K`: scale factors of the axes.
 
-    The correlations of bias, scale and misalignment with each other and with the curves are set to
-    0: with chance correlations from few units, one position would determine all constants of a new
-    unit. The correlations between curves are reduced by a ratio estimated from their scatter [1]_.
-    A dynamic curve is first replaced by its difference from the static curve: in most units both
-    curves are equal, and reduced correlations would make them differ.
+    The correlations of the bias, scale and misalignment constants with each other and with the
+    curves are set to 0: with chance correlations from few units, one position would determine all
+    constants of a new unit. The correlations between curves are reduced by a ratio estimated from
+    their scatter [1]_. A dynamic curve is first replaced by its difference from the static curve:
+    in most units both curves are equal, and reduced correlations would make them differ.
     """
     to_differences = np.eye(deviations.shape[1])
     for block in (*layout.bias, *layout.scale):
@@ -116,7 +113,7 @@ def _scatter(deviations: Floats, layout: ParameterLayout, K: Floats) -> Floats:
         for coefficient in range(1, n_common):
             to_differences[block.dynamic + coefficient, block.static + coefficient] = -1.0
     deviations = _with_common_scatter(deviations @ to_differences.T, layout, K)
-    kind = np.zeros(deviations.shape[1], np.int64)
+    kind = np.zeros(deviations.shape[1], np.int64)  # 0: curves; each other number: one constant
     levels = [[block.static, block.dynamic] for block in (*layout.bias, *layout.scale)]
     for number, places in enumerate((*levels, *range(layout.misalignment, len(kind))), 1):
         kind[places] = number
@@ -171,13 +168,13 @@ def _in_one_stage(column: Column, tau_s: float) -> Column:
 
 def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
     """
-    Return pairs (column of the bank of time constants, factor) whose sum approximates `column`.
+    Return columns with time constants of the bank, and factors; their sum approximates `column`.
 
     Parts of two units of a type have different time constants, so a lag is interpolated between
     the lags of the bank, which is common to all units; a lag of 0 s has the value 0. A lag of two
     stages, a lag behind a temperature between board and sensor, and a lag with a lead are sums of
-    first-order lags. A power of a sum of lags is approximated by the power of one lag of the board
-    that has the same delay in a long ramp as the sum.
+    first-order lags. A power of such a sum is approximated by the power of one lag of the board
+    that has the same delay as the sum in a long ramp.
     """
     tau, second, lag = column.tau_s, column.second_tau_s, column.source
     is_line = isinstance(lag, Lag) and column.term.form is LINE
@@ -223,7 +220,7 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
 def _relative_to(
     calibration: Calibration, template: Calibration, mean_K: Floats
 ) -> tuple[Floats, Floats]:
-    """Return parameters and covariance in `template`'s layout, for scale factors `mean_K`."""
+    """Return parameters and covariance in the layout of `template`, for scale factors `mean_K`."""
     if calibration.posterior is None:
         raise FitError(
             f'the calibration of unit {calibration.unit.serial} has no covariance, so it cannot '
@@ -264,13 +261,13 @@ def _shape(calibration: Calibration) -> list[tuple[str, int]]:
 def _template(calibrations: Sequence[Calibration], columns: Sequence[Column]) -> Calibration:
     """Return a calibration with the union of the units' ranges, and with columns of weight 0."""
     first = calibrations[0]
-    slow = [[axis.residual_sd_m_s2 for axis in each.static.axes()] for each in calibrations]
-    usual = np.median(slow, axis=0).tolist()
+    sds = [[axis.residual_sd_m_s2 for axis in each.static.axes()] for each in calibrations]
+    medians = np.median(sds, axis=0).tolist()
     regimes = []
     for each in zip(*(calibration.regime_sets() for calibration in calibrations), strict=True):
         x, y, z = (
             replace(axis, residual_sd_m_s2=sd)
-            for axis, sd in zip(each[0].axes(), usual, strict=True)
+            for axis, sd in zip(each[0].axes(), medians, strict=True)
         )
         temperatures = union(regime.temperature_range_c for regime in each)
         regimes.append(RegimeSet(temperatures, union(r.rate_range_k_min for r in each), x, y, z))

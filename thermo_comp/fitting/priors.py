@@ -106,18 +106,17 @@ def informative_priors(
     usual_ageing: float = 1.0,
 ) -> Iterator[InformativePrior]:
     """
-    Return priors from a calibration for several amounts of ageing. The fit compares priors by log
-    evidence plus the log density of the ageing: half-Student, of scale `usual_ageing` [m/s^2].
-
-    The fit begins with the last, widest prior. A calibration without covariance raises FitError.
+    Yield priors from a calibration for several amounts of ageing, the widest last. A fit compares
+    them by log evidence plus log density of the ageing: half-Student of scale `usual_ageing`
+    [m/s^2]. A calibration without covariance raises FitError.
     """
     if calibration.posterior is None:
         raise FitError(
             'the prior has no covariance: use a calibration that was fitted to bags; an imported '
             'calibration cannot be a prior'
         )
-    # Pairs to try: `ageing`, sd of change of bias [g] and scale factor (0: the user states it);
-    # `share`, the ratio of an added uncorrelated variance to each variance of the calibration.
+    # Pairs to try: `ageing`, the sd of the changes of bias [g] and scale factor (0: as the user
+    # states); `share`, the ratio of an added uncorrelated variance to each calibration variance.
     tried = [(0.0, share) for share in (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)]
     # The fit begins with the last, widest prior: in a first fit with a narrow prior, the
     # estimated noise would absorb changes of the unit.
@@ -129,8 +128,8 @@ def informative_priors(
         tried += [(ageing, 0.0) for ageing in (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)]
         # Priors for a unit whose effects of temperature have changed, too. A `share` of 1, 1e3 and
         # 1e6 increases the prior sd 1.4, 30 and 1000 times, as the sd may be a thousandth of the
-        # effect. The added sd is limited to the size of the effect: with a larger sd, effects at
-        # temperatures without rests would be unknown.
+        # effect. `_root` limits the added sd to the size of the effect: with a larger sd, effects
+        # at temperatures without rests would be unknown.
         tried += [(ageing, share) for share in (1.0, 1e3, 1e6) for ageing in (3e-5, 3e-4, 3e-3)]
     K, places = constants_of(calibration).scale, parameter_layout(calibration)
     layout = regression.layout(regression.windows.parts)
@@ -171,8 +170,7 @@ def _root(covariance: Floats, share: float, sizes: Floats, to_file: Floats) -> F
     Return the upper triangular root of the inverse covariance of the unit's unknowns.
 
     `covariance`: of the file's parameters; each variance v is increased by ``min(share * v, max(v,
-    size^2))``, with the parameter's size in `sizes`; `to_file`: derivatives of the file's
-    parameters w.r.t. the unknowns
+    size^2))``, the size from `sizes`; `to_file`: derivatives of the parameters by the unknowns
     """
     diagonal = np.diag(covariance)
     floor = np.where(diagonal > 0.0, diagonal, np.min(diagonal[diagonal > 0.0], initial=1.0))

@@ -38,7 +38,7 @@ def judge_prior(serial: str, prior: Calibration | None) -> Iterator[Finding]:
 
 
 def full_scale_of(bags: Sequence[ReducedBag], options: FitOptions) -> float:
-    """Return the stated full scale [input units], else one above all samples of the bags."""
+    """Return the stated full scale [input units] or, by default, one above all samples."""
     full_scale, largest = options.saturated_at, max(bag.max_abs for bag in bags)
     if full_scale == COUNTS_FULL_SCALE:
         return widened(full_scale, np.array([[largest]]))
@@ -208,8 +208,8 @@ def _why_dead(bags: Sequence[ReducedBag], dead: Sequence[_DeadAxis]) -> str:
 
 def _dead_axes(bags: Sequence[ReducedBag]) -> Iterator[_DeadAxis]:
     """
-    Find the axes that are constant throughout a rest but have noise in at least half of the rests,
-    and the axes that are constant, but not always 0, in every rest while another axis has noise.
+    Find the axes that are constant throughout a rest but have noise in half or more of the rests;
+    if another axis has noise, also the axes that are constant in all rests, but not 0 in all.
     """
     rests = _rests(bags)
     alive = np.array([rest.sample_sd > 0.0 for rest in rests])
@@ -270,7 +270,7 @@ def judge_missing(bags: Sequence[ReducedBag], windows: ThermalWindows) -> Iterat
     n_used = float(windows.data.weight.sum()) * windows.typical_count
     unsettled = n_unsettled / n_still
     missing = 1.0 - n_used / n_still - unsettled
-    reported = 0.1  # smallest share of the time at rest without temperature that is reported
+    reported = 0.1  # largest share of the time at rest without temperature that is not reported
     if missing > reported:
         why = 'do the thermometers and the accelerometer use the same clock?'
         if n_between > 0.5 * missing * n_still:
@@ -290,8 +290,8 @@ def judge_missing(bags: Sequence[ReducedBag], windows: ThermalWindows) -> Iterat
 
 def _missing(bag: ReducedBag, track: Track) -> tuple[float, float, float]:
     """
-    Return three numbers of samples at rest: of all; of those before the board temperature is
-    accurate; and of later ones without a known temperature while all thermometers are recorded.
+    Return the numbers of all samples at rest, of those before the board temperature is accurate,
+    and of later ones without a known temperature while all thermometers are recorded.
     """
     read = [readings.stamp_ns for readings in bag.temperatures.values() if len(readings.stamp_ns)]
     begin_s = 1e-9 * (max(stamp_ns[0] for stamp_ns in read) - bag.start_ns)

@@ -7,8 +7,8 @@ The blocks of a bag are read once, in bounded memory. Samples are averaged to ce
 second (see `stillness`), and the cells of a still interval to windows of ten seconds. A short
 interval, and the end of an interval, may have shorter windows. Within a window the deviation of
 every thermal regressor from a straight line is far below the noise, so the mean of a window is a
-sufficient statistic. The regression estimates the noise of window means, which for a
-charge-balancing converter is less than the scatter of the samples implies.
+sufficient statistic. The regression estimates the noise of the means of windows; with a
+charge-balancing converter this noise is smaller than the scatter of the samples implies.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ class Readings(NamedTuple):
 @dataclass(frozen=True)
 class StillInterval:
     """
-    One interval without motion, that is, one position.
+    An interval without motion: a rest of the unit.
 
     start_ns, end_ns: stamps of the middles of the interval's first and last cell
     begin_s: start of the interval's first window, since the bag's first sample [s]
     n_whole: number of windows of full length; a shorter last window may follow them
     time, count, mean: each window's time since the first sample [s], number and mean of samples
-    sample_sd: root of the median over the cells of the variance of single samples, shape (3,)
+    sample_sd: root of the median, over the cells, of the variance of the samples, shape (3,)
     rounding_sd: sd of the error of the mean by rounding; 0 if samples have noise, shape (3,)
     angular_rate: mean angular rate of each window [rad/s], or None if samples of the bag lack it
     """
@@ -80,14 +80,12 @@ class ReducedBag:
     start_ns, end_ns: stamps of the first and last sample used
     n_dropped: number of samples that are not finite, or whose stamps are out of order
     n_saturated: number of samples at the full scale
-    n_cells, n_still_cells: number of cells (means of half a second, or of more at a low sample
-        rate) in the bag, and in its rests
-    window_s: length of a window [s]; above the requested length if the sample rate is low
+    n_cells, n_still_cells: number of cells (see the module's docstring) in the bag, in its rests
+    window_s: length of a window [s]; longer than requested if the sample rate is low
     cycle_s: typical interval between samples [s]
     is_integer: whether all samples are integers
     middle: code at zero force if the samples are unsigned codes, else 0
-    step: smallest difference that the samples of the coarsest axis can have; 0 if none is seen
-        [input units]
+    step: resolution of the samples of the coarsest axis, or 0 if it is not visible [input units]
     max_abs: largest magnitude of a sample, without the largest 1 % of the cells [input units]
     since_s: time from the bag's first sample to the part of the bag that was read [s]
     restless: reason why the bag cannot be used, such as no rests; '' if the bag can be used
@@ -199,7 +197,7 @@ def reduce_source(
     variance allowed in a rest is chosen so that rests determine bias and scale best. If the user
     or the bag states |f|, the limit of the variance is fixed, and `min_rest_s` is by default 3 s.
     At a low sample rate, cells of the usual 30 samples are so long that drifts look like motions
-    and short rests are lost: cells of 10 or 5 samples are tried.
+    and short rests are lost: cells of 10 or 5 samples are then tried.
     """
 
     def reduced(least: int) -> tuple[ReducedBag, float]:
@@ -238,7 +236,7 @@ def _reduced(
     if source.force is None:
         ranges = _rests(cells, min_rest_s, still_sd)
     else:
-        # If |f| is stated, it is not gravity: the norms of rests cannot decide on thresholds.
+        # The stated |f| is not gravity, so the norms of rests cannot decide on thresholds.
         cells = stillness.without_rotation(cells)
         ranges = stillness.still_intervals(cells, min_rest_s or 3.0, still_sd)
     restless = reading.causes.cause(cells, still_sd)
@@ -345,7 +343,7 @@ def _max_abs(cells: Cells) -> float:
 def _rests(cells: Cells, min_rest_s: float | None, still_sd: float) -> list[tuple[int, int]]:
     """Find the rests, with the thresholds whose rests determine bias and scale best."""
     candidates: list[list[tuple[int, int]]] = []
-    # Limits to try for the variance in a rest, divided by the variance in the quietest cells.
+    # Limits of the variance in a rest to try, divided by the variance in the quietest cells.
     ratios = tuple(stillness.VARIANCE_RATIO * 2.0**power for power in range(6))
     of_ratios = stillness.still_runs(cells, still_sd, ratios)
     for shortest_s in (3.0, 2.0, 1.0) if min_rest_s is None else (min_rest_s,):
@@ -366,8 +364,8 @@ def _joined(cells: Cells, ranges: list[tuple[int, int]], still_sd: float) -> lis
     """
     Join rests that are separated by a vibration without motion, if a bag has six or more such
     vibrations, as from a compressor that cycles. There is no motion if on each axis a parabola
-    fits the cells from four before to four after the vibration with a mean squared residual below
-    4 variances of a cell's mean.
+    through the cells, from four before to four after the vibration, leaves a mean square residual
+    below 4 variances of a cell's mean.
     """
     is_calm = stillness.is_under(cells, still_sd)
     result = ranges[:1]
@@ -402,7 +400,7 @@ def _windows(
     offsets = np.arange(0, end - lower, per_window)
     count = cells.count[rows].astype(np.float64)
     total = np.add.reduceat(count, offsets)
-    # A last window with less than 90 % of the median number of samples is not of full length.
+    # The last window counts as whole only if it has 90 % of the median number of samples.
     if n_whole and total[n_whole - 1] < 0.9 * np.median(total):
         n_whole -= 1
     mean = block_means(cells.mean[rows], count, offsets)
@@ -425,9 +423,9 @@ def rounding_sd(variance: Floats, drift: Floats, quantum: Floats) -> Floats:
     """
     Return the sd of the error of a mean by rounding to a converter's steps, shape (3,).
 
-    `variance`: median variance of the rounded samples in a cell; above 0, the noise of the
-    samples averages the rounding error to 0.
-    `drift`: range of the windows' means; a range of n converter steps divides the sd by n + 1.
+    `variance`: median variance of the rounded samples in a cell; if it is above 0, the noise of
+    the samples averages the rounding error to 0.
+    `drift`: range of the windows' means; a range of n converter steps divides the sd by n + 1
     """
     steps = np.divide(drift, quantum, where=quantum > 0.0, out=np.zeros(3))
     return np.asarray(np.where(variance > 0.0, 0.0, quantum / 12.0**0.5 / (1.0 + steps)))

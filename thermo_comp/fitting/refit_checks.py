@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns two checks after which a fit is repeated: whether at settled temperatures the bias by the
-chosen model is less certain than by a smaller model, and whether supports tilted slowly.
+Owns two checks after which a fit is repeated: whether the bias at settled temperatures is less
+certain with the chosen model than with a smaller model, and whether supports tilted slowly.
 """
 
 from __future__ import annotations
@@ -23,8 +23,7 @@ from .windows import CURVE
 
 # Length of a piece of a rest in which a slow tilt of the support is taken as constant [s].
 _PIECE_S = 3600.0
-# Smallest number of positions whose left-out |f| is scored, for a reliable standard error of
-# the gain by slow tilts.
+# Smallest number of scored positions for a reliable standard error of the gain by slow tilts.
 _FEWEST_NORMS = 6
 
 
@@ -51,7 +50,7 @@ def may_have_slow_tilts(fit: Fit) -> bool:
     """
     Whether the hourly mean drift (RMS) of left-out positions exceeds 6 times its noise and a tenth
     of the error of left-out |f|, which must be known in `_FEWEST_NORMS` positions. Slow tilts
-    change the readings of axes across gravity, but hardly |f|.
+    change the readings of axes across gravity, but hardly change |f|.
     """
     score, data = fit.selected.score, fit.windows.data
     if np.isfinite(score.norms.square).sum() < _FEWEST_NORMS:
@@ -77,7 +76,7 @@ def _slow_drift(data: Windows, drift: Floats) -> tuple[float, float]:
 
 
 def is_better_with_tilts(fit: Fit, tilted: Fit) -> bool:
-    """Whether errors of |f| in left-out positions fall if supports may tilt from hour to hour."""
+    """Whether left-out |f| has clearly smaller errors if supports may tilt from hour to hour."""
     before, after = fit.selected.score.norms, tilted.selected.score.norms
     n_common = np.sum(np.isfinite(before.square) & np.isfinite(after.square))
     gain = before.gain_of(after)
@@ -118,7 +117,7 @@ def of_whole_rests(
     for bag in bags:
         for rest in bag.intervals:
             parts = [next(left) for _ in _pieces(rest, bag.window_s)]
-            # Weight: duration of a piece, at least a window's length (one sample lasts 0 s).
+            # The weight of a piece is its duration, at least a window's length (a cell lasts 0 s).
             share = np.array([max(part.duration_s, bag.window_s) for part in parts])
             up = share @ np.array([part.up for part in parts])
             x, y, z = (up / np.linalg.norm(up)).tolist()

@@ -3,9 +3,9 @@
 """
 Owns the regression: the posterior of all unknowns under a given prior, by Gauss-Newton.
 
-All unknowns have Gaussian priors (attitudes: flat on the sphere). Gauss-Newton finds the mode; the
-inverse of the Hessian is the covariance. The unknowns of positions and bags are eliminated first.
-A position is left out by subtraction of its contribution from the normal equations of the unit.
+All unknowns have Gaussian priors, except attitudes, whose prior is flat. Gauss-Newton finds the
+mode; the inverse of the Hessian is the covariance. The unknowns of positions and bags are
+eliminated first. To leave out a position, subtract its part from the unit's normal equations.
 
 References
 ----------
@@ -66,10 +66,9 @@ class PosteriorMode:
 @dataclass(frozen=True)
 class Point:
     """
-    The equations linearised about a state, and Gauss-Newton's step from this state under a prior.
+    The equations linearised about a state, and the Gauss-Newton step from this state.
 
-    grams: weighted sums, over the windows of each position, of products of two base series, shape
-        (n_positions, n_base, n_base)
+    grams: sums of products of whitened base series by position, (n_positions, n_base, n_base)
     """
 
     regression: Regression
@@ -121,8 +120,8 @@ class Point:
     @property
     def _common_variance(self) -> float:
         """Prior variance of the sum, over the bags, of an initial lag state; 0 if not used."""
-        # The prior sd of the mean of a lag state over the bags is 0.1 times its sd in one bag: a
-        # mean that differs from 0 is an effect of the unit.
+        # The prior sd of the mean of a lag state over the bags is only 0.1 times its sd in one
+        # bag, because a mean other than 0 would be an effect of the unit.
         is_used = self.regression.n_bags > 1 and bool(self.layout.start.size)
         return is_used * (0.1 * self.regression.n_bags) ** 2 * self.prior.start_variance_ratio
 
@@ -158,8 +157,8 @@ class Point:
 
     def without_each(self) -> Iterator[tuple[Ints, Floats]]:
         """
-        Yield, for each mounting, its positions and the normal equations of the unit without these
-        positions; yield nothing if there is a single mounting.
+        Yield, for each mounting, its positions and the normal equations of the unit without them;
+        nothing if there is a single mounting.
         """
         base = self.regression.products(self.layout.used).base
         at_state = self.regression.products_at(self.grams, self.state, base)
@@ -189,7 +188,7 @@ class Point:
             precision = self.precision[:n]
             factor = factored_with_prior(information, precision)
             return solved(factor, gradient - precision * deviation), factor
-        # The equations of (root of the prior precision) times (unknowns) are well conditioned.
+        # Unknowns multiplied by the root of the prior precision have well-conditioned equations.
         root = self.prior.informative.root
         scaled = solve_triangular(root, information, trans='T')
         scaled = solve_triangular(root, scaled.T, trans='T')
@@ -210,11 +209,10 @@ class Point:
         return step, factor
 
     def linear_step(self) -> Floats:
-        """Return the step in which damping keeps the nonlinear unknowns almost constant."""
+        """Return a step that is damped so that the nonlinear unknowns stay almost constant."""
         layout, local, unit = self.layout, self.normal.local.copy(), self.normal.unit.copy()
         # A factor 1e6 on the Hessian's diagonal divides the steps of nonlinear unknowns by about
-        # 1e6. With an informative prior, which correlates the unknowns, a far larger factor would
-        # cause rounding errors in double precision.
+        # 1e6; a far larger one would cause rounding errors with an informative, correlated prior.
         at = [*range(2 + layout.stretch.shape[1]), *range(layout.of_axis.shape[1], layout.n_local)]
         local[..., at, at] *= 1e6
         end = unit.shape[-1] - 1
@@ -228,13 +226,12 @@ class Point:
 
     def stepped(self) -> Point:
         """
-        Take Gauss-Newton's step.
+        Take the Gauss-Newton step.
 
-        If the step increases the energy, fractions of the step of the nonlinear unknowns (which
-        multiply other unknowns) are tried, each with a new step of the linear unknowns.
+        If the step increases the energy, fractions of the step of the nonlinear unknowns (those
+        that multiply other unknowns) are tried, each with a new step of the linear unknowns.
         """
-        # The regression keeps only the last linearisation: compute `self.energy` and
-        # `self.solution` before the energy of the next point.
+        # Compute these before the next point: the regression keeps only the last linearisation.
         energy, (step, _) = self.energy, self.solution
         result = self.with_step(step)
         if result.energy <= energy:
@@ -251,7 +248,7 @@ class Point:
         return result
 
     def posterior(self, end: Point) -> PosteriorMode:
-        """Return the posterior at the mode `end`, with the covariance computed at this point."""
+        """Return the posterior with the mode `end` and the covariance at this point."""
         layout, prior, precision, reduced = self.layout, self.prior, self.precision, self.reduced
         _, factor = self.solution
         n, unit_root = layout.n_unit, inverse_root(factor)
@@ -282,11 +279,7 @@ class Regression(Equations):
     _linearised: tuple[State, Layout, Floats, Tangent, Normal] | None = None
 
     def at(self, state: State, prior: Prior, grams: Floats | None = None) -> Point:
-        """
-        Linearise about `state` with inactive weights set to 0.
-
-        `grams`: sums over windows, as in `Point`; None: over all windows.
-        """
+        """Linearise about `state` with inactive weights set to 0; `grams` None: of all windows."""
         layout = self.layout(prior.column_sd > 0.0, prior.nonlinear_sd > 0.0)
         grams = self.products(layout.used).of_positions if grams is None else grams
         return Point(self, without_inactive(state, layout), prior, layout, grams)
@@ -315,7 +308,7 @@ class Regression(Equations):
         return point.posterior(point)
 
     def step(self, state: State, prior: Prior) -> PosteriorMode:
-        """Take one step towards the mode; the covariance is that at `state`, before the step."""
+        """Take one step towards the mode; the covariance is computed at `state`."""
         self.whiten(prior.noise)
         point = self.at(state, prior)
         end = point.stepped()

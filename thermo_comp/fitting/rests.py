@@ -21,8 +21,8 @@ from .windows import LAGS, ThermalWindows
 
 def is_constant(windows: ThermalWindows, part: Ints) -> bool:
     """
-    Whether the board temperature changes less (RMS) within positions, or within bags, than from
-    one position or bag to the next; `part`: index of each window's position, or of its bag, (n,).
+    Whether the board temperature changes less (RMS) within parts than from part to part; `part`:
+    index of each window's part, its position or its bag, shape (n,).
     """
     t = windows.temperature
     within = within_positions(t[:, None], part)[:, 0]
@@ -37,9 +37,10 @@ def is_bench(windows: ThermalWindows, up: Floats) -> bool:
 
 def _is_heated(windows: ThermalWindows) -> Bools:
     """
-    Return which positions were heated or cooled, shape (n_positions,), or all if none was. A
-    position is heated if its temperature changes, or its mean differs from the median, by over a
-    tenth of the whole range. Drifts of short rests in a room hardly separate bias and scale.
+    Return which positions were heated or cooled, shape (n_positions,), or all if none was. Such a
+    position has a change of temperature, or a difference of its mean temperature from the median
+    of all positions, above a tenth of the range of all temperatures: smaller drifts, as of short
+    rests in a room, hardly separate bias and scale.
     """
     t, edges, weight = windows.temperature, windows.data.edges[:-1], windows.data.weight
     mean = block_means(t[:, None], weight, edges)[:, 0]
@@ -52,8 +53,8 @@ def is_steady(windows: ThermalWindows) -> Bools:
     """
     Return which positions have constant temperatures, shape (n_positions,): in a position the
     board temperature and the lags change (RMS) by less than three sd of the estimated board
-    temperature. A ninth of the mean square of a change of three sd is noise, so slopes fitted
-    over such changes would be a ninth too small.
+    temperature. A ninth of the mean square of a change of three sd is noise, so a slope fitted to
+    such a change would be too small by a ninth.
     """
     data, model = windows.data, windows.model
     lags = [column.group in LAGS and not column.power for column in model.columns]
@@ -87,8 +88,7 @@ def constant_in(data: Windows, steady: Bools, settled: Bools) -> Windows:
 
 def poses_of(windows: ThermalWindows, up: Floats) -> Ints | None:
     """
-    Return the index of the pose of each position, -1 for a position without a pose, shape
-    (n_positions,), or None if no position has a pose.
+    Return the index of each position's pose, (n_positions,), -1 if it has none; None if none has.
 
     `up`: attitudes, shape (n_positions, 3). The positions of an attitude form a pose if the unit
     was returned to this attitude from a different one, or if all (two or more) positions have it.

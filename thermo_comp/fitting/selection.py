@@ -30,7 +30,7 @@ from .regression import PosteriorMode, Regression
 from .unknowns import POSE_SD, InformativePrior, Prior, State
 from .windows import BEND, CURVE, LAGS, PART, PRODUCTS, SET, ThermalWindows
 
-#: Large initial sd of mounting offsets, relative to `Prior.offset_scale`: by data sheets, the bias
+#: Ratio of a large initial sd of mounting offsets to `Prior.offset_scale`. In data sheets the bias
 #: of tactical triads repeats to 0.3 .. 1 mg over turn-ons, 10 to 20 times `Prior.offset_scale`.
 LARGE_OFFSETS = 10.0
 
@@ -64,8 +64,9 @@ class Trial:
 @dataclass(frozen=True)
 class Selected:
     """
-    The chosen model: its completed fit, its left-out score, and all models that were tried;
-    `informative`: the priors made of one calibration for several amounts of ageing.
+    The chosen model: its completed fit, its left-out score, and all models that were tried.
+
+    informative: the priors made from one calibration for several amounts of ageing
     """
 
     posterior: PosteriorMode
@@ -80,8 +81,8 @@ class Fit(NamedTuple):
 
     typical: typical prior sd of all columns that the selection could have chosen, shape (2, m), or
         None if there was no selection of columns
-    of_means: for bags at constant temperatures: state of the fit to the means of the positions,
-        if this fit has a curve and is worse on left-out data than the chosen fit; else None
+    of_means: state of the fit to the means of the positions, if the temperatures of each bag are
+        constant and this fit has a curve, but is worse on left-out data; else None
     """
 
     windows: ThermalWindows
@@ -98,8 +99,8 @@ class Fit(NamedTuple):
     @property
     def offset_sd(self) -> float:
         """
-        Sd of the bias offset of a mounting after a new turn-on as fitted to the bags [m/s^2]. The
-        published sd also includes values that the bags do not exclude.
+        Sd, fitted to the bags, of the bias offset of a mounting after a new turn-on [m/s^2]. The
+        published sd also allows for larger values that the bags do not exclude.
         """
         prior = self.posterior.prior
         return float(np.hypot(prior.offset_sd, self.regression.has_turn_ons * prior.turn_on_sd))
@@ -132,7 +133,7 @@ class Growth:
         self.tried: list[Trial] = []
 
     def fit(self, groups: tuple[str, ...], state: State, prior: Prior, typical: Floats) -> Trial:
-        """Fit all columns of `groups`, also those that the fit of a smaller model dropped."""
+        """Fit all columns of `groups`, also those that were removed from a smaller model."""
         candidates = replace(self._candidates, typical=typical)
         initial_sd = np.where(prior.column_sd > 0.0, prior.column_sd, typical)
         is_wanted = np.isin(self._names, groups)
@@ -160,8 +161,7 @@ class Growth:
             kelvins, state = regression.windows.kelvins, posterior.state
             square = float(np.mean(regression.residual(state, posterior.layout) ** 2))
             if state.pose.size:
-                # Attitudes and offsets of rests in a pose absorb errors of the model: add their
-                # mean squares to the mean square of the residual.
+                # Add the mean squares of attitudes and offsets, which absorb errors of the model.
                 by_attitude = regression.gravity * state.from_pose
                 square += float(np.mean(state.offset**2) + np.mean(by_attitude**2))
             # Typical sd of a new column: the weight with which it alone explains the residual.
@@ -194,7 +194,7 @@ class Growth:
         return [smooth, *self.trials(smooth, [BEND])]
 
     def lowest_degree(self, constants: Trial) -> Trial:
-        """Fit curves of all degrees; take a higher degree if the log density clearly rises."""
+        """Fit curves of each degree; choose a higher degree if the log density clearly rises."""
         prior, state = constants.posterior.prior, constants.posterior.state
         prior = replace(prior, offset_sd=prior.offset_scale or prior.offset_sd)
         number = np.cumsum(self._names == CURVE)
@@ -210,7 +210,7 @@ class Growth:
         return chosen
 
     def trials(self, chosen: Trial, groups: Sequence[str]) -> list[Trial]:
-        """Fit the chosen model plus groups of columns: up to 4 choices with large gains."""
+        """Fit the chosen model plus a set of groups, for each of up to 4 sets with large gains."""
         absent = [group for group in groups if group in self.free and group not in chosen.groups]
         if not absent:
             return []
@@ -222,8 +222,8 @@ class Growth:
             is_bend = self._names == BEND
             knees = inactive.chosen(typical, is_bend, CLEAR_GAIN, 60)
             typical = np.where(is_bend & ~knees, 0.0, typical)
-        # Try groups together that describe one effect: the squared temperature of a part of lag m,
-        # (t - m)^2 = t^2 - 2 t m + m^2, needs the product t m and the square m^2.
+        # Try those groups together that describe one effect: the squared temperature of a part of
+        # lag m, (t - m)^2 = t^2 - 2 t m + m^2, needs the product t m and the square m^2.
         together = PRODUCTS, (*LAGS, 'product', 'gradient_x_temperature', 'square')
         sets = [tuple(group for group in groups if group in absent) for groups in together]
         sets = [*((group,) for group in absent), *(groups for groups in sets if len(groups) > 1)]
@@ -241,11 +241,11 @@ class Growth:
 
 def better_start(fits: Sequence[_Model]) -> _Model:
     """
-    Choose by left-out data between the first and the last fit, which begin with a small and with a
-    large prior sd of mounting offsets, or of the misalignment. If left-out data do not decide, the
-    fit with the large prior sd is chosen only if its log density is larger by `CLEAR_GAIN`.
-    Mounting offsets and misalignments explain |f| in few positions equally well, but only
-    misalignments predict |f| in a new position.
+    Choose by left-out data between a fit begun with a small prior sd of mounting offsets or of the
+    misalignment, the first, and one begun with a large sd, the last. If left-out data do not
+    decide, the last is chosen if its log density is larger by `CLEAR_GAIN`. Mounting offsets and
+    misalignments explain |f| in few positions equally well, but only misalignments predict |f| in
+    a new position.
     """
     small, large = fits[0], fits[-1]
     evidence_gain = log_density(large.posterior) - log_density(small.posterior)
@@ -320,8 +320,8 @@ def _grown(
     may_bend = BEND in growth.free and {*PRODUCTS} & {*chosen.groups}
     if may_bend and BEND not in chosen.groups and not chosen.is_complete:
         # A bend of the curve over a part's temperature is found only in a model with the part's
-        # lag, not in one that approximates the lag by products and squares. Add columns to a model
-        # with lags and bends if its left-out error is below three times that of the chosen model.
+        # lag, not in a model that approximates the lag by products and squares. Add groups to a
+        # model with lags and bends if its error is below three times that of the chosen model.
         _, *with_bends = growth.with_bends(first, LAGS)
         if with_bends and with_bends[0].score.rms < 3.0 * chosen.score.rms:
             growth.tried += with_bends
@@ -337,8 +337,8 @@ def fit_all(
     informative: Sequence[InformativePrior] = (),
 ) -> Selected:
     """Fit all columns, with the prior of `informative` whose fit has the largest log density."""
-    # In few positions, offsets of mountings and ageing of the unit explain |f| equally well,
-    # so the sd of these offsets is constant until an informative prior is chosen.
+    # Mounting offsets and ageing of the unit explain |f| in few positions equally well, so the sd
+    # of these offsets is constant until an informative prior is chosen.
     scale = prior.offset_scale
     prior = replace(prior, offset_scale=0.0 if informative else scale)
     posterior = settle(regression, state, prior, candidates)
@@ -361,11 +361,9 @@ def finish(
     regression: Regression, chosen: Trial, candidates: Candidates
 ) -> tuple[PosteriorMode, Score]:
     """
-    Complete the chosen model: reduce the weights of outliers, drop columns of small gain, try
-    a large sd of mounting offsets, and try slow noise.
-
-    Slow noise may replace columns as the explanation of thermal effects, so it is kept only if the
-    correction of left-out data does not become worse.
+    Complete the chosen model: reduce the weights of outliers, drop columns of small gain, try a
+    large sd of mounting offsets, and try slow noise. Slow noise can describe thermal effects in
+    place of columns, so it is kept only if the correction of left-out data does not become worse.
     """
     downweigh(regression, chosen.posterior)
     posterior = settle(regression, chosen.posterior.state, chosen.posterior.prior, candidates)
@@ -375,9 +373,9 @@ def finish(
     large = LARGE_OFFSETS * prior.offset_scale
     is_noise = score.rms <= 4.0 * float(np.hypot(score.noise, score.by_thermometer))
     if prior.offset_sd < prior.offset_scale and is_noise:
-        # Nine constants explain |f| in nine positions, whatever the mounting offsets. The drift
-        # of a reading due to its scale factor is proportional to the specific force on the axis,
-        # so a model that explains the drifts determines these forces, and mounting offsets.
+        # Nine constants explain |f| in nine positions with any mounting offsets. The drift of a
+        # reading due to its scale factor is proportional to the specific force along the axis, so
+        # a model that explains the drifts determines these forces, and with them the offsets.
         prior = replace(prior, offset_sd=large, turn_on_sd=large)
         posterior = settle(regression, posterior.state, prior, candidates)
         score = score_of(regression, posterior)

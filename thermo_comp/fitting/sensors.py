@@ -3,9 +3,9 @@
 """
 Owns the estimation of the settings of thermometers and of the regime detector from bags.
 
-Rates of temperature are central differences over two minutes, which are not causal and so need a
-recording. These rates show the lags of the thermometers and the ramps of the test. Lags, ramps and
-noise of their readings become settings of the causal thermal tracker and regime detector.
+Rates of temperature are central differences over two minutes, which need later readings and so a
+recording. These rates show the lags of the thermometers and the ramps of the test. From lags,
+ramps and noise follow the settings of the causal thermal tracker and regime detector.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ..thermal.settings import OBVIOUS_SHARE, RAMP_K_MIN, DetectorSettings, Ther
 from ..typing import Floats, Ints
 from .reduction import Readings, ReducedBag
 
-# Interval between temperature rates [s]; intervals on each side in their central difference.
+# Interval between temperature rates [s]; intervals on each side of a central difference.
 _BIN_S, _BINS_PER_SIDE = 10.0, 6
 
 
@@ -49,7 +49,7 @@ def learn_detector(bags: Sequence[ReducedBag]) -> DetectorSettings:
     base = DetectorSettings()
     board = learn_thermometer([bag.board for bag in bags], base.board)
     case = learn_thermometer([bag.case for bag in bags], base.case)
-    histories = _rate_histories([bag.case for bag in bags], case.noise_sd_c, case.quantum_c)
+    histories = _histories([bag.case for bag in bags], case.noise_sd_c, case.quantum_c)
     smallest = min(base.smallest_ramp_k_min, _slowest_ramp(histories, base.smallest_ramp_k_min))
     return replace(
         base,
@@ -71,13 +71,13 @@ def learn_thermometer(
     quantum = quantum_of(np.concatenate([readings.value for readings in long]))
     # With a noise setting below 0.1 mK the estimated temperature would follow rounding errors.
     noise = max(_noise_of(long, quantum), 1e-4)
-    histories = _rate_histories(recorded, noise, quantum)
+    histories = _histories(recorded, noise, quantum)
     with_ramps = [history for history in histories if history.fastest > history.least_ramp]
     if not with_ramps:
         return replace(base, noise_sd_c=noise, quantum_c=quantum)
     fastest = max(history.fastest for history in with_ramps)
-    # When a ramp begins, a temperature with a first-order lag has the second derivative rate /
-    # lag, which is estimated from the difference of two rates one minute apart.
+    # At the start of a ramp a temperature with a first-order lag has the second derivative
+    # ``rate / lag``, which is estimated from the difference of two rates one minute apart.
     lags = []
     for history in with_ramps:
         change = np.abs(history.rate[_BINS_PER_SIDE:] - history.rate[:-_BINS_PER_SIDE])
@@ -115,8 +115,8 @@ def _noise_of(recorded: Sequence[Readings], quantum: float) -> float:
     second = np.concatenate([np.diff(readings.value, 2) for readings in recorded])
     if not quantum:
         return 1.4826 * float(np.median(np.abs(second))) / float(np.sqrt(6.0))
-    # Most rounded readings equal their neighbours, so the median difference is 0: use the mean
-    # square of differences, without the largest 1 %, less the variance of rounding.
+    # Most rounded readings equal their neighbours, so the median of the differences is 0. Use the
+    # mean square of the differences, without the largest 1 %, less the variance of rounding.
     square = np.sort(second**2)[: int(0.99 * len(second))]
     noise = float(np.sqrt(max(float(square.mean()) / 6.0 - quantum**2 / 12.0, 0.0)))
     limit = 0.1 * quantum
@@ -137,7 +137,7 @@ def _flicker(recorded: Sequence[Readings]) -> float:
         first = np.flatnonzero(np.diff(edges, prepend=np.nan))
         count = np.diff(np.append(first, len(edges)))
         edge, at_s = edges[first], time[changed[first]]
-        # Leave out an edge between two rounded values at which the temperature reverses.
+        # Leave out edges at which the temperature reverses.
         step, apart_s = edge[2:] - edge[:-2], at_s[2:] - at_s[:-2]
         passes = np.abs(step) > 1e-9
         moves += float(np.sum(count[1:-1][passes] ** 2 - 1)) * float(np.median(np.diff(time))) ** 2
@@ -145,9 +145,7 @@ def _flicker(recorded: Sequence[Readings]) -> float:
     return 0.5 * float(np.sqrt(np.pi * moves / (inverse_rates or np.inf)))
 
 
-def _rate_histories(
-    recorded: Sequence[Readings], noise: float, quantum: float
-) -> list[RateHistory]:
+def _histories(recorded: Sequence[Readings], noise: float, quantum: float) -> list[RateHistory]:
     """Return the rate of temperature in each bag of at least 30 readings over 6 minutes."""
     side = _BIN_S * _BINS_PER_SIDE
     result = []
@@ -169,7 +167,7 @@ def _rate_histories(
 
 
 def _slowest_ramp(histories: Sequence[RateHistory], usual: float) -> float:
-    """Return 0.7 times the slowest ramp of over 10 min, limited to RAMP_K_MIN..usual [K/min]."""
+    """Return 0.7 times the rate of the slowest ramp over 10 min, in RAMP_K_MIN..usual [K/min]."""
     slowest = usual / 0.7
     for history in histories:
         is_ramp = np.abs(history.rate) > max(history.least_ramp, 0.1 / 60.0)
@@ -194,7 +192,7 @@ def _ripple(histories: Sequence[RateHistory], lag_s: float, usual: float) -> flo
     noise = float(np.median([history.rate_sd for history in histories]))
     swing = float(np.quantile(np.abs(resting - np.median(resting)), 0.95))
     clean = float(np.sqrt(max(swing**2 - (2.0 * noise) ** 2, 0.0)))
-    # A ripple with rates of up to 3 sd of the noise of the rates may be undetected: assume such a
+    # Noise may hide a ripple whose rates are up to 3 sd of the noise of the rates: assume such a
     # ripple, but at most the `usual` ripple.
     hidden = min(usual, 3.0 * noise * lag_s)
     return float(np.clip(max(clean * lag_s, hidden), 0.02, 1.0))
@@ -264,7 +262,7 @@ def averaged(
     Average readings over steps of time if there are at least two per step, as from IMU drivers.
 
     Return the bag with mean readings, and the settings with the noise of a mean reading.
-    `inputs`: the thermometers, the board's first; all others have the settings of the case's.
+    `inputs`: the thermometers, first that of the board; the others have the settings of the case.
     """
     temperatures = {**bag.temperatures}
     settings = [detector.board, detector.case]
@@ -284,7 +282,7 @@ def averaged(
 
 
 def _means(readings: Readings, step: Ints, has_cells: bool) -> Readings:
-    """Average readings in each `step`; with `has_cells` keep first and changed readings only."""
+    """Average readings in each step; if `has_cells`, keep a step's first and changed readings."""
     stamp_ns, value = readings
     is_first = np.diff(step, prepend=-1) != 0
     if has_cells:
@@ -292,7 +290,7 @@ def _means(readings: Readings, step: Ints, has_cells: bool) -> Readings:
         return Readings(stamp_ns[is_first], value[is_first])
     first = np.flatnonzero(is_first)
     least, most = np.minimum.reduceat(value, first), np.maximum.reduceat(value, first)
-    # The tracker must see impossible steps of the readings as they are.
+    # Where readings differ by an impossible step, the tracker must get the readings themselves.
     is_first |= np.repeat(most - least > LARGEST_STEP, np.diff(first, append=len(step)))
     first = np.flatnonzero(is_first)
     n = np.diff(first, append=len(step))

@@ -7,14 +7,13 @@ whitens these series for slow noise, and the sums of products of whitened series
 All terms of the measurement equation (`equations`) are linear combinations of the base series, so
 the sums of the products of whitened base series in each position are sufficient statistics.
 
-Windows' noise is white plus exponentially correlated (first-order Gauss-Markov). In a position the
-error of window k is ``c_k + e_k``: e_k is white with variance ``sigma^2 / weight_k``, c_k a
-stationary Gauss-Markov process of variance ``ratio sigma^2`` and correlation time T (IEEE Std 952,
-Annex B.4.3); a random walk is the limit for a long T. Flicker noise, the bias instability of a
-sensor, is the sum of Gauss-Markov processes of equal variance, with the correlation times T, 10 T,
-100 T and so on [2]_. The innovations of a Kalman filter for white plus Gauss-Markov noise, divided
-by their standard deviations, are white and have all information of the series. With the
-innovations of means and columns, ordinary least squares is the optimal estimator [1]_.
+The error of window k of a position is ``c_k + e_k``: e_k is white noise of variance ``sigma^2 /
+weight_k``, c_k a stationary first-order Gauss-Markov process of variance ``ratio sigma^2`` and
+correlation time T (IEEE Std 952, Annex B.4.3); a random walk is the limit for a long T. Flicker
+noise, the bias instability of a sensor, is the sum of Gauss-Markov processes of equal variance,
+with the correlation times T, 10 T, 100 T and so on [2]_. The innovations of a Kalman filter for
+this noise, divided by their standard deviations, are white and contain all information of the
+series: for the innovations of means and columns least squares is the optimal estimator [1]_.
 
 References
 ----------
@@ -47,13 +46,12 @@ class Whitener:
         n_steps = int(lengths.max())
         step = np.arange(n_steps)[:, None]
         self._is_there = step < lengths
-        #: Index of the window at each step in each position; 0 after a position's last window.
+        #: Index of the j-th window of each position, in row j; 0 after a position's last window.
         self._row = np.where(self._is_there, starts + step, 0)
         self._n = len(position)
         since = np.diff(time[self._row], axis=0, prepend=time[self._row[:1]])
         self._interval = interval = np.where(self._is_there, since, 0.0)
-        #: Correlation times to try [s]: from 3 windows to a sixth of the median length of a
-        #: position, in steps of half a decade.
+        #: Correlation times to try [s]: half decades from 3 windows to a sixth of a position.
         self.times_s: list[float] = []
         span_s = float(np.median(interval.sum(axis=0)))
         typical_s = float(np.median(interval[1:][self._is_there[1:]])) if n_steps > 1 else 1.0
@@ -63,8 +61,8 @@ class Whitener:
             time_s *= 10.0**0.5
         #: Upper bound of the correlation time in a search: half a decade above `times_s` [s].
         self._longest_s = time_s
-        #: Number of processes of flicker noise, with correlation times of 3 windows times powers
-        #: of ten, up to a time at least as long as a position.
+        #: Number of processes of flicker noise: their correlation times are 3 windows times powers
+        #: of ten, up to the first that is at least as long as a position.
         self.n_flicker = 1 + math.ceil(math.log10(max(span_s / (3.0 * typical_s), 1.0)))
 
     def shows(self, time_s: float) -> bool:
@@ -87,10 +85,8 @@ class Whitener:
         still = np.array([[noise.ratio * np.eye(noise.n_times)] for noise in noises])
         covariance = np.repeat(still, self._row.shape[1], axis=1)
         level = np.zeros((*covariance.shape[:3], series.shape[1]))
-        for rows, is_there, interval in zip(
-            self._row, self._is_there, self._interval, strict=True
-        ):
-            decay = np.exp(-interval[:, None] / times_s)
+        for rows, is_there, step_s in zip(self._row, self._is_there, self._interval, strict=True):
+            decay = np.exp(-step_s[:, None] / times_s)
             covariance = still + decay[..., None] * decay[..., None, :] * (covariance - still)
             shared = covariance.sum(axis=-1)
             total = shared.sum(axis=-1) + 1.0 / weight[rows]
@@ -151,7 +147,7 @@ class Whitener:
 
 
 def _vertex(values: Floats, at: int) -> float:
-    """Return where a parabola through values `at - 1`..`at + 1` is least, less `at`; or 0."""
+    """Return the place of the minimum of a parabola through three values, less `at`, or 0."""
     if not 0 < at < len(values) - 1:
         return 0.0
     before, here, after = values[at - 1 : at + 2].tolist()
@@ -319,7 +315,7 @@ class Series:
         initial lag states at the prior mean to columns with the initial lag states of `state`.
         """
         if not len(base.lagged):
-            return rows  # a copy's memory layout would change the last bits of products
+            return rows  # the memory layout of a copy would change the last bits of products
         result: Floats = rows.copy()
         starts = self.starts(state, base)[:, None]
         result[..., 1 + base.lagged] += starts * rows[..., base.at_start]

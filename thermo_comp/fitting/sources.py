@@ -3,9 +3,9 @@
 """
 Owns the input of a fit: sources of blocks of accelerometer samples and temperature readings.
 
-Bags, tables and simulated runs all give blocks of the type `Block` to fit and compensator. The
-known |f| of a bag in which |f| is not g is from the user or from the bag's metadata: a single
-value, a table of time sections, or a rotation rate with a radius.
+Bags, tables and simulated runs all give blocks of the type `Block` to fit and compensator. If |f|
+of a bag is not g, the user or the bag's metadata state it: as a single value, as a table of time
+sections, or by a rotation rate and a radius.
 """
 
 from __future__ import annotations
@@ -69,8 +69,7 @@ class KnownForce:
     The known |f| of a bag over time; outside the sections |f| is gravity.
 
     stamp_ns, rate: readings of the rotation rate [rad/s], about a vertical axis
-    radius, radius_sd: distance of the unit from the axis, and its sd [m]; with an sd above 0 the
-        fit estimates the distance
+    radius, radius_sd: distance of the unit from the axis and its sd [m]; sd 0: not estimated
     """
 
     name: str
@@ -93,7 +92,7 @@ class KnownForce:
                     return Magnitude(section.size, sd=section.sd)
             return Magnitude(gravity)
         inside = (self.stamp_ns >= start_ns) & (self.stamp_ns <= end_ns)
-        n, needed = int(inside.sum()), 3  # the sd of the mean of 2 readings is not reliable
+        n, needed = int(inside.sum()), 3  # the sd of the mean of two readings is not reliable
         if n < needed:
             since_s = (start_ns - first_ns) * 1e-9
             raise FitError(
@@ -144,7 +143,7 @@ class FitSource:
 
     blocks: function that returns a new iterable of the blocks in file order
     force: known |f|, or None if |f| is gravity
-    reader: function that returns the last reader of the recording, or None for arrays
+    reader: function that returns the last opened reader of the recording, or None for arrays
     """
 
     name: str
@@ -193,8 +192,7 @@ def recording_source(
     """
     Make a source of a recording; each iteration over its blocks opens the recording again.
 
-    `require`: topics that the recording must have; `force`: the user's options about |f|, which
-    replace the bag's metadata
+    `require`: topics that must exist; `force`: options about |f|, which replace the bag's metadata
     """
     path = Path(path)
     with open_recording(path, topics, require=require) as reader:
@@ -316,7 +314,7 @@ def _asked_sections(text: str, path: Path) -> tuple[Section, ...]:
     mine: list[str] = []
     for line in content.splitlines():
         first, _, rest = line.strip().replace(',', ' ').partition(' ')
-        # A name of a bag is 01.mcap or run_*; a number with its unit, such as 10s, is no name.
+        # 01.mcap and run_* are names of bags; 10s, a number with its unit, is not.
         if not first or first[0] == '#' or not re.search(r'[A-Za-z_*?]{2}|[*]', first):
             mine.append(line)
         elif fnmatch(path.name, first):

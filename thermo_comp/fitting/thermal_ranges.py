@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns ranges of temperatures, rates and gradients in a fit's data, the lag of the board, and the
-error of an axis at temperatures at which gravity acted along this axis in no position.
+error of an axis at temperatures at which no position has gravity along this axis.
 
 A scale factor has an effect on the readings only if gravity acts along its axis. A recording in
 one attitude at new temperatures extends the temperature range of the calibration, but determines
@@ -36,9 +36,9 @@ def union(ranges: Iterable[Range]) -> Range:
 
 def valid_range(values: Floats, smallest_margin: float, order: int = 0) -> Range:
     """
-    Return the valid range of a quantity that is proportional to a power (`order`) of a heat flow,
-    and so of the rate of a ramp: the range of its values with a margin, extended by the factor
-    2^order to ramps of twice the rate. A range of temperatures (`order` 0) gets only the margin.
+    Return the valid range of a quantity: the range of its values with a margin. If the quantity is
+    proportional to a power (`order`) of a heat flow, and so of the rate of a ramp, the range is
+    extended by the factor 2^order to ramps of twice the rate.
     """
     ratio = 2.0**order
     lower, upper = float(np.min(values)), float(np.max(values))
@@ -50,26 +50,25 @@ def valid_range(values: Floats, smallest_margin: float, order: int = 0) -> Range
 
 def temperature_range(windows: ThermalWindows) -> Range:
     """Return the valid range of board temperatures [degC]."""
-    # A calibration from one temperature is valid within 0.5 K of this temperature; without a
-    # thermometer within 50 K, as the covariance includes an unknown slope over temperature.
+    # A calibration from one temperature is valid within 0.5 K of this temperature; one without a
+    # thermometer within 50 K, as its covariance includes an unknown slope over temperature.
     return valid_range(windows.temperature, 0.5 if windows.was_measured else 50.0)
 
 
 def soak_gradient(windows: ThermalWindows, earlier: Calibration | None) -> Range | None:
     """
-    Return the gradient of the first sensor in soaks and its robust scatter [K], both by the prior
-    calibration `earlier` if it has them, else by the windows; None if the bags have no such sensor
-    or no soak.
+    Return the gradient of the first sensor in soaks and its robust scatter [K], from the prior
+    calibration `earlier` if it has both, else from the windows; None without sensor or soak.
     """
     if earlier is not None and earlier.soak_gradient_k is not None:
         return earlier.soak_gradient_k
     rate = 60.0 * np.abs(windows.rate)
-    # If the rate is noisy, the tenth of the windows with the smallest rates counts as soak.
+    # If the rate is noisy, the tenth of the windows with the smallest rates counts as a soak.
     slowest = max(0.2 * RAMP_K_MIN, float(np.quantile(rate, 0.1)))
     is_soak = rate <= slowest
     if not windows.gradient.any() or slowest > RAMP_K_MIN or is_soak.sum() < 5:
         return None
-    # In a soak the rate is not yet 0: fit a line over the rate to get the gradient at rate 0.
+    # The rates in a soak differ from 0: fit a line over the rate to get the gradient at rate 0.
     gradient, by_rate = windows.gradient[is_soak], np.vander(windows.rate[is_soak], 2)
     slope, middle = np.linalg.lstsq(by_rate, gradient, rcond=None)[0].tolist()
     scatter = np.abs(gradient - by_rate @ (slope, middle))
@@ -83,8 +82,8 @@ def rest_gradient_range(
     Return the valid range of the first sensor's gradient at rate 0, ``gradient - lag_s * rate``.
 
     The range of a prior calibration, `earlier`, is included. The windows give no range without the
-    sensor, without ramps (which determine the lag), or if it would exceed +-100 K, as in bags that
-    are too short for a rate. The result is None if neither prior nor windows give a range.
+    sensor, without ramps (which determine the lag), or if their range would exceed +-100 K, as for
+    bags too short for a rate. The result is None if neither prior nor windows give a range.
     """
     lower, upper = valid_range(windows.gradient - lag_s * windows.rate, 0.01)
     is_small = max(-lower, upper) < 100.0
@@ -118,7 +117,7 @@ def with_unseen_axes(
     Add the error of extrapolated scale factors to the lack of fit of each regime, `lacks`.
 
     `earlier`: calibration used as prior, or None. At temperatures at which no position of the
-    bags determines the scale of an axis, the lack of fit of the axis is at least the prior's.
+    bags determines the scale of an axis, its lack of fit is at least that of `earlier`.
     """
     (lower, upper), (new_lower, new_upper) = _determined_ranges(fit, earlier), _seen(fit, None)
     slope = _unknown_slope(fit) * fit.regression.gravity
@@ -167,21 +166,21 @@ def judge_unseen_axes(fit: Fit, earlier: Calibration | None) -> list[Finding]:
 
 def _determined_ranges(fit: Fit, earlier: Calibration | None) -> Floats:
     """
-    Return the range of board temperature of each axis without an added error of its scale factor,
-    shape (2, 3) [degC]. The range of an axis along which no position has gravity is infinite: the
-    prior sd of its scale factor includes the error of extrapolation.
+    Return the range of board temperature, shape (2, 3) [degC], in which the scale factor of each
+    axis has no added error. The range of an axis along which no position has gravity is infinite:
+    the prior sd of its scale factor includes the error of extrapolation.
     """
     lower, upper = _seen(fit, earlier)
     # The temperature ranges of the positions of one test differ by about a tenth of the range.
-    reach = 0.1 * (upper - lower)
+    margin = 0.1 * (upper - lower)
     is_seen = lower <= upper
-    return np.where(is_seen, (lower - reach, upper + reach), [[-np.inf], [np.inf]])
+    return np.where(is_seen, (lower - margin, upper + margin), [[-np.inf], [np.inf]])
 
 
 def _seen(fit: Fit, earlier: Calibration | None) -> Floats:
     """
-    Return the lowest and the highest board temperature of the positions with gravity along each
-    axis, and of a prior calibration, shape (2, 3) [degC]; (inf, -inf) if there are none.
+    Return for each axis the lowest and the highest board temperature of the positions with gravity
+    along the axis, and of a prior calibration, shape (2, 3) [degC]; (inf, -inf) without both.
     """
     temperature = fit.windows.temperature[:, np.newaxis]
     # At 0.5 g along an axis, |f| has a quarter of the relative error of the axis' scale factor.

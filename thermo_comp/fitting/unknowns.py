@@ -38,26 +38,25 @@ def misalignment_scale(noise: float) -> float:
 @dataclass(frozen=True)
 class Windows:
     """
-    The data of a fit: windows sorted by position and time, with every column of the table.
+    The data of a fit: windows sorted by position and time, and the values of all columns.
 
     position, bag: index of each window's position (within one bag), and of its bag, shape (n,)
     section: index of each window's section of its position, see `windows.N_SECTIONS`, shape (n,)
     time: time since the bag's first sample [s], shape (n,)
     weight: number of samples of each window, divided by the median of these numbers, shape (n,)
     mean: mean raw samples, in input units, shape (n, 3)
-    columns: values of the columns in their physical units, with the initial lag states at their
-        prior mean, shape (n, m)
-    kelvins: temperature change that corresponds to each column's RMS [K]; 0: constant, shape (m,)
+    columns: columns in their physical units, for initial lag states at the prior mean, (n, m)
+    kelvins: RMS / largest slope over temperature of each column [K]; 0: constant, shape (m,)
     lag: index of each column's lag; -1 for a column without lag, shape (m,)
     start: derivative of each column w.r.t. the initial state of its lag, shape (n, m)
     start_covariance: prior covariance of the initial lag states [K^2], shape (n_lags, n_lags)
     in_scale: whether each column may act on the scale as well as on the bias, shape (m,)
     tilt: functions of temperature, of RMS 1, of which a support's tilt is a sum, shape (n, k)
     forces: known |f| and nonlinear terms, or None if |f| is gravity in all positions
-    undisturbed: factors (< 1: disturbed) of the weights, (n,), or None: the fit estimates them
+    undisturbed: factors of the weights, < 1 for an outlier, (n,); None: the fit estimates them
     acts_on: axes on which each column acts, shape (m, 3); None if on all axes
-    pose: index of each position's pose, -1 without a pose, shape (n_positions,), or None if
-        the unit was never returned to an attitude
+    pose: index of each position's pose, -1 without a pose, shape (n_positions,); None: no poses
+    has_prior: whether the fit has a prior calibration
     board: board temperature [degC] and the variance of its estimate [K^2], (n, 2); None: unknown
     board_noise: sd of the noise of a reading of the board's thermometer [K]
     settled: columns at k constant temperatures over the range of the windows, with settled lags,
@@ -111,7 +110,7 @@ class Windows:
 
     @cached_property
     def edges(self) -> Ints:
-        """Index of each position's first window, then number of windows, (n_positions + 1,)."""
+        """Index of each position's first window; last: number of windows, (n_positions + 1,)."""
         return np.searchsorted(self.position, np.arange(self.n_positions + 1))
 
     @cached_property
@@ -146,17 +145,12 @@ class Windows:
     @cached_property
     def has_turn_ons(self) -> bool:
         """
-        Whether turn-on offsets are unknowns of the fit. Without a prior calibration the offset of
-        a single turn-on is part of the bias. On average, two or more mountings per turn-on are
-        needed to separate turn-on offsets from mounting offsets.
+        Whether turn-on offsets are unknowns of the fit. To separate them from mounting offsets
+        takes, on average, two or more mountings per turn-on. Without a prior calibration the
+        offset of a single turn-on is part of the bias.
         """
         fewest = 1 if self.has_prior else 2
         return fewest <= self.n_turn_ons <= (int(self.mounting[-1]) + 1) / 2
-
-    @property
-    def inner(self) -> Ints:
-        """Indices of windows that are followed by two further windows of their position."""
-        return np.flatnonzero(self.position[2:] == self.position[:-2])
 
     @property
     def age(self) -> Floats:
@@ -167,11 +161,10 @@ class Windows:
 
 class Noise(NamedTuple):
     """
-    The slow noise: one Gauss-Markov process; or flicker noise (bias instability), the sum of
-    several such processes of equal variance, whose correlation times rise by factors of ten.
+    Slow noise: one Gauss-Markov process, or flicker noise (bias instability), which is the sum of
+    several such processes of equal variance, with correlation times in steps of a factor of ten.
 
-    ratio: stationary variance of each process, divided by the white-noise variance of a window of
-        weight 1; 0 without slow noise
+    ratio: stationary variance of each process / white-noise variance of a window of weight 1
     time_s: the shortest correlation time [s]
     n_times: number of Gauss-Markov processes
     """
@@ -204,7 +197,7 @@ class InformativePrior:
     mean: mean of the parameters, shape (n_unit,)
     root: upper triangular R with ``R.T @ R`` the inverse covariance, shape (n_unit, n_unit)
     log_density: log prior density of the ageing that this prior assumes
-    is_changed: whether the covariance is far wider than that of the prior calibration
+    is_changed: whether the covariance is far larger than that of the prior calibration
     """
 
     mean: Floats
@@ -231,13 +224,13 @@ class Prior:
     offset_scale: scale of the half-Student priors of offset_sd and turn_on_sd, 0: constant [m/s^2]
     misalignment_scale: value of misalignment_sd before the data are used [rad]
     unseen_misalignment_sd: sd of the elements of M [rad] in the published covariance, if positions
-        near the faces do not determine M and `misalignment_sd` is a smaller constant; else 0
+        near the faces do not determine M and the fit has a smaller `misalignment_sd`; else 0
     tilt_sd: sd of the coefficients of the tilts of a support [rad], see `Windows.tilt`
-    pose_sd: sd of attitudes about their pose [rad]; the prior of attitudes without pose is flat
+    pose_sd: sd of attitudes about their pose [rad]; attitudes without a pose have a flat prior
     start_variance_ratio: variance of the initial lag states, divided by that in the node's prior
     nonlinear_sd: sd of nonlinear coefficients, then of changes per kelvin; 0: inactive, (2 k,)
-    informative: prior that replaces all sd of the unit's parameters; column_sd is then only used
-        to mark the active columns by values above 0
+    informative: prior that replaces all sds of the unit's parameters; column_sd then only marks
+        the active columns, by values above 0
     """
 
     column_sd: Floats

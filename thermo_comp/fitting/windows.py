@@ -5,7 +5,7 @@ Owns the table of windows and columns of the regression, made from the statistic
 
 Fit and compensator use the same thermal tracker and the same columns, of `unit.columns`, so a
 column has the same values in the fit and online; if readings are averaged (`sensors.averaged`),
-the same values within the noise of a reading.
+the values agree within the noise of a reading.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ N_SECTIONS = 6
 @dataclass(frozen=True)
 class Sets:
     """
-    Families of the curves of the static and of the dynamic set; their coefficients are not used.
+    Families of the curves of the static and the dynamic set; their coefficients are not used.
 
     is_shared: whether the dynamic curve is the static curve plus a difference; else it is separate
     """
@@ -91,7 +91,7 @@ class Model:
     name: name of the model in the provenance
     parts: the lag of the part of each axis, or None in a model without one lag per axis
     sensors: thermometers other than the board's; the first is that of the case
-    range_c: board temperatures [degC]; of a rest with windows in this range only these are used
+    range_c: board temperatures [degC]; windows outside are left out if their rest has one inside
     """
 
     name: str
@@ -174,8 +174,7 @@ class ThermalWindows:
     data: means of the samples, and columns, for the regression
     temperature, rate: board temperature [degC], its rate [K/s]; weight: of the dynamic set; (n,)
     gradient: T_case - T_board [K], shape (n,)
-    raw: values u of the columns of the response, before they are limited to their ranges and
-        multiplied by powers of t, shape (n, k)
+    raw: values u of the response's columns, not limited or multiplied by powers of t, (n, k)
     angular_rate: mean angular rate [rad/s], shape (n, 3), or (n, 0) if a bag has no angular rate
     typical_count: median number of samples of a window
     rests: bag and interval of each position
@@ -224,7 +223,7 @@ class ThermalWindows:
 
 class _Rows(NamedTuple):
     """
-    The windows of one rest or of all rests, as columns of a table.
+    The windows of one rest, or of all rests: one row for each window.
 
     thermal: board temperature [degC], its rate [K/s], weight of the dynamic set, gradient [K], and
         the columns of the response without powers of t, as in `ThermalWindows`, shape (n, 4 + k)
@@ -263,7 +262,7 @@ def thermal_windows(
     numbers: list[int] = []
     has_rate = all(interval.angular_rate is not None for bag in bags for interval in bag.intervals)
     for number, (bag, track) in enumerate(zip(bags, tracks, strict=True)):
-        # All lags of a bag are computed at once, which is faster than reading by reading.
+        # Computing all lags of a bag at once is faster than reading by reading.
         gradients = [track.states[:, places[Gradient(name)]] for name in spec.sensors]
         memory = memory_on_grid(spec, track.step_s, track.states[:, BOARD], gradients)
         # `np.interp` would copy a strided or boolean series at each call.
@@ -345,8 +344,7 @@ def _windows(
     sums, groups, columns = model.part_sums, model.sets.groups, model.columns
     n_curves, lags = len(groups), StateLayout(spec).lags
     t, gradient = rows.thermal[:, 0] - model.reference_temperature, rows.thermal[:, 4]
-    # A support tilts linearly with the board and case temperatures, and with the square of the
-    # case temperature.
+    # A support's tilt is linear in board and case temperature, and in the square of the latter.
     tilt = np.column_stack((t, gradient, (t + gradient) ** 2))
     tilt_rms = np.sqrt(np.mean(tilt**2, axis=0))
     is_tilting = tilt_rms > 0.0
@@ -358,7 +356,7 @@ def _windows(
     lag = np.array([-1] * n_curves + [lags.get(c.source, -1) for c in columns], np.int64)
     of_part = rows.columns @ sums.T
     kelvins = _kelvins(model, rows.columns, rows.thermal[:, 5:], t, gradient)
-    # The columns of a curve over a part's temperature have no lag, or the lag of this part.
+    # A curve over a part's temperature is a sum of columns without a lag, or with this part's lag.
     lag_of_part = np.where(sums != 0.0, lag, -1).max(axis=1, initial=-1)
     settled = _settled(model, spec, rows, table)
     return Windows(
@@ -406,14 +404,14 @@ def _sections(position: Ints, time: Floats) -> Ints:
 
 
 def _kelvins(model: Model, values: Floats, raw: Floats, t: Floats, gradient: Floats) -> Floats:
-    """Return the RMS of each column divided by its largest slope over temperature [K], (m,)."""
+    """Return `Windows.kelvins`, the RMS / largest slope over temperature of columns [K], (m,)."""
     farthest = float(np.abs(t).max(initial=0.0))
     flow = float(np.sqrt(np.mean(gradient**2))) or 1.0
     grid = np.linspace(float(t.min()), float(t.max()) + 1e-9, 100)
     curves = model.sets.columns(grid, np.full_like(grid, 0.5))
     steepest = [float(np.abs(np.gradient(curve, grid)).max()) for curve in curves]
     rms = np.sqrt(np.mean(values**2, axis=0))
-    # The largest slope of the dynamic set's weight w over temperature is set to 1 / RMS gradient.
+    # The slope of the dynamic set's weight w over temperature counts as 1 / RMS gradient.
     steepest[model.sets.level] = 1.0 / flow
     for column, series in zip(model.columns, raw.T, strict=True):
         steepest.append(column.term.steepest(column, series, flow) * farthest**column.power)
@@ -434,7 +432,7 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
     """Run the thermal tracker over the readings of a bag; store its state 5 times per window."""
     spec = replace(spec, lags=(), plays=())
     if not len(bag.board.value):
-        # Without readings take the reference temperature for the last 1e9 s: all lags are 0.
+        # Without readings the temperature counts as the reference for 1e9 s: all lags are 0.
         still = np.zeros((2, StateLayout(spec).width))
         still[:, BOARD] = model.reference_temperature
         end_s = 1.0 + (bag.end_ns - bag.start_ns) * 1e-9
@@ -442,8 +440,8 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
     lengths_s = (float(np.median(np.diff(i.time))) for i in bag.intervals if len(i.time) > 1)
     step_s = max(min(lengths_s, default=1.0) / 5.0, 0.1)
     inputs = spec.inputs
-    # The filter of a thermometer needs more time for a reading than the tracker for a state, so
-    # each mean is over two steps, unless a mean over more than 8 s would delay the dynamic regime.
+    # A reading needs more computing time than a state, so readings are averaged over two steps,
+    # unless a mean over more than 8 s would delay the dynamic regime.
     mean_s = 2.0 * step_s if step_s <= 4.0 else step_s
     bag, detector = averaged(bag, model.detector, inputs, mean_s)
     config = ThermalConfig()
@@ -455,7 +453,7 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
     reading = next(readings, None)
     for stamp_ns in range(begin_ns, max(bag.end_ns, begin_ns) + step_ns, step_ns):
         # As in the node, a state depends on all readings with a stamp up to that of the state. A
-        # mean has the mean stamp of its readings, so single readings may be one step later.
+        # mean has the mean stamp of its readings, so some of these may be later, by up to a step.
         while reading is not None and reading[1] <= stamp_ns:
             tracker.read(*reading)
             reading = next(readings, None)
