@@ -3,8 +3,9 @@
 """
 Owns the conversion of a log of any format to a bag: checks, and a report on the rows left out.
 
-At rest the norm of the specific force is gravity in any attitude. A log whose stated unit
-contradicts gravity is refused: otherwise a factor of 9.8 would remain in the calibration.
+At rest the norm of the specific force is gravity in any attitude. A log is refused if its samples
+at rest do not have this norm in the stated unit, because a wrong unit would remain in the
+calibration as a factor, such as 9.8.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -40,8 +41,8 @@ _TOLERANCE = 0.2
 _SENSITIVITIES = (2048, 4096, 8192, 16384)
 
 _CELL_S, _MIN_SAMPLES = 0.5, 12  # length of a cell of samples [s], least number of samples in it
-# Ratio of a cell's sd to the lower quartile of the cells' sds, above which the cell is a movement;
-# noise alone gives cells of 12 samples a ratio below 2.
+# Ratio of a cell's sd to the lower quartile of all cells' sds, above which the unit moves in the
+# cell; noise alone gives cells of 12 samples a ratio below 2.
 _MOVING_RATIO = 4.0
 _MERGE_NS = 10 * 10**9  # shortest rest between two separate movements [ns]
 
@@ -71,7 +72,7 @@ class ForeignLog:
     clip: tuple[float, float] | None = None  # readings at which the sensor is saturated
     frame_id: str = 'imu_link'
     serial: str = ''
-    short: Sequence[int] = ()  # lines, or numbers of messages, dropped for missing cells
+    short: Sequence[int] = ()  # numbers of the lines or messages dropped for missing cells
     not_used: tuple[str, ...] = ()  # columns of a table that are not written to the bag
     continued: tuple[int, ...] = ()  # numbers of the lines after an overflow of a 32-bit time
     metadata: Mapping[str, str] = field(default_factory=dict)
@@ -293,8 +294,8 @@ def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:
     if not full.any():
         return Stillness(float('nan'), float('nan'), 0.0, ())
     sd = np.sqrt(cells.variance[full].mean(axis=1))
-    # The quiet level is the lower quartile of the cells' sd, as a unit may be handled for most of
-    # a log. The quiet level is at least a quantum, as smaller noise is not visible.
+    # The quiet level is the lower quartile and not the median of the cells' sd, because a unit
+    # may be handled for most of a log; it is at least a quantum: smaller noise is not visible.
     is_quiet = sd <= _MOVING_RATIO * max(np.quantile(sd, 0.25), cells.quantum.max())
     cell_ns = round(cells.cell_s * 1e9)
     moving: list[tuple[int, int]] = []

@@ -31,8 +31,8 @@ from ..errors import CalibrationError
 from ..plain_yaml import load_plain_yaml
 from ..typing import Floats
 
-_ARDUPILOT_REFERENCE_C = 35.0
-_ARDUPILOT_SCALE = 1e6
+_ARDUPILOT_REFERENCE_C = 35.0  # temperature at which d of ArduPilot's cubic is 0 [degC]
+_ARDUPILOT_SCALE = 1e6  # ArduPilot's coefficient / that in m/s^2 or rad/s per power of kelvin
 # ArduPilot's value for an unknown temperature of the offset calibration [degC].
 _NO_TEMPERATURE = -273.0
 _AXES = ('X', 'Y', 'Z')
@@ -50,7 +50,7 @@ _HEADING = re.compile(r'\s*(#|Misalignment Matrix|Scale Matrix|Bias Vector)')
 
 @dataclass(frozen=True)
 class Content:
-    """A tool's file: ``a = matrix (N - bias)``, N: readings, bias: cubic of temperature."""
+    """Content of a tool's file: ``a = matrix (N - bias)``, with the reading N."""
 
     matrix: Floats  # shape (3, 3); the identity in an autopilot's file
     bias: Floats  # coefficients of the cubic of each axis, in units of N, shape (3, 4)
@@ -112,7 +112,7 @@ def _within(number: int | None, lowest: int) -> int:
 
 
 def _read_px4(text: str, number: int | None) -> Content | None:
-    """Read PX4 TC_A parameters (QGroundControl's format or ``NAME=VALUE``); None without any."""
+    """Read PX4 parameters (QGroundControl's format or ``NAME=VALUE``); None if no TC_A exists."""
     values = _Parameters(text)
     numbers = {int(name[4]) for name in values if re.match(r'TC_A\d_X1_', name)}
     if not numbers:
@@ -129,12 +129,13 @@ def _read_px4(text: str, number: int | None) -> Content | None:
     bias, reference, lower, upper = cubics(f'TC_A{number}_')
     rate_bias = None
     if values.get('TC_G_ENABLE', 1.0) == 1.0 and f'TC_G{number}_X1_0' in values:
-        rate_bias, rate_reference, *edges = cubics(f'TC_G{number}_')
+        rate_bias, rate_reference, *rate_range = cubics(f'TC_G{number}_')
+        # Expand the cubics about `reference`, the temperature at which d of TC_A is 0.
         moved = np.polynomial.Polynomial((reference - rate_reference, 1.0))
         for row in rate_bias:
             coefficients = np.polynomial.Polynomial(row)(moved).coef
             row[:] = np.pad(coefficients, (0, 4 - len(coefficients)))
-        lower, upper = max(lower, edges[0]), min(upper, edges[1])
+        lower, upper = max(lower, rate_range[0]), min(upper, rate_range[1])
     source, notes = f'PX4 TC_A{number}_*', [_THERMAL_NOTE]
     return Content(np.eye(3), bias, reference, (lower, upper), notes, source, rate_bias=rate_bias)
 
@@ -226,8 +227,8 @@ def rotation_notes(rotation: Floats) -> list[str]:
     yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
     angles = f'{roll:.6g} {pitch:.6g} {yaw:.6g}'
     return [
-        "the axes of the other tool's frame differ from those of thermo_comp's: the tf from the "
-        f"other tool's frame to thermo_comp's has roll, pitch, yaw {angles} rad"
+        "the axes of the other tool's frame differ from thermo_comp's: the tf from the other "
+        f"tool's frame to thermo_comp's has roll, pitch, yaw {angles} rad"
     ]
 
 
