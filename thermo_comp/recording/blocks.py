@@ -33,8 +33,7 @@ BLOCK_MESSAGES = 1 << 15
 NO_STAMP_NS = -(2**31) * 10**9
 _JUMP_NS = 10**9  # backward steps of the stamps above this are jumps of time [ns]
 LONGEST_PAUSE_NS = 3600 * 10**9  # longer jumps of the stamps are shortened to this length [ns]
-#: Largest number of jumps of the stamps by over an hour in a recording that is read.
-_MOST_JUMPS = 100
+_MOST_JUMPS = 100  # a recording with more jumps of the stamps by over an hour is refused
 # A thermometer is taken to use another clock than the accelerometer if the median distance [s] of
 # its readings (`_FEWEST_READINGS` or more) from the samples around them is above `_APART_S`.
 _FEWEST_READINGS, _APART_S = 10, 10.0
@@ -274,7 +273,7 @@ def unstamped(stamp_ns: int) -> str:
 
 
 def clocks_apart(block: Block) -> str:
-    """Return a warning for equal stamps, or for samples and readings of two clocks, or ''."""
+    """Return a warning if all stamps are equal, or if readings have another clock; else ''."""
     stamps = block.accel_stamp_ns
     if len(stamps) >= _FEWEST_READINGS and (stamps == stamps[0]).all():
         return unstamped(int(stamps[0]))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the spans of an MCAP file that hold messages: decompresses them and finds their messages.
+Owns the parts of an MCAP file that hold messages: decompresses the parts, finds the messages.
 
 A complete chunk must expand to the size that it declares, at most 64 MiB. The message index of a
 chunk is only used if the messages in the index fill the chunk without gap or overlap; otherwise
@@ -47,7 +47,7 @@ MAX_CHUNK_BYTES = 1 << 26  # largest declared content of a chunk [bytes]
 _MAX_GROWTH = 1024
 _FREE_GROWTH_BYTES = 1 << 26
 _MAX_WINDOW = 1 << 27  # largest window of zstd [bytes]
-_STEP_BYTES = 1 << 16  # bytes decompressed at a time; the first damaged piece of data is lost
+_STEP_BYTES = 1 << 16  # bytes decompressed at a time; pieces of this size before damage are kept
 _ENGINES: Mapping[str, Callable[[], Any]] = {
     'lz4': lz4.frame.LZ4FrameDecompressor,
     'bz2': bz2.BZ2Decompressor,
@@ -166,7 +166,7 @@ def _indexed(data: Bytes, index: memoryview) -> Messages | None:
         is_sound = opcode == Opcode.MESSAGE_INDEX and content == length + 6
         if not is_sound or length % _INDEX_ROW_BYTES or begin + length > len(index):
             return None
-        # An unsigned offset above 2^63 becomes negative: `is_inside` refuses negative offsets.
+        # An unsigned offset of 2^63 or more becomes negative, which `is_inside` refuses.
         columns.append(np.frombuffer(index, '<i8', length // 8, begin)[1::2])
         begin += length
     at = np.sort(np.concatenate(columns), kind='stable') if columns else np.empty(0, np.int64)
@@ -174,7 +174,7 @@ def _indexed(data: Bytes, index: memoryview) -> Messages | None:
     if begin != len(index) or not is_inside:
         return None
     head = gather(data, at, MESSAGE_HEAD_BYTES)
-    # For a too small length the unsigned difference is huge, which the next test refuses.
+    # For a length that is too small, the unsigned difference is huge, which the next test refuses.
     length = number_at(head, 1, '<u8') - np.uint64(_MESSAGE_FIELDS_BYTES)
     if int(np.max(length)) > len(data) or (number_at(head, 0, 'u1') != MESSAGE).any():
         return None
@@ -264,7 +264,7 @@ def inflate_ros1_chunk(packed: bytes) -> bytes:
 
 
 def _pieces(compression: str, source: Any, limit: int, step: int) -> Iterator[bytes]:
-    """Decompress bytes or a zstd file in pieces of `step` bytes; DamagedError above `limit`."""
+    """Decompress a source in pieces of `step` bytes; DamagedError above `limit` bytes in all."""
     n_left = limit
     for piece in iter(partial(_reader(compression, source), step), b''):
         n_left -= len(piece)

@@ -144,7 +144,7 @@ _BASE, _NAME, _ARRAY = 1, 2, 3
 
 
 class _Cursor:
-    """The place up to which each of many messages has been read [bytes after encapsulation]."""
+    """The offset up to which each message of a batch has been read [bytes after encapsulation]."""
 
     def __init__(self, messages: Messages, definitions: Definitions) -> None:
         self._messages, self._definitions = messages, definitions

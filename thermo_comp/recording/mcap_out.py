@@ -41,7 +41,7 @@ _COMPRESSORS: Mapping[Compression, Callable[[Any, int], Any]] = {
 }
 #: Transient-local topics (a late subscriber gets the last message), without their namespace.
 _LATCHED = tuple(topic.name for topic in OUTPUTS if topic.is_latched)
-_INFINITE = {'sec': 9223372036, 'nsec': 854775807}
+_INFINITE = {'sec': 9223372036, 'nsec': 854775807}  # an infinite duration of a QoS profile
 # Typed as any callable: the type hints differ between versions of the `mcap` library.
 _new_builder: Callable[[], Any] = RecordBuilder
 #: Head of a message record: opcode, length, channel, sequence, log time, publish time.
@@ -266,6 +266,6 @@ def _offered_qos(topic: str) -> dict[str, Any]:
 
 def dump_yaml(content: Any) -> str:
     """Write YAML in block style with the keys in their order."""
-    # Write repeated values in full, without YAML aliases.
+    # The dumper writes repeated values in full, without YAML aliases.
     dumper: Any = type('Dumper', (yaml.SafeDumper,), {'ignore_aliases': lambda *_: True})
     return str(yaml.dump(content, None, dumper, sort_keys=False, allow_unicode=True, width=10_000))

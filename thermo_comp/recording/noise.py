@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the noise of samples at rest: finds glitches (single samples with wrong bits, as after a
-transfer error), and limits of a cell's variance and roughness for low-pass filtered noise.
+Owns the noise of samples at rest: glitches (single samples with wrong bits, as after a transfer
+error), and limits of a cell's variance and roughness for low-pass filtered noise.
 
 A cell is a run of samples of 0.5 s or longer; its roughness is half the mean square change from
 sample to sample, which equals the variance for white noise.
@@ -88,8 +88,9 @@ def roughest_at_rest(cells: Cells, quiet: Bools, is_coloured: Bools, ratio: floa
     """
     Return the largest roughness of a cell at rest, per axis; infinite for white noise. `ratio`:
     largest variance at rest / noise variance. In coloured noise a step does not show in mean and
-    variance, but in the changes from sample to sample. The roughness is taken as chi-square
-    distributed, with degrees of freedom by the ratio of its tenth percentile to its median.
+    variance, but in the changes from sample to sample. The roughness is assumed to have a
+    chi-square distribution, with as many degrees of freedom as the ratio of its tenth percentile
+    to its median requires.
     """
     result = np.full(3, np.inf)
     for axis in np.flatnonzero(is_coloured) if quiet.any() else ():

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the survey of a recording before a fit: duration, rates, temperatures, rests, gaps, and the
-messages for recordings that are not of an accelerometer at rest.
+Owns the survey of a recording before a fit: duration, rates, temperatures, rests and gaps, and
+messages on samples that an accelerometer at rest does not send.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -54,16 +54,16 @@ class ThermometerSurvey:
 
 @dataclass(frozen=True)
 class Survey:
-    """Summary of a recording: still intervals of 3 s or more, findings on obstacles to a fit."""
+    """Summary of a recording with `n` samples."""
 
     info: RecordingInfo
     n: int
     duration_s: float
     rate_hz: float  # inverse of the median interval between samples of the first block
-    n_still: int
-    still_s: float
+    n_still: int  # number of still intervals of 3 s or more
+    still_s: float  # sum of the lengths of these intervals
     thermometers: Mapping[str, ThermometerSurvey]
-    findings: list[str]
+    findings: list[str]  # problems of the recording, and what a fit lacks
 
 
 def thermal_findings(
@@ -129,7 +129,7 @@ def survey_recording(
         topic = reader.topics.get('accel')
         total = reader.info.topics[topic][1] if topic else 0
         accumulator, causes = CellAccumulator(_CELL_S, None), CauseCounter()
-        # All temperature readings fit into memory: a test has far fewer readings than samples.
+        # Keep all temperature readings in memory: they are far fewer than the samples.
         readings: dict[str, list[Readings]] = {}
         clock = _Clock()
         for block in reader.blocks():
@@ -166,14 +166,14 @@ def survey_recording(
 
 @dataclass
 class _Clock:
-    """Statistics of the stamps so far: first block's median interval, gaps, stamps not rising."""
+    """Statistics of the samples' stamps: their median interval, gaps and backward steps."""
 
     n: int = 0
     earliest_ns: int = 0
     latest_ns: int = 0
     last_ns: int = 0
     newest_ns: int = 0  # newest stamp since the last restart of the clock
-    step_ns: float = 0.0
+    step_ns: float = 0.0  # median interval of the first stamps that rise
     n_backwards: int = 0  # number of stamps not later than the newest stamp before
     n_restarts: int = 0  # number of steps back by more than `LONGEST_PAUSE_NS`
     n_gaps: int = 0

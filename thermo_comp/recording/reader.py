@@ -42,8 +42,8 @@ from .serialized import Messages
 from .topics import WHOLE, Selected, Topics, select_topics, shown
 from .wire import Feed, decode_blocks
 
-_MAX_BYTES = 1 << 24
-_COMPRESSIONS = {'none': '', 'file': 'file', 'message': 'message'}
+_MAX_BYTES = 1 << 24  # largest size of metadata.yaml [bytes], and largest number of its nodes
+_COMPRESSIONS = {'none': '', 'file': 'file', 'message': 'message'}  # by `compression_mode`
 #: Largest batch that is decoded at a time from a `ForeignFile`: messages, bytes, time [ns].
 _BATCH_MESSAGES = 1 << 14
 _BATCH_BYTES, _BATCH_NS = 1 << 23, 10 * 10**9
@@ -240,7 +240,7 @@ def inspect_recording(path: str | Path) -> RecordingInfo:
 
 @dataclass(frozen=True, slots=True)
 class _Description:
-    """Files of a bag, their compression, number of messages by topic, a note on missing parts."""
+    """Files of a bag, compression, `counts` of messages by topic, `note` on missing parts."""
 
     storage: str
     files: tuple[Path, ...]

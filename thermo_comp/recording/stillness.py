@@ -5,10 +5,11 @@ Owns still intervals: sums samples in short cells (count, mean, variance) and fi
 
 Two tests are relative to the noise of the bag's quiet cells: the variance inside a cell
 (vibration, handling) and the step of the mean between adjacent cells (a turn, a knock). A step
-starts a new interval, because a tilt by a microradian changes a sample by a micro-g. Temperature
-tilts a unit at rest, too: a steady change of the mean by at most 50 micro-g/s in several cells is
-a drift, no step. Two tests have absolute limits, because even a flight has quiet cells: at rest
-the sd of samples is below `still_sd`, and the angular rate within 1 deg/s of its median.
+starts a new interval, because a tilt by a microradian changes a sample by a micro-g. A change of
+temperature tilts a unit at rest, too: if the mean changes steadily by at most 50 micro-g/s over
+several cells, this is a drift and not a step. Two tests have absolute limits, because even a
+flight has quiet cells: at rest the sd of samples is at most `still_sd`, and the angular rate is
+within 1 deg/s of its median.
 """
 
 from collections.abc import Sequence
@@ -35,15 +36,15 @@ _ROTATION_S = 10.0
 _STEP_SDS = 8.0
 # Number of steps between cells whose median is the drift; largest drift [g/s].
 _DRIFT_STEPS, _DRIFT = 9, 5e-5
-# Number of samples searched for a quantum; smallest number of changes from sample to sample that
-# show a quantum if all changes are whole multiples of the smallest change.
+# Number of samples searched for a quantum; smallest number of changes from sample to sample from
+# which the smallest change is taken for the quantum if all changes are whole multiples of it.
 _QUANTUM_SAMPLES, _STEPS_NEEDED = 20000, 10
 STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # whole cells fill one of these numbers of windows
 _LONGEST_CELL_NS = 86400e9  # limit of a cell's length, for wrong stamps [ns]
 MIN_SAMPLES = 30  # usual smallest number of samples in a cell
 _LARGEST = 1e100  # largest valid sample: squares of larger samples may overflow
 _WORD = 32768.0  # middle of the range of unsigned 16-bit numbers
-_LONGER = (23, 31)  # magnitude bits of 24- and 32-bit words
+_LONGER = (23, 31)  # numbers of bits of 24- and 32-bit words, without the sign
 _STUCK = 0.3  # ratio of the noise's sd to the quantum below which most samples are equal
 
 
@@ -91,6 +92,7 @@ class CellAccumulator:
     """
     Reduces streamed samples to cells of `cell_s`, or of `least` samples if these last longer.
     Whole cells fill a window of `window_s` or, if a cell is longer than a window, 2 to 60 windows.
+    Samples of `full_scale` or more are saturated and dropped.
     """
 
     def __init__(
@@ -106,8 +108,9 @@ class CellAccumulator:
         self._last_ns: int | None = None
         self._last = np.zeros((0, 3))  # last sample of the previous block
         self._shift = np.zeros(3)
-        # Row of a cell: its number, number of samples, sums of times, samples and their squares;
-        # change from the cell before; sum of squared changes. The last cell may grow.
+        # Columns of a cell's row: its number; number of samples; sums of the times, of samples
+        # (and rates) and of their squares; change of the samples from the cell before; sums of
+        # squared changes from sample to sample. The last row changes while samples are added.
         self._sums: list[Floats] = [np.empty((0, 15))]
         self._n_dropped = self._n_saturated = self._n_glitches = self._n_repeated = 0
         self._n_looked_at = 0
@@ -250,7 +253,7 @@ def widened(full_scale: float, samples: Floats) -> float:
 
 
 def _part_of(window_s: float, least_ns: float) -> float:
-    """Raise a cell length [ns] so that whole cells fill 1 to 60 windows, unless it is longer."""
+    """Raise a cell length [ns] until whole cells fill 1 to 60 windows, if it is not longer."""
     for stretch in STRETCHES:
         n_cells = int(stretch * window_s * 1e9 / least_ns * (1.0 + 1e-6))
         if n_cells:
@@ -311,9 +314,9 @@ def still_runs(
     level = np.quantile(cells.variance[plausible], 0.1, axis=0)
     colour = spread_of_variances(cells, plausible, level)
     # A sensor that repeats one number does not show its noise; samples that toggle between two
-    # adjacent numbers have a variance of a quarter quantum squared. For white noise and cells of
-    # 60 samples, 1.3 times the tenth percentile of the variances equals the mean variance; for
-    # cells of 32 samples, 0.9 times the mean variance.
+    # adjacent numbers have a variance of a quarter quantum squared. For white noise, 1.3 times
+    # the tenth percentile of the variances equals the mean variance if cells have 60 samples, and
+    # 0.9 times the mean variance if cells have 32 samples.
     noise = np.maximum(1.3 * level * colour, 0.25 * cells.quantum**2)
     # A drift of d within a cell has a variance of d^2 / 12; twice this variance allows for noise.
     within = np.concatenate((drift[:1], (drift[1:] + drift[:-1]) / 2.0, drift[-1:]))

@@ -135,7 +135,7 @@ _USUAL = Topics()
 
 
 class Selected(NamedTuple):
-    """Topics and fields by role (``accel``, thermometers), counts or imu, note on topics."""
+    """Topics and fields by role; input of the samples; `chosen`: notes on topics, or None."""
 
     topics: dict[Role, str]
     fields: dict[Role, str]
@@ -179,7 +179,8 @@ def choice_note(name: str, key: str, wanted: str, among: str) -> str:
     """Return the note that a topic was chosen by its type; '' if its name is the wanted one."""
     if is_called(name, split_field(wanted)[0]):
         return ''
-    return f'{shown(name)}, its {among} {_TYPES[key].rpartition("/")[2]}, is taken for {key}'
+    kind = _TYPES[key].rpartition('/')[2]
+    return f'{shown(name)}, the {among} {kind} of the bag, is taken for {key}'
 
 
 def select_topics(
@@ -325,15 +326,15 @@ def is_called(name: str, wanted: str) -> bool:
 def _match(present: Present, wanted: str, key: str) -> str | None:
     """Return the topic with a name, or else the only topic with this name in a namespace."""
     bare = split_field(wanted)[0].strip('/')
-    spaced = [name for name in present if name.strip('/') == bare][:1]
-    spaced = spaced or sorted(name for name in present if name.endswith('/' + bare))
-    if len(spaced) > 1:
+    names = [name for name in present if name.strip('/') == bare][:1]
+    names = names or sorted(name for name in present if name.endswith('/' + bare))
+    if len(names) > 1:
         raise RecordingError(
-            f'several topics end in this name: {", ".join(map(shown, spaced[:_MAX_LISTED]))}; '
+            f'several topics end in this name: {", ".join(map(shown, names[:_MAX_LISTED]))}; '
             f'choose one with --topic {key}=TOPIC',
             key=wanted,
         )
-    return spaced[0] if spaced else None
+    return names[0] if names else None
 
 
 def _missing(present: Present, wanted: Mapping[str, str], corrected: str = '') -> RecordingError:

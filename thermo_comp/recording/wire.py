@@ -34,13 +34,13 @@ from .topics import shown
 _IMU_COLUMNS = (slice(0, 4), slice(4, 13), slice(13, 16), slice(16, 25), slice(28, 37))
 _IMU_ACCELERATION = slice(25, 28)
 
-HEAD_BYTES = 16
-_MAX_PADDING = 7
-_NS = 1_000_000_000
+HEAD_BYTES = 16  # number of bytes before the characters of frame_id
+_MAX_PADDING = 7  # largest number of bytes after the numbers
+_NS = 1_000_000_000  # nanoseconds per second
 
 
 class Feed(NamedTuple):
-    """A channel of a bag, its role (``accel`` or a thermometer), its topic, the field to read."""
+    """A channel of a bag with its role (``accel`` or a thermometer), topic and field to read."""
 
     channel: int
     role: Role
