@@ -64,6 +64,7 @@ _BAROMETERS = {'vehicle_air_data': 'baro_temp_celcius', 'sensor_baro': 'temperat
 _TOPICS = ('sensor_accel', 'sensor_gyro', 'sensor_combined', *_BAROMETERS)
 _NOT_THERE = 2**31 - 1  # `accelerometer_timestamp_relative` of a message without an accelerometer
 _HEADER_BYTES = 3  # number of bytes of a DataFlash message before its fields
+_MESSAGE_TYPES = re.compile(r'IMU\d?|BARO|BAR\d|PARM')  # those of DataFlash that are read
 _VECTORS = ('AccX', 'AccY', 'AccZ', 'GyrX', 'GyrY', 'GyrZ')
 
 
@@ -137,8 +138,8 @@ def _ulog(path: Path) -> _Content:
     accels, gyros, hint = by_topic['sensor_accel'], by_topic['sensor_gyro'], ''
     correction = None
     if not accels:
-        both = {number: _combined(pair) for number, pair in by_topic['sensor_combined'].items()}
-        accels, gyros = ({number: pair[part] for number, pair in both.items()} for part in (0, 1))
+        for number, columns in by_topic['sensor_combined'].items():
+            accels[number], gyros[number] = _combined(columns)
         hint = (
             'the log has no sensor_accel: the samples are those of sensor_combined, which PX4 has '
             f'corrected by CAL_ACC*; to record raw samples, {_PROFILE}'
@@ -227,9 +228,7 @@ def _dataflash(path: Path) -> _Content:
     metadata = notes if any(str(key).startswith('SIM_') for key in reader.params) else {}
     changes: dict[str, list[tuple[int, float]]] = {}
     try:
-        for name in sorted(reader.name_to_id):
-            if not re.fullmatch(r'IMU\d?|BARO|BAR\d|PARM', name):
-                continue
+        for name in filter(_MESSAGE_TYPES.fullmatch, sorted(reader.name_to_id)):
             table, short = _messages(reader, name)
             stamp_us = table.get('TimeUS', table.get('TimeMS', np.empty(0)) * 1000.0)
             if name == 'PARM' and table.keys() >= {'Name', 'Value'}:

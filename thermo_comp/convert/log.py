@@ -23,7 +23,7 @@ from ..files import shown_name
 from ..fitting.sources import digest
 from ..recording.blocks import ImuColumns, Readings
 from ..recording.overview import KELVINS
-from ..recording.stillness import CellAccumulator
+from ..recording.stillness import CellAccumulator, is_full
 from ..recording.topics import Topics
 from ..recording.writer import STAMP_END_NS, BagWriter
 from ..text import valid_serial
@@ -289,8 +289,7 @@ def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:
         run = slice(first, first + _RUN_ROWS)
         reduced.add(stamp_ns[run], accel[run])
     cells = reduced.cells()
-    usual = float(np.median(cells.count)) if len(cells.count) else 0.0
-    full = cells.count >= max(_MIN_SAMPLES, 0.5 * usual)
+    full = is_full(cells, _MIN_SAMPLES)
     if not full.any():
         return Stillness(float('nan'), float('nan'), 0.0, ())
     sd = np.sqrt(cells.variance[full].mean(axis=1))

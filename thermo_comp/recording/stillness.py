@@ -150,13 +150,10 @@ class CellAccumulator:
             self._quantum = np.where(self._quantum > 0.0, self._quantum, quantum)
             self._n_looked_at += int((part[1:] != part[:-1]).any(axis=1).sum()) + 1
         self._is_integer = self._is_integer and bool((samples == np.rint(samples)).all())
-        rate = None if rate is None else rate[use]
         glitches = is_glitch(samples, self._quantum)
-        if glitches.any():
-            self._n_glitches += int(glitches.sum())
-            stamp_ns, samples = stamp_ns[~glitches], samples[~glitches]
-            rate = None if rate is None else rate[~glitches]
-        self._accumulate(stamp_ns, samples, rate)
+        self._n_glitches += int(glitches.sum())
+        rate = None if rate is None else rate[use][~glitches]
+        self._accumulate(stamp_ns[~glitches], samples[~glitches], rate)
 
     def forget(self, stamp_ns: int) -> None:
         """Drop the cells before a stamp [ns]."""
@@ -306,7 +303,7 @@ def still_runs(
     Return the runs of still cells of any length for each value of `ratios`, the largest ratio of a
     still cell's variance to the noise variance; `still_sd` is the largest sd at rest [g].
     """
-    full = _is_full(cells)
+    full = is_full(cells)
     plausible = full & is_under(cells, still_sd) & ~_is_turning(cells)
     if not plausible.any():
         return [[] for _ in ratios]
@@ -353,7 +350,7 @@ def without_rotation(cells: Cells) -> Cells:
 
 def why_restless(cells: Cells, still_sd: float = STILL_SD) -> str:
     """Describe why a bag has no rests."""
-    full, under = _is_full(cells), is_under(cells, still_sd)
+    full, under = is_full(cells), is_under(cells, still_sd)
     if full.any() and not (full & under).any():
         quietest = np.sqrt(np.min(cells.variance[full].max(axis=1))) / _one_g(cells)
         return (
@@ -370,9 +367,10 @@ def why_restless(cells: Cells, still_sd: float = STILL_SD) -> str:
     return text + 'but must rest in each position'
 
 
-def _is_full(cells: Cells) -> Bools:
+def is_full(cells: Cells, least: float = 2.0) -> Bools:
+    """Whether a cell has `least` samples or more, and at least half of the median number."""
     usual = float(np.median(cells.count)) if len(cells.count) else 0.0
-    return np.asarray(cells.count >= max(2.0, 0.5 * usual))
+    return np.asarray(cells.count >= max(least, 0.5 * usual))
 
 
 def _one_g(cells: Cells) -> float:

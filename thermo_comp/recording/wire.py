@@ -31,8 +31,8 @@ from .serialized import Messages, gather, number_at
 from .topics import shown
 
 #: Indices of the fields of `ImuColumns` among the 37 numbers of sensor_msgs/Imu.
-_IMU_COLUMNS = (slice(0, 4), slice(4, 13), slice(13, 16), slice(16, 25), slice(28, 37))
-_IMU_ACCELERATION = slice(25, 28)
+IMU_COLUMNS = (slice(0, 4), slice(4, 13), slice(13, 16), slice(16, 25), slice(28, 37))
+IMU_ACCELERATION = slice(25, 28)
 
 HEAD_BYTES = 16  # number of bytes before the characters of frame_id
 _MAX_PADDING = 7  # largest number of bytes after the numbers
@@ -73,7 +73,8 @@ def decode_blocks(
                 taken = as_cdr(taken, topics[role].type)
             if role in fields:
                 read_ns, values = fields[role].read(taken)
-                rows = encode_stamped(read_ns, '', N_NUMBERS[kind], [(0, values[:, None])])
+                pieces = [(slice(0, 1), values[:, None])]
+                rows = encode_stamped(read_ns, '', N_NUMBERS[kind], pieces)
                 taken = Messages.of_rows(rows, taken.channel, taken.log_ns)
             stamp_ns, numbers, frame = decode_stamped(taken, kind)
         except RecordingError as error:
@@ -85,8 +86,8 @@ def decode_blocks(
             changes = [] if is_equal else rank[1:][frame[1:] != frame[:-1]].tolist()
             if changes:
                 runs = (slice(*run) for run in pairwise([0, *changes, len(messages)]))
-                pieces = (messages.take(run) for run in runs)
-                return [decode_blocks(part, feeds, roles, keep_raw=keep_raw)[0] for part in pieces]
+                parts = (messages.take(run) for run in runs)
+                return [decode_blocks(part, feeds, roles, keep_raw=keep_raw)[0] for part in parts]
             accel, samples_ns, samples, frames = rank, stamp_ns, numbers, frame
         else:
             after = np.searchsorted(accel, rank).astype(np.int64)
@@ -94,11 +95,11 @@ def decode_blocks(
         log_ns[role] = taken.log_ns
         if keep_raw and len(taken):
             raw[role] = taken.packed()
-    imu = ImuColumns(*(samples[:, c] for c in _IMU_COLUMNS)) if is_imu else None
+    imu = ImuColumns(*(samples[:, c] for c in IMU_COLUMNS)) if is_imu else None
     if imu is not None:
         # A covariance with the first element -1 marks an acceleration that was not measured.
         is_absent = imu.linear_acceleration_covariance[:, :1] == -1.0
-        samples = np.where(is_absent, np.nan, samples[:, _IMU_ACCELERATION])
+        samples = np.where(is_absent, np.nan, samples[:, IMU_ACCELERATION])
     frame_id = frames[0].decode('utf-8', 'replace') if len(frames) else ''
     return [Block(samples_ns, samples, frame_id, imu, temperatures, log_ns, raw)]
 
@@ -144,11 +145,11 @@ def decode_stamped(messages: Messages, kind: str) -> tuple[Ints, Floats, NDArray
 
 
 def encode_stamped(
-    stamp_ns: Ints, frame_id: str, n_numbers: int, pieces: Sequence[tuple[int, Floats]]
+    stamp_ns: Ints, frame_id: str, n_numbers: int, pieces: Sequence[tuple[slice, Floats]]
 ) -> Bytes:
     """
     Serialize (CDR, little-endian) a header and float64 numbers as rows of bytes, shape (n, size).
-    Each piece is the index of its first number in the message, and values of shape (n, width), or
+    A piece has the indices of its numbers in a message, and their values, of shape (n, width), or
     (width,) if equal in all messages; other numbers are 0.
     """
     text = frame_id.encode() + b'\0'
@@ -156,18 +157,18 @@ def encode_stamped(
     body = 4 + (len(head) + 3) // 8 * 8
     row = np.frombuffer(bytearray(head.ljust(body, b'\0') + bytes(8 * n_numbers)), np.uint8)
     # Values that are equal in all messages are written once, into `row`, before `row` is copied.
-    for column, values in pieces:
+    for place, values in pieces:
         if values.ndim == 1:
-            row[body:].view('<f8')[column : column + len(values)] = values
+            row[body:].view('<f8')[place] = values
     data = np.empty((len(stamp_ns), len(row)), np.uint8)
     data[:] = row
     seconds = stamp_ns // _NS
     data[:, 4:8].view('<i4')[:, 0] = seconds
     data[:, 8:12].view('<u4')[:, 0] = stamp_ns - seconds * _NS
     numbers = data[:, body:].view('<f8')
-    for column, values in pieces:
+    for place, values in pieces:
         if values.ndim > 1:
-            numbers[:, column : column + values.shape[1]] = values
+            numbers[:, place] = values
     return data
 
 
