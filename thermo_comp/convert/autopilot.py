@@ -64,7 +64,7 @@ _BAROMETERS = {'vehicle_air_data': 'baro_temp_celcius', 'sensor_baro': 'temperat
 _TOPICS = ('sensor_accel', 'sensor_gyro', 'sensor_combined', *_BAROMETERS)
 _NOT_THERE = 2**31 - 1  # `accelerometer_timestamp_relative` of a message without an accelerometer
 _HEADER_BYTES = 3  # number of bytes of a DataFlash message before its fields
-_MESSAGE_TYPES = re.compile(r'IMU\d?|BARO|BAR\d|PARM')  # those of DataFlash that are read
+_MESSAGE_TYPES = re.compile(r'IMU\d?|BARO|BAR\d|PARM')  # DataFlash messages that are read
 _VECTORS = ('AccX', 'AccY', 'AccZ', 'GyrX', 'GyrY', 'GyrZ')
 
 
@@ -236,8 +236,9 @@ def _dataflash(path: Path) -> _Content:
                     title = label.decode('ascii', 'replace')
                     changes.setdefault(title, []).append((int(at) * 1000, float(value)))
                 continue
-            old = int(name[-1]) - 1 if name[-1].isdigit() else 0  # `IMU2` has the number 1
-            table |= {'timestamp': stamp_us, 'I': table.get('I', np.full(len(stamp_us), old))}
+            by_name = int(name[-1]) - 1 if name[-1].isdigit() else 0  # `IMU2` has the number 1
+            numbers = table.get('I', np.full(len(stamp_us), by_name))
+            table |= {'timestamp': stamp_us, 'I': numbers}
             for number in np.unique(table['I'][: len(stamp_us)]).tolist():
                 columns = {title: column[table['I'] == number] for title, column in table.items()}
                 stamp_ns = _stamps(columns)

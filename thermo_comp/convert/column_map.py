@@ -216,8 +216,9 @@ def _without_wraps(table: Table, unit: TimeUnit | None) -> tuple[Ints, tuple[int
 def _read(
     path: Path, columns: Sequence[Column] | None, stamp: Stamp, style: Format | None = None
 ) -> Table:
-    read = read_parquet if path.suffix.lower() in ('.parquet', '.pq') else read_text
-    return read(path, columns, stamp, style)
+    if path.suffix.lower() in ('.parquet', '.pq'):
+        return read_parquet(path, columns, stamp)
+    return read_text(path, columns, stamp, style)
 
 
 def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:

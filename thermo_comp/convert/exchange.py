@@ -69,8 +69,8 @@ def export_calibration(
     notes += [of_counts] * (calibration.unit.input == 'counts')
     white, walk = calibration.noise_density_m_s2_sqrt_hz, calibration.slow_noise_m_s2_sqrt_h
     noise = max(white), max(walk), 1.0 / calibration.unit.cycle_time_s
-    content = replace(content, notes=notes, noise=noise)
-    text = tool.write(content, number, device_id)
+    content = replace(content, notes=notes, noise=noise, number=number, device_id=device_id)
+    text = tool.write(content)
     title = f'Thermal calibration of unit {calibration.unit.serial}, by thermo_comp'
     # Write each note as a comment line; the reader of imu_tk does not accept comments.
     head = [] if to == 'imu_tk' else [f'# {one_line(line)}\n' for line in (title, *content.notes)]

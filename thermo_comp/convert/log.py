@@ -93,7 +93,7 @@ class Stillness:
 
     magnitude: float  # median |a| of the quiet cells
     noise: float  # median sd per axis of the quiet cells
-    still_s: float
+    still_s: float  # total time of the quiet cells
     moving_ns: tuple[tuple[int, int], ...]  # stamps of begin and end of each movement
 
 

@@ -296,9 +296,7 @@ def _iso_ns(text: str) -> int:
     return seconds * 10**9 + int((fraction or '').ljust(9, '0'))
 
 
-def read_parquet(
-    path: Path, columns: Sequence[Column] | None, stamp: Stamp, _style: Format | None = None
-) -> Table:
+def read_parquet(path: Path, columns: Sequence[Column] | None, stamp: Stamp) -> Table:
     """Read columns of a Parquet file like `read_text`; with `columns` None, texts become NaN."""
     pq = import_extra('pyarrow.parquet', 'parquet', 'a Parquet file')
     import pyarrow as pa

@@ -58,6 +58,8 @@ class Content:
     range_c: tuple[float, float]
     notes: list[str]  # parts of the calibration that are lost or missing
     source: str = ''  # the tool and the parameter set that was read
+    number: int | None = None  # number of the parameter set or IMU to write
+    device_id: int = 0  # identity of the sensor in PX4; 0: unknown
     # White noise [m/s^2/sqrt(Hz)], random walk [m/s^2/sqrt(h)], sample rate [Hz]; in a file that
     # was read, 0 means that the file does not state the value.
     noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -65,12 +67,13 @@ class Content:
     text: str = ''  # the written file
 
 
-def _write_px4(content: Content, number: int | None, device_id: int) -> str:
+def _write_px4(content: Content) -> str:
     """Write PX4 parameters in QGroundControl's format; the n of ``TC_An`` counts from 0."""
-    instance = _within(number, 0)
+    instance = _within(content.number, 0)
     lower, upper = content.range_c
     lines = ['# Vehicle-Id Component-Id Name Value Type']
-    for letter, bias, known_id in (('A', content.bias, device_id), ('G', content.rate_bias, 0)):
+    sensors = ('A', content.bias, content.device_id), ('G', content.rate_bias, 0)
+    for letter, bias, known_id in sensors:
         if bias is None:
             continue
         prefix = f'TC_{letter}{instance}_'
@@ -86,9 +89,9 @@ def _write_px4(content: Content, number: int | None, device_id: int) -> str:
     return '\n'.join(lines) + '\n'
 
 
-def _write_ardupilot(content: Content, number: int | None, _device_id: int) -> str:
+def _write_ardupilot(content: Content) -> str:
     """Write ArduPilot parameters; the n of ``INS_TCALn`` counts from 1."""
-    imu = _within(number, 1)
+    imu = _within(content.number, 1)
     lower, upper = content.range_c
     content.notes.append(
         'the file has the changes of the offset with temperature, not the offset: calibrate the '
@@ -232,7 +235,7 @@ def rotation_notes(rotation: Floats) -> list[str]:
     ]
 
 
-def _write_imu_tk(content: Content, _number: int | None, _device_id: int) -> str:
+def _write_imu_tk(content: Content) -> str:
     """Write the three blocks of imu_tk's ``.calib``; imu_tk's reader accepts no comments."""
     rotation, upper = _qr(content.matrix)
     scale = np.diag(upper)
@@ -243,19 +246,19 @@ def _write_imu_tk(content: Content, _number: int | None, _device_id: int) -> str
     )
 
 
-def _write_imu_calib(content: Content, _number: int | None, _device_id: int) -> str:
+def _write_imu_calib(content: Content) -> str:
     bias = content.matrix @ content.bias[:, 0]
     return f'SM: {content.matrix.ravel().tolist()}\nbias: {bias.tolist()}\n'
 
 
-def _write_kalibr(content: Content, number: int | None, _device_id: int) -> str:
+def _write_kalibr(content: Content) -> str:
     """Write Kalibr's YAML of an IMU, without topic and gyroscope."""
     white, walk, rate = content.noise
     rows = ''.join(f'    - {row}\n' for row in np.linalg.inv(content.matrix).tolist())
     content.notes.append('Kalibr estimates the bias in each run and ignores the key `bias`')
     content.notes.append('the file lacks rostopic and gyroscope of the IMU: add these for Kalibr')
     return (
-        f'imu{number or 0}:\n  model: scale-misalignment\n  update_rate: {rate:.9g}\n'
+        f'imu{content.number or 0}:\n  model: scale-misalignment\n  update_rate: {rate:.9g}\n'
         f'  accelerometer_noise_density: {white!r}\n'
         f'  accelerometer_random_walk: {walk / 60.0!r}\n'
         f'  accelerometers:\n    M:\n{rows}    bias: {content.bias[:, 0].tolist()}\n'
@@ -351,7 +354,7 @@ def _array(value: object, key: str, size: int) -> Floats:
 class Tool:
     """Writer and reader of a tool's files, which hold bias curves (`is_thermal`) or constants."""
 
-    write: Callable[[Content, int | None, int], str]
+    write: Callable[[Content], str]
     read: Callable[[str, int | None], Content | None]  # returns None for the file of another tool
     is_thermal: bool = False
     reference_c: float | None = None  # the fixed reference temperature of an autopilot

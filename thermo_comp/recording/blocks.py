@@ -31,7 +31,7 @@ BLOCK_MESSAGES = 1 << 15
 
 #: Stands for the stamp of a message without a stamp: the earliest stamp that a header can hold.
 NO_STAMP_NS = -(2**31) * 10**9
-_JUMP_NS = 10**9  # backward steps of the stamps above this are jumps of time [ns]
+_JUMP_NS = 10**9  # a backward step of the stamps by more than this is a jump of the clock [ns]
 LONGEST_PAUSE_NS = 3600 * 10**9  # longer jumps of the stamps are shortened to this length [ns]
 _MOST_JUMPS = 100  # a recording with more jumps of the stamps by over an hour is refused
 # A thermometer is taken to use another clock than the accelerometer if the median distance [s] of
@@ -39,7 +39,7 @@ _MOST_JUMPS = 100  # a recording with more jumps of the stamps by over an hour i
 _FEWEST_READINGS, _APART_S = 10, 10.0
 #: Shortest time between successive equal readings in the result of `Readings.thinned` [ns].
 _REPEAT_NS = 10_000_000_000
-#: Longest mean interval between messages [ns] in a recording longer than `_SPARSE_NS` [ns].
+#: A recording longer than `_SPARSE_NS` with fewer messages than one per `_SPARSEST_NS` is refused.
 _SPARSE_NS, _SPARSEST_NS = 10 * 86400 * 10**9, 10 * 10**9
 
 
@@ -107,7 +107,7 @@ class ImuColumns(NamedTuple):
 
     @classmethod
     def of_rate(cls, rate: Floats | None) -> ImuColumns:
-        """Build from angular rates, None if absent; orientation marked as absent (REP 145)."""
+        """Build from angular rates (None: absent); the orientation is marked absent (REP 145)."""
         none, unknown = np.array([-1.0] + 8 * [0.0]), np.zeros(9)
         level = np.array([0.0, 0.0, 0.0, 1.0])
         if rate is None:

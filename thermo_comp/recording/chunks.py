@@ -39,7 +39,7 @@ MESSAGE_HEAD_BYTES = 31
 _MESSAGE_FIELDS_BYTES = MESSAGE_HEAD_BYTES - PREFIX.size
 MESSAGE = int(Opcode.MESSAGE)
 
-#: Reasons why reading record by record stopped.
+#: Reasons why `scan_records` stopped before the end of the data.
 _ENDS_EARLY = 'a record ends too early'
 _ZERO_OPCODE = 'a record has the opcode 0'
 MAX_CHUNK_BYTES = 1 << 26  # largest declared content of a chunk [bytes]

@@ -228,7 +228,7 @@ class McapFile(BagFile):
             self.truncated = f'the file is cut off at byte {self._size}: {ending}'
 
     def _count(self, spans: Sequence[Span], ending: str, is_whole: bool) -> str:
-        """Count all messages, and find their first and last log times; complete `ending`."""
+        """Count all messages and find their log times; return the completed text `ending`."""
         n_torn = 0
         for span in spans:
             try:
@@ -249,7 +249,7 @@ class McapFile(BagFile):
 
 
 def _in_order(pieces: Iterable[tuple[int, Messages, int | None]]) -> Iterator[Messages]:
-    """Merge pieces: each has its place in the file, messages, next piece's first log time."""
+    """Merge pieces (place in file, messages, first log time of the next piece) by log time."""
     # Messages before the first log time of the next piece are final; later messages are held.
     held: dict[int, Messages] = {}
     for row, piece, next_ns in pieces:

@@ -194,8 +194,8 @@ class McapOutput:
 
     def _put_chunk(self, messages: Messages) -> None:
         log_ns, channel, size = messages.log_ns, messages.channel, messages.size
-        laid = messages.packed(MESSAGE_HEAD_BYTES)
-        data, at = laid.data, laid.start - MESSAGE_HEAD_BYTES
+        spaced = messages.packed(MESSAGE_HEAD_BYTES)
+        data, at = spaced.data, spaced.start - MESSAGE_HEAD_BYTES
         heads: Any = np.zeros(len(at), _RECORD_HEAD)
         heads['f0'], heads['f1'] = MESSAGE, size + (MESSAGE_HEAD_BYTES - PREFIX.size)
         heads['f2'], heads['f4'], heads['f5'] = channel, log_ns, log_ns

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 # Smallest distance of a glitch from the mean of its neighbours, in sd of the noise.
 _SDS = 25.0
-# Smallest distance of a glitch from the mean of its neighbours, divided by the samples' norm. One
-# count more or less, as by the remainder that a converter carries over, is no glitch.
+# Smallest distance of a glitch from the mean of its neighbours, divided by the samples' norm. A
+# change by one count, as by the remainder that a converter carries over, is no glitch.
 _LEAST = 0.02
 # Smallest number of samples in which glitches are searched; fewer do not determine the noise.
 _FEWEST = 30

@@ -73,8 +73,8 @@ class RecordingReader(ExitStack):
                 selected = select_topics(self.info.topics, topics, require, self.info.metadata)
                 self.topics: Mapping[Role, str] = selected.topics
                 self.fields = dict(self._fields(selected))
-            bare = [role for role, field in self.fields.items() if not field.header]
-            note = f'no stamps in {", ".join(bare)}: a reading gets the stamp of the sample before'
+            bare = ', '.join(role for role, field in self.fields.items() if not field.header)
+            note = f'readings of {bare} have no stamp: each gets that of the sample before it'
             chosen = _notes(selected.chosen, note if bare else '')
             self.info = replace(self.info, input=selected.input, chosen=chosen)
         except BaseException as error:

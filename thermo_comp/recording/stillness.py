@@ -40,7 +40,7 @@ _DRIFT_STEPS, _DRIFT = 9, 5e-5
 # which the smallest change is taken for the quantum if all changes are whole multiples of it.
 _QUANTUM_SAMPLES, _STEPS_NEEDED = 20000, 10
 STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # whole cells fill one of these numbers of windows
-_LONGEST_CELL_NS = 86400e9  # limit of a cell's length, for wrong stamps [ns]
+_LONGEST_CELL_NS = 86400e9  # largest length of a cell, reached only with wrong stamps [ns]
 MIN_SAMPLES = 30  # usual smallest number of samples in a cell
 _LARGEST = 1e100  # largest valid sample: squares of larger samples may overflow
 _WORD = 32768.0  # middle of the range of unsigned 16-bit numbers
@@ -250,7 +250,7 @@ def widened(full_scale: float, samples: Floats) -> float:
 
 
 def _part_of(window_s: float, least_ns: float) -> float:
-    """Raise a cell length [ns] until whole cells fill 1 to 60 windows, if it is not longer."""
+    """Raise a cell length [ns] to one that divides 1 to 60 windows; a longer cell is kept."""
     for stretch in STRETCHES:
         n_cells = int(stretch * window_s * 1e9 / least_ns * (1.0 + 1e-6))
         if n_cells:
