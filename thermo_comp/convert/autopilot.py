@@ -238,9 +238,9 @@ def _dataflash(path: Path) -> _Content:
                 continue
             by_name = int(name[-1]) - 1 if name[-1].isdigit() else 0  # `IMU2` has the number 1
             numbers = table.get('I', np.full(len(stamp_us), by_name))
-            table |= {'timestamp': stamp_us, 'I': numbers}
-            for number in np.unique(table['I'][: len(stamp_us)]).tolist():
-                columns = {title: column[table['I'] == number] for title, column in table.items()}
+            table['timestamp'] = stamp_us
+            for number in np.unique(numbers[: len(stamp_us)]).tolist():
+                columns = {title: column[numbers == number] for title, column in table.items()}
                 stamp_ns = _stamps(columns)
                 readings = Readings(stamp_ns, _column(columns, 'T' if 'T' in columns else 'Temp'))
                 if not name.startswith('IMU'):

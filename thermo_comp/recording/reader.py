@@ -40,7 +40,7 @@ from .fields import Field, definitions_of
 from .mcap_file import McapFile
 from .serialized import Messages
 from .topics import WHOLE, Selected, Topics, select_topics, shown
-from .wire import Feed, decode_blocks
+from .wire import decode_blocks
 
 _MAX_BYTES = 1 << 24  # largest size of metadata.yaml [bytes], and largest number of its nodes
 _COMPRESSIONS = {'none': '', 'file': 'file', 'message': 'message'}  # by `compression_mode`
@@ -137,14 +137,12 @@ class RecordingReader(ExitStack):
     def _blocks(self, raw: bool = False) -> Iterator[Block]:
         def decoded() -> Iterator[Block]:
             for path, topics, messages in self._read(set(self.topics.values()), {'cdr', 'ros1'}):
-                feeds = [
-                    Feed(number, role, topic, self.fields.get(role))
+                channels = {
+                    role: {number: topic for number, topic in topics.items() if topic.name == name}
                     for role, name in self.topics.items()
-                    for number, topic in topics.items()
-                    if topic.name == name
-                ]
+                }
                 with translated(path):
-                    blocks = decode_blocks(messages, feeds, self.topics, keep_raw=raw)
+                    blocks = decode_blocks(messages, channels, self.fields, keep_raw=raw)
                 yield from blocks
 
         n_read = dict.fromkeys(self.topics, 0)
@@ -228,7 +226,7 @@ def read_recording(
 ) -> Recording:
     """Read a whole bag into memory; raises as `open_recording` does, also for damaged data."""
     with open_recording(path, topics, require=require) as reader:
-        blocks = list(reader.blocks()) or decode_blocks(Messages.of([], [], []), (), ROLES)
+        blocks = list(reader.blocks()) or decode_blocks(Messages.of([], [], []), {}, {})
         return Recording(reader.info, joined(blocks))
 
 

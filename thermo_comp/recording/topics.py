@@ -194,6 +194,7 @@ def select_topics(
         raise RecordingError('the bag holds no messages')
     name_of: dict[Role, str] = {}
     keys: dict[Role, str] = {}
+    chosen: list[str] = []
     corrected = _corrected(present, metadata)
     inputs = ['counts', 'imu'] if topics.input == 'auto' else [topics.input]
     for role, wanted in {'accel': inputs, 'board': ['board'], 'case': ['case']}.items():
@@ -203,15 +204,12 @@ def select_topics(
             name = _of_type(present, names[key], _TYPES[key], getattr(topics, key))
             if present[name][1]:
                 name_of[role], keys[role] = name, key
+                among = "driver's" if is_called(name, _RAW) else 'only'  # by REP 145, or by type
+                chosen.append(choice_note(name, key, getattr(topics, key), among))
             elif role in require:
                 raise RecordingError('the topic has no messages', key=shown(name))
         elif role in require:
             raise _missing(present, {key: getattr(topics, key) for key in wanted}, corrected)
-    chosen = []
-    for role, key in keys.items():
-        name = name_of[role]
-        among = "driver's" if is_called(name, _RAW) else 'only'  # named as in REP 145, or by type
-        chosen.append(choice_note(name, key, getattr(topics, key), among))
     if corrected and 'accel' not in name_of:
         chosen.append(_text_of_corrected(corrected))
     name_of |= _further(present, topics, name_of, is_read=bool(require))
@@ -289,22 +287,22 @@ def _further(
     present: Present, topics: Topics, topics_of: Mapping[Role, str], *, is_read: bool
 ) -> dict[str, str]:
     """Find `topics.further`, and further thermometers in the namespace of board or case."""
-    both = {}
+    further = {}
     for sensor, wanted in topics.further.items():
         name = _match(present, wanted, thermometer(sensor))
         if name is not None:
-            both[sensor] = _of_type(present, name, TEMPERATURE, wanted)
+            further[sensor] = _of_type(present, name, TEMPERATURE, wanted)
         elif is_read:
             raise _missing(present, {thermometer(sensor): wanted})
     beside = topics_of.get('board') or topics_of.get('case') or ''
     namespace, is_usual, _ = beside.rpartition('temperature/')
     front = f'{namespace}temperature/' if is_usual else '/temperature/'
-    taken = {*topics_of.values(), *both.values()}
+    taken = {*topics_of.values(), *further.values()}
     for name in of_kind(present, TEMPERATURE):
         sensor = name.removeprefix(front)
         if sensor != name and name not in taken and is_thermometer(sensor):
-            both.setdefault(sensor, name)
-    return dict(sorted(both.items()))
+            further.setdefault(sensor, name)
+    return dict(sorted(further.items()))
 
 
 def _of_type(present: Present, name: str, expected: str, wanted: str) -> str:

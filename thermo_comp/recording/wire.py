@@ -14,10 +14,10 @@ The size of messages of one type depends on `frame_id` alone; messages of one la
 of bytes, with stamps and numbers as views. `rosbags` converts ROS 1 messages one by one.
 """
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from struct import pack
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,46 +39,40 @@ _MAX_PADDING = 7  # largest number of bytes after the numbers
 _NS = 1_000_000_000  # nanoseconds per second
 
 
-class Feed(NamedTuple):
-    """A channel of a bag with its role (``accel`` or a thermometer), topic and field to read."""
-
-    channel: int
-    role: Role
-    topic: Topic
-    field: Field | None = None
-
-
 def decode_blocks(
-    messages: Messages, feeds: Collection[Feed], roles: Iterable[Role], *, keep_raw: bool = False
+    messages: Messages,
+    channels: Mapping[Role, Mapping[int, Topic]],
+    fields: Mapping[Role, Field],
+    *,
+    keep_raw: bool = False,
 ) -> list[Block]:
     """
-    Decode messages in their order; a block ends where `frame_id` changes. `roles` lists the inputs
-    found in the whole bag. A temperature in a field of another message type is in `raw` as a
-    Temperature message. RecordingError, without a path, if the bytes do not fit the message type.
+    Decode messages in their order; a block ends where `frame_id` changes. `channels`: numbers and
+    topics of the channels of each input of the bag; `fields`: the field to read of a thermometer.
+    A temperature in a field of another message type is in `raw` as a Temperature message.
+    RecordingError, without a path, if the bytes do not fit the message type.
     """
-    roles = tuple(dict.fromkeys((*ROLES, *roles)))
-    topics = {feed.role: feed.topic for feed in feeds}
-    fields = {feed.role: feed.field for feed in feeds if feed.field is not None}
-    is_imu = 'accel' in topics and topics['accel'].type == IMU
+    is_imu = any(topic.type == IMU for topic in channels.get('accel', {}).values())
     temperatures, log_ns, raw = {}, {}, {}
-    for role in roles:
+    for role in dict.fromkeys((*ROLES, *channels)):
         kind = TEMPERATURE if role != 'accel' else IMU if is_imu else VECTOR3_STAMPED
-        channels = {feed.channel: feed.topic for feed in feeds if feed.role == role}
-        rank = messages.places_of(channels)
+        topics = channels.get(role, {})
+        rank = messages.places_of(topics)
         taken = messages.take(rank)
+        topic = next(iter(topics.values()), Topic('', kind, 'cdr'))
         try:
-            if len({topic[:3] for topic in channels.values()}) > 1:
+            if len({other[:3] for other in topics.values()}) > 1:
                 raise RecordingError('its messages have several encodings')
-            if role in topics and topics[role].encoding == 'ros1':
-                taken = as_cdr(taken, topics[role].type)
-            if role in fields:
+            if topic.encoding == 'ros1':
+                taken = as_cdr(taken, topic.type)
+            if topics and role in fields:
                 read_ns, values = fields[role].read(taken)
                 pieces = [(slice(0, 1), values[:, None])]
                 rows = encode_stamped(read_ns, '', N_NUMBERS[kind], pieces)
                 taken = Messages.of_rows(rows, taken.channel, taken.log_ns)
             stamp_ns, numbers, frame = decode_stamped(taken, kind)
         except RecordingError as error:
-            raise RecordingError(error.message, key=shown(topics[role].name)) from error
+            raise RecordingError(error.message, key=shown(topic.name)) from error
         if role == 'accel':
             # Comparing bytes is a fast test of whether frame_id is constant.
             text = frame.tobytes()
@@ -86,8 +80,10 @@ def decode_blocks(
             changes = [] if is_equal else rank[1:][frame[1:] != frame[:-1]].tolist()
             if changes:
                 runs = (slice(*run) for run in pairwise([0, *changes, len(messages)]))
-                parts = (messages.take(run) for run in runs)
-                return [decode_blocks(part, feeds, roles, keep_raw=keep_raw)[0] for part in parts]
+                return [
+                    decode_blocks(messages.take(run), channels, fields, keep_raw=keep_raw)[0]
+                    for run in runs
+                ]
             accel, samples_ns, samples, frames = rank, stamp_ns, numbers, frame
         else:
             after = np.searchsorted(accel, rank).astype(np.int64)
