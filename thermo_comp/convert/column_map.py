@@ -31,8 +31,7 @@ from .table import STAMP_EXPONENTS, Format, Stamp, Table, TimeUnit, read_parquet
 
 #: Slope and offset that convert a temperature of each unit to degC.
 _CELSIUS = {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}
-#: Range of plausible intervals between samples [s], which decides the unit of the times.
-_STEPS_S = (5e-5, 0.5)
+_STEPS_S = (5e-5, 0.5)  # range of plausible intervals between samples [s]
 #: Longest plausible interval [s] if the unit turns by over `_TURN` [rad] within a block of
 #: `_BLOCK` samples, between two still blocks (sd below `_QUIET` [g]): with intervals in ms the
 #: turn would be too fast for a hand.
@@ -56,18 +55,14 @@ _A_MAP = 'a column map: --columns MAP'
 
 @dataclass(frozen=True)
 class Accel:
-    """
-    The accelerometer's three columns; `output` is the message written, counts or Imu (m/s^2).
-    `clip`: lowest and highest reading, at which the sensor is saturated, in the table's unit;
-    `offset`: reading at zero force, which is subtracted, such as 32768 in offset binary.
-    """
+    """The accelerometer's three columns; `clip` and `offset` are in `unit`."""
 
     columns: Triple
     unit: Unit
-    output: Literal['counts', 'imu']
+    output: Literal['counts', 'imu']  # message to write; Imu is in m/s^2
     counts_per_g: Positive | None = None
-    clip: tuple[float, float] | None = None
-    offset: float = 0.0
+    clip: tuple[float, float] | None = None  # lowest and highest reading: the sensor is saturated
+    offset: float = 0.0  # reading at zero force, which is subtracted, such as 32768
 
     def __post_init__(self) -> None:
         if self.unit == 'counts' and self.output == 'imu' and self.counts_per_g is None:

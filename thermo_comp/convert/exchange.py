@@ -28,8 +28,7 @@ from ..unit.rate_bias import MILLIDEGREE, Gyroscope, RateCurve, RateSet
 from .tools import TOOLS, Content, ql, rotation_notes
 
 _GRID = 257  # number of temperatures at which a curve is computed
-#: White noise assumed for an imported gyroscope [rad/s/sqrt(Hz)].
-_RATE_NOISE = 1e-4
+_RATE_NOISE = 1e-4  # white noise assumed for an imported gyroscope [rad/s/sqrt(Hz)]
 #: A file is taken to be in m/s^2 if all scale factors are below this number and above its inverse.
 _NEAR_ONE = 2.0
 

@@ -40,8 +40,7 @@ _OTHER = re.compile('mag|mfield|orient|euler|quat|angle|lin|free|user|grav|pos|v
 _TEMPERATURE = re.compile(
     'temp|tmp|celsius|(^|_)t_?c($|_)|^t_(board|case|imu|die|chip|sensor|air|amb|room|baro)'
 )
-# Words in headings of thermometers that are not on the board.
-_OUTSIDE = re.compile('case|air|amb|baro|bmp|aht|room|hous|env')
+_OUTSIDE = re.compile('case|air|amb|baro|bmp|aht|room|hous|env')  # thermometers off the board
 # Unit of a temperature at the end of a heading; words of headings that name no temperature.
 _DEGREES_END = re.compile('(^|_)(deg_?[cfk]|kelvin|fahrenheit)$')
 _NO_READING = re.compile('(^|_)(raw|adc|counts?|lsb|id|rev|status|valid|voltage|volts?|mv)(_|$)')
@@ -113,10 +112,7 @@ def read_headings(
 def _thermometers(
     headings: Sequence[str], names: Container[str], is_plausible: Callable[[str, str], bool]
 ) -> dict[str, tuple[str, str]]:
-    """
-    Return each thermometer's column and unit. A column whose heading is a place, like `board`, is
-    used only if its thermometer has no other column. `names`: `_plain` of all headings.
-    """
+    """Return each thermometer's column and unit; `names`: `_plain` of all headings."""
     units = {heading: _stated(heading, _DEGREES) or 'degC' for heading in headings}
     named, places = [], []
     for heading, unit in units.items():
@@ -133,7 +129,7 @@ def _thermometers(
         name = 'case' if result and (heading in outside or heading in named) else 'board'
         if name not in result:
             result[name] = heading, units[heading]
-        elif heading in named:
+        elif heading in named:  # a place is used only if its thermometer has no other column
             result[f't{len(result)}'] = heading, units[heading]
     return result
 

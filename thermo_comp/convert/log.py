@@ -37,8 +37,7 @@ Unit = Literal['m/s^2', 'g', 'mg', 'counts']
 # of cheap sensors, even in a chamber, and far below the ratios of m/s^2, g and mg.
 PER_G: dict[Unit, float] = {'g': 1.0, 'm/s^2': STANDARD_GRAVITY, 'mg': 1000.0}
 _TOLERANCE = 0.2
-# Usual sensitivities of 16-bit sensors with ranges from +-16 g to +-2 g [counts/g].
-_SENSITIVITIES = (2048, 4096, 8192, 16384)
+_SENSITIVITIES = (2048, 4096, 8192, 16384)  # 16-bit sensors of +-16 g to +-2 g [counts/g]
 
 _CELL_S, _MIN_SAMPLES = 0.5, 12  # length of a cell of samples [s], least number of samples in it
 # Ratio of a cell's sd to the lower quartile of all cells' sds, above which the unit moves in the

@@ -33,8 +33,7 @@ from ..typing import Floats
 
 _ARDUPILOT_REFERENCE_C = 35.0  # temperature at which d of ArduPilot's cubic is 0 [degC]
 _ARDUPILOT_SCALE = 1e6  # ArduPilot's coefficient / that in m/s^2 or rad/s per power of kelvin
-# ArduPilot's value for an unknown temperature of the offset calibration [degC].
-_NO_TEMPERATURE = -273.0
+_NO_TEMPERATURE = -273.0  # ArduPilot's value for an unknown calibration temperature [degC]
 _AXES = ('X', 'Y', 'Z')
 _THERMAL_NOTE = (
     'imported: bias over the temperature of the board thermometer only; no scale, misalignment, '

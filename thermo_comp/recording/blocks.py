@@ -26,19 +26,16 @@ Role = str  # ``accel``, or the name of a thermometer
 
 ROLES: tuple[Role, ...] = ('accel', 'board', 'case')
 
-#: Messages per block; large enough that the per-block overhead is negligible.
-BLOCK_MESSAGES = 1 << 15
+BLOCK_MESSAGES = 1 << 15  # messages per block; the overhead per block is then negligible
 
-#: Stands for the stamp of a message without a stamp: the earliest stamp that a header can hold.
-NO_STAMP_NS = -(2**31) * 10**9
+NO_STAMP_NS = -(2**31) * 10**9  # stands for a missing stamp: the earliest that a header can hold
 _JUMP_NS = 10**9  # a backward step of the stamps by more than this is a jump of the clock [ns]
 LONGEST_PAUSE_NS = 3600 * 10**9  # longer jumps of the stamps are shortened to this length [ns]
 _MOST_JUMPS = 100  # a recording with more jumps of the stamps by over an hour is refused
 # A thermometer is taken to use another clock than the accelerometer if the median distance [s] of
 # its readings (`_FEWEST_READINGS` or more) from the samples around them is above `_APART_S`.
 _FEWEST_READINGS, _APART_S = 10, 10.0
-#: Shortest time between successive equal readings in the result of `Readings.thinned` [ns].
-_REPEAT_NS = 10_000_000_000
+_REPEAT_NS = 10 * 10**9  # `Readings.thinned` keeps an equal reading after this time [ns]
 #: A recording longer than `_SPARSE_NS` with fewer messages than one per `_SPARSEST_NS` is refused.
 _SPARSE_NS, _SPARSEST_NS = 10 * 86400 * 10**9, 10 * 10**9
 
@@ -69,23 +66,17 @@ class BagFile:
 
 @dataclass(frozen=True, slots=True)
 class RecordingInfo:
-    """
-    The content of a bag, known before its messages are read.
-    `topics`: message type (several joined by `` | ``) and number of messages by name. `start_ns`
-    and `end_ns`: first and last log time, 0 without messages. `truncated` describes missing parts,
-    if any; `metadata` holds the key-value pairs stored in the bag; `input` is the input whose
-    topic has the samples; `chosen` has notes on topics selected by their type and on stamps.
-    """
+    """The content of a bag, known before its messages are read."""
 
     path: Path
     storage: str
-    topics: Mapping[str, tuple[str, int]]
-    start_ns: int
-    end_ns: int
-    truncated: str | None = None
-    metadata: Mapping[str, str] = field(default_factory=dict)
-    input: Literal['counts', 'imu'] | None = None
-    chosen: str | None = None
+    topics: Mapping[str, tuple[str, int]]  # type (or types joined by ' | ') and number of messages
+    start_ns: int  # first log time, 0 without messages
+    end_ns: int  # last log time, 0 without messages
+    truncated: str | None = None  # description of missing parts
+    metadata: Mapping[str, str] = field(default_factory=dict)  # pairs stored in the bag
+    input: Literal['counts', 'imu'] | None = None  # input whose topic has the samples
+    chosen: str | None = None  # notes on topics selected by their type, and on stamps
 
     @property
     def n_messages(self) -> int:
@@ -94,14 +85,11 @@ class RecordingInfo:
 
 
 class ImuColumns(NamedTuple):
-    """
-    Fields of sensor_msgs/Imu: quaternion x, y, z, w, shape (n, 4), rates [rad/s], shape (n, 3),
-    covariances, shape (n, 9). A writer repeats an array of one row for all messages.
-    """
+    """Fields of sensor_msgs/Imu; a writer repeats an array of one row for all messages."""
 
-    orientation: Floats
-    orientation_covariance: Floats
-    angular_velocity: Floats
+    orientation: Floats  # quaternion x, y, z, w, shape (n, 4)
+    orientation_covariance: Floats  # like the other covariances of shape (n, 9)
+    angular_velocity: Floats  # [rad/s], shape (n, 3)
     angular_velocity_covariance: Floats
     linear_acceleration_covariance: Floats
 
@@ -147,20 +135,15 @@ class Readings(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """
-    Consecutive messages in reading order, as columns; a block ends where `frame_id` changes.
-    `accel`, shape (n, 3), is in counts per conversion cycle, or m/s^2 if the input is
-    sensor_msgs/Imu; `imu` holds its other fields. `temperatures` has a key for each thermometer;
-    `log_ns` and, if requested, the serialized messages `raw` also have the key ``accel``.
-    """
+    """Consecutive messages in reading order, as columns; a block ends where `frame_id` changes."""
 
     accel_stamp_ns: Ints
-    accel: Floats
+    accel: Floats  # counts per conversion cycle, or m/s^2 of sensor_msgs/Imu, shape (n, 3)
     frame_id: str
-    imu: ImuColumns | None
-    temperatures: Mapping[str, Readings]
+    imu: ImuColumns | None  # the other fields of sensor_msgs/Imu
+    temperatures: Mapping[str, Readings]  # by thermometer
     log_ns: Mapping[Role, Ints]
-    raw: Mapping[Role, Messages] = field(default_factory=dict)
+    raw: Mapping[Role, Messages] = field(default_factory=dict)  # serialized, if requested
 
     def __len__(self) -> int:
         """Return the number of accelerometer messages."""

@@ -81,15 +81,12 @@ def translated(path: Path, *, is_foreign: bool = False) -> Iterator[None]:
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """
-    A part of a file: a chunk, a chunk without end ('torn'), or messages outside chunks ('loose').
-    `length` excludes the message indexes after the part; `size`: decompressed size [bytes].
-    """
+    """Part of a file: a chunk, a chunk without end ('torn'), messages outside chunks ('loose')."""
 
     position: int
-    length: int
+    length: int  # without the message indexes after the part
     index_length: int = 0
-    size: int = 0
+    size: int = 0  # number of bytes after decompression
     start_ns: int = 0
     end_ns: int = 0
     kind: Literal['chunk', 'torn', 'loose'] = 'chunk'

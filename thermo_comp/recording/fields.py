@@ -140,8 +140,7 @@ class Field:
         return cursor.number(_KINDS[description[1][0]])
 
 
-# Kinds of a field's description in `rosbags`: basic type, message, array (4: sequence).
-_BASE, _NAME, _ARRAY = 1, 2, 3
+_BASE, _NAME, _ARRAY = 1, 2, 3  # kinds of fields in `rosbags`; `_NAME`: message, 4: sequence
 
 
 class _Cursor:

@@ -33,8 +33,7 @@ from .serialized import Messages, join_messages
 
 MAGIC = b'\x89MCAP0\r\n'
 _BEGIN = MAGIC + bytes([Opcode.HEADER])
-#: Name of the metadata record with the key-value pairs of this package's writer.
-METADATA_NAME = 'thermo_comp'
+METADATA_NAME = 'thermo_comp'  # name of the metadata record that this package writes
 
 _FOOTER_BYTES = PREFIX.size + 20 + len(MAGIC)
 _MAX_SUMMARY_BYTES = 1 << 28  # a larger summary is not read [bytes]

@@ -19,15 +19,12 @@ from ..typing import Bools, Floats
 if TYPE_CHECKING:
     from .stillness import Cells
 
-# Smallest distance of a glitch from the mean of its neighbours, in sd of the noise.
-_SDS = 25.0
+_SDS = 25.0  # smallest distance of a glitch from the mean of its neighbours, in sd of the noise
 # Smallest distance of a glitch from the mean of its neighbours, divided by the samples' norm. A
 # change by one count, as by the remainder that a converter carries over, is no glitch.
 _LEAST = 0.02
-# Smallest number of samples in which glitches are searched; fewer do not determine the noise.
-_FEWEST = 30
-# Standard normal quantiles of the probabilities 0.1 and 1 - 1e-11.
-_TENTH, _NEVER = -1.2816, 6.7
+_FEWEST = 30  # smallest number of samples that determines the noise, to search for glitches
+_TENTH, _NEVER = -1.2816, 6.7  # standard normal quantiles of the probabilities 0.1 and 1 - 1e-11
 # Noise is coloured if a cell's degrees of freedom are below this fraction of those of white noise;
 # smallest number of degrees of freedom of a cell; number of iterations in `spread_of_variances`
 # and of trial values in `roughest_at_rest`.

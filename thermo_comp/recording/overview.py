@@ -23,8 +23,7 @@ from .reader import RecordingReader, open_recording
 from .stillness import STILL_SD, CellAccumulator, Cells, still_intervals, why_restless
 from .topics import PLAIN, Topics, shown
 
-#: Range of readings that are probably in kelvins: no board survives such temperatures in degC.
-KELVINS = (180.0, 480.0)
+KELVINS = (180.0, 480.0)  # readings probably in kelvins: no board survives as many degC
 _RAMP_WINDOW_S = 120.0  # time over which the rate of a ramp is averaged [s]
 _CELL_S, _MIN_REST_S = 0.5, 3.0  # lengths of a cell and of the shortest still interval [s]
 _GAP_INTERVALS = 5.0  # shortest gap between samples / median interval in the first block
@@ -129,8 +128,7 @@ def survey_recording(
         topic = reader.topics.get('accel')
         total = reader.info.topics[topic][1] if topic else 0
         accumulator, causes = CellAccumulator(_CELL_S, None), CauseCounter()
-        # Keep all temperature readings in memory: they are far fewer than the samples.
-        readings: dict[str, list[Readings]] = {}
+        readings: dict[str, list[Readings]] = {}  # all in memory: far fewer than the samples
         clock = _Clock()
         for block in reader.blocks():
             for name, temperature in block.temperatures.items():

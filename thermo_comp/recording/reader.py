@@ -83,8 +83,7 @@ class RecordingReader(ExitStack):
                 raise RecordingError(f'cannot be opened: {error.strerror}', path) from error
             raise
         self._part = topics.part
-        #: Time from the first sample of the bag to that of the selected part [s]; 0 until read.
-        self.since_s = 0.0
+        self.since_s = 0.0  # time from the first sample of the bag to that of the part read [s]
         self.apart = ''  # warning about stamps that are all equal, or of a second clock
 
     def _fields(self, selected: Selected) -> Iterator[tuple[Role, Field]]:

@@ -30,12 +30,9 @@ STILL_SD = 0.05
 # the rate's bias, which is interpolated between medians over `_LEVEL_S` [s].
 _STILL_RATE_SD, _STILL_RATE = np.radians(2.0), np.radians(1.0)
 _LEVEL_S = 120.0
-# `without_rotation` subtracts from the angular rate its median over this time [s].
-_ROTATION_S = 10.0
-# Smallest step between adjacent cells that ends a rest, in robust sd of all steps.
-_STEP_SDS = 8.0
-# Number of steps between cells whose median is the drift; largest drift [g/s].
-_DRIFT_STEPS, _DRIFT = 9, 5e-5
+_ROTATION_S = 10.0  # `without_rotation` subtracts the median angular rate over this time [s]
+_STEP_SDS = 8.0  # smallest step between adjacent cells that ends a rest, in robust sd of steps
+_DRIFT_STEPS, _DRIFT = 9, 5e-5  # number of steps whose median is the drift; its limit [g/s]
 # Number of samples searched for a quantum; smallest number of changes from sample to sample from
 # which the smallest change is taken for the quantum if all changes are whole multiples of it.
 _QUANTUM_SAMPLES, _STEPS_NEEDED = 20000, 10
@@ -50,37 +47,27 @@ _STUCK = 0.3  # ratio of the noise's sd to the quantum below which most samples 
 
 @dataclass(frozen=True)
 class Cells:
-    """
-    Statistics of the n cells of a bag, shape (n,) or (n, 3); a cell is a short run of samples.
-    `start_ns` and `end_ns` are the stamps of the first and last sample of the bag; `time` is the
-    mean time of a cell's samples since `start_ns` [s]; `index` the cell's number on the time grid.
-    Samples that are not finite or whose stamp does not rise are dropped, as are glitches, see
-    `is_glitch`. `n_repeated` counts samples with the same stamp as the sample before. `quantum` is
-    the step between the possible values of the samples, or 0 if unknown; `middle` is 32768 for
-    unsigned 16-bit words, else 0; rates are in rad/s. `roughness` is half the mean square change
-    from sample to sample, which equals the variance for white noise; `seam` is a cell's first
-    sample less the last sample of the cell before, 0 after a gap.
-    """
+    """Statistics of the n cells (short runs of samples) of a bag, of shape (n,) or (n, 3)."""
 
-    start_ns: int
-    end_ns: int
+    start_ns: int  # stamp of the first sample of the bag
+    end_ns: int  # stamp of the last sample of the bag
     cell_s: float
-    n_dropped: int
+    n_dropped: int  # number of samples dropped: not finite, or with a stamp that does not rise
     n_saturated: int
-    n_glitches: int
-    n_repeated: int
-    is_integer: bool
-    quantum: Floats
-    middle: float
-    time: Floats
-    count: Ints
-    index: Ints
+    n_glitches: int  # number of samples dropped as glitches, see `is_glitch`
+    n_repeated: int  # number of samples with the same stamp as the sample before
+    is_integer: bool  # whether all samples are whole numbers
+    quantum: Floats  # step between the possible values of an axis; 0: unknown; shape (3,)
+    middle: float  # 32768 for unsigned 16-bit words, else 0
+    time: Floats  # mean time of a cell's samples since `start_ns` [s]
+    count: Ints  # number of samples in a cell
+    index: Ints  # number of a cell on the time grid
     mean: Floats
     variance: Floats
-    roughness: Floats
-    seam: Floats
-    rate: Floats
-    rate_variance: Floats
+    roughness: Floats  # half the mean square change from sample to sample
+    seam: Floats  # first sample of a cell less the last sample of the cell before; 0 after a gap
+    rate: Floats  # mean angular rate [rad/s]
+    rate_variance: Floats  # [rad^2/s^2]
 
     def part(self, which: slice) -> 'Cells':
         """Select consecutive cells."""
@@ -259,10 +246,7 @@ def _part_of(window_s: float, least_ns: float) -> float:
 
 
 def _quantum_of(samples: Floats, few: list[Floats]) -> Floats:
-    """
-    Return the quantum of each axis from the changes between samples; 0 without a quantum.
-    `few`: the changes of earlier samples of each axis, as long as these are fewer than three.
-    """
+    """Return each axis's quantum, 0 if unknown; `few`: up to two earlier changes of each axis."""
     result = np.zeros(3)
     for axis in range(3):
         changes = np.abs(np.diff(samples[:, axis]))

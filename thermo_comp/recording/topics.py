@@ -36,8 +36,7 @@ _MAX_SHOWN = 80  # largest length of a name in a message [characters]
 
 _FIRST_STAMP_S = 1e8  # a limit of a `BagPart` of at least this time [s] is a stamp (after 1973)
 
-#: Message type and number of messages of each topic of a bag.
-Present = Mapping[str, tuple[str, int]]
+Present = Mapping[str, tuple[str, int]]  # type and number of messages of each topic of a bag
 
 
 @dataclass(frozen=True, slots=True)

@@ -74,8 +74,7 @@ def decode_blocks(
         except RecordingError as error:
             raise RecordingError(error.message, key=shown(topic.name)) from error
         if role == 'accel':
-            # Comparing bytes is a fast test of whether frame_id is constant.
-            text = frame.tobytes()
+            text = frame.tobytes()  # comparing bytes is a fast test of a constant frame_id
             is_equal = text == text[: frame.itemsize] * len(frame)
             changes = [] if is_equal else rank[1:][frame[1:] != frame[:-1]].tolist()
             if changes:

@@ -28,8 +28,7 @@ from .wire import IMU_ACCELERATION, IMU_COLUMNS, encode_stamped
 
 STAMP_END_NS = 2**31 * 10**9  # upper limit of ROS stamps, exclusive [ns]
 _AUTO_FLUSH_BYTES = 1 << 26
-#: Formats of tables by the suffix of the file.
-TABLES: Mapping[str, Kind] = {'.csv': CSV, '.parquet': PARQUET}
+TABLES: Mapping[str, Kind] = {'.csv': CSV, '.parquet': PARQUET}  # formats by the file's suffix
 WriteRows = Callable[[Mapping[str, NDArray[Any]]], None]
 #: Field of a message: indices of its numbers, name, values of all messages.
 _Column = tuple[slice, str, ArrayLike]
