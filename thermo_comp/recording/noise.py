@@ -85,9 +85,8 @@ def roughest_at_rest(cells: Cells, quiet: Bools, is_coloured: Bools, ratio: floa
     """
     Return the largest roughness of a cell at rest, per axis; infinite for white noise. `ratio`:
     largest variance at rest / noise variance. In coloured noise a step does not show in mean and
-    variance, but in the changes from sample to sample. The roughness is assumed to have a
-    chi-square distribution, with as many degrees of freedom as the ratio of its tenth percentile
-    to its median requires.
+    variance, but in the changes from sample to sample. The roughness is assumed chi-square
+    distributed; the ratio of its tenth percentile to its median gives the degrees of freedom.
     """
     result = np.full(3, np.inf)
     for axis in np.flatnonzero(is_coloured) if quiet.any() else ():

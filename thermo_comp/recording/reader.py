@@ -53,9 +53,8 @@ class RecordingReader(ExitStack):
     """
     An open bag: a rosbag2 directory, a bare ``.mcap`` or ``.db3`` file, or a ROS 1 ``.bag``.
     A role is ``accel`` or the name of a thermometer; the roles in `require` must be in the bag.
-    `info` describes the bag; after all blocks are read, `info.truncated` names the missing
-    messages. `topics`: topic of each role; `fields`: field with the reading of a thermometer, by
-    role; `definitions`: encoding and text of each message type's definition.
+    After all blocks are read, `info.truncated` names the missing messages. The keys of `topics`
+    and `fields` are roles; the keys of `definitions` (encoding and text) are message types.
     Raises RecordingError if the file is not a bag, is damaged, or a topic is missing or ambiguous.
     """
 
