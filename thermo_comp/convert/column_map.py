@@ -32,24 +32,19 @@ from .table import STAMP_EXPONENTS, Format, Stamp, Table, TimeUnit, read_parquet
 #: Slope and offset that convert a temperature of each unit to degC.
 _CELSIUS = {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}
 _STEPS_S = (5e-5, 0.5)  # range of plausible intervals between samples [s]
-#: Longest plausible interval [s] if the unit turns by over `_TURN` [rad] within a block of
-#: `_BLOCK` samples, between two still blocks (sd below `_QUIET` [g]): with intervals in ms the
-#: turn would be too fast for a hand.
-_SLOW_S, _BLOCK, _TURN, _QUIET = 2.0, 12, 0.5, 0.02
+_SLOW_S = 2.0  # longest plausible interval [s] if intervals in ms make a turn too fast for a hand
+_BLOCK, _QUIET = 12, 0.02  # number of samples of a block; largest sd of a still block [g]
+_TURN = 0.5  # smallest turn within a block that a hand cannot make if intervals are in ms [rad]
 _FASTEST_RAD_S = 20.0  # largest angular rate of a unit that is turned by hand [rad/s]
 #: Range of stamps from 2000 to 2038, and largest interval between such stamps [s]. Times since
 #: power-up in us, taken for seconds, may lie in this range, but have intervals above 60 s.
 _SINCE_1970_S, _SINCE_1970_STEP_S = (946_684_800.0, 2_147_483_648.0), 60.0
-#: Largest ratio of the range of temperatures in a log to the duration of the log [K/s]; a hair
-#: dryer warms a board by about 0.1 K/s.
-_FASTEST_K_S = 0.5
+_FASTEST_K_S = 0.5  # largest change of temperature / duration of a log; a hair dryer: 0.1 K/s
 # Largest share of rows in which a temperature in whole degrees changes. A column of the numbers of
 # boards or sensors alternates from row to row, so it changes in nearly all rows.
 _FEW_CHANGES = 0.1
 _RISING = 0.7  # smallest share of rows whose time is later than the time of the row before
-#: A step from the uppermost to the lowest tenth of the range of a 32-bit counter of time, such as
-#: Arduino's micros(), is an overflow (after 71.6 min).
-_WRAP_EDGE = 0.1
+_WRAP_EDGE = 0.1  # a step from the last to the first tenth of the 32-bit range is an overflow
 _A_MAP = 'a column map: --columns MAP'
 
 

@@ -33,16 +33,12 @@ from ..unit.gravity import STANDARD_GRAVITY
 
 Unit = Literal['m/s^2', 'g', 'mg', 'counts']
 
-# |a| at rest in each unit, and the relative tolerance of |a|: above the errors of bias and scale
-# of cheap sensors, even in a chamber, and far below the ratios of m/s^2, g and mg.
-PER_G: dict[Unit, float] = {'g': 1.0, 'm/s^2': STANDARD_GRAVITY, 'mg': 1000.0}
-_TOLERANCE = 0.2
+PER_G: dict[Unit, float] = {'g': 1.0, 'm/s^2': STANDARD_GRAVITY, 'mg': 1000.0}  # |a| at rest
+_TOLERANCE = 0.2  # relative tolerance of |a|: above the errors of cheap sensors in a chamber
 _SENSITIVITIES = (2048, 4096, 8192, 16384)  # 16-bit sensors of +-16 g to +-2 g [counts/g]
 
 _CELL_S, _MIN_SAMPLES = 0.5, 12  # length of a cell of samples [s], least number of samples in it
-# Ratio of a cell's sd to the lower quartile of all cells' sds, above which the unit moves in the
-# cell; noise alone gives cells of 12 samples a ratio below 2.
-_MOVING_RATIO = 4.0
+_MOVING_RATIO = 4.0  # largest sd of a still cell / lower quartile of all sds; by noise below 2
 _MERGE_NS = 10 * 10**9  # shortest rest between two separate movements [ns]
 
 NO_STAMP = np.iinfo(np.int64).min  # stands for the stamp of a row without a stamp

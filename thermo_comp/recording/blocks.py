@@ -32,12 +32,11 @@ NO_STAMP_NS = -(2**31) * 10**9  # stands for a missing stamp: the earliest that 
 _JUMP_NS = 10**9  # a backward step of the stamps by more than this is a jump of the clock [ns]
 LONGEST_PAUSE_NS = 3600 * 10**9  # longer jumps of the stamps are shortened to this length [ns]
 _MOST_JUMPS = 100  # a recording with more jumps of the stamps by over an hour is refused
-# A thermometer is taken to use another clock than the accelerometer if the median distance [s] of
-# its readings (`_FEWEST_READINGS` or more) from the samples around them is above `_APART_S`.
-_FEWEST_READINGS, _APART_S = 10, 10.0
+_FEWEST_STAMPS = 10  # smallest number of stamps for a warning about their clock
+_APART_S = 10.0  # largest median distance of readings from samples of the same clock [s]
 _REPEAT_NS = 10 * 10**9  # `Readings.thinned` keeps an equal reading after this time [ns]
-#: A recording longer than `_SPARSE_NS` with fewer messages than one per `_SPARSEST_NS` is refused.
-_SPARSE_NS, _SPARSEST_NS = 10 * 86400 * 10**9, 10 * 10**9
+_LONG_NS = 10 * 86400 * 10**9  # shortest duration of a long recording [ns]
+_SPARSEST_NS = 10 * 10**9  # largest mean interval of messages in a long recording [ns]
 
 
 class Topic(NamedTuple):
@@ -258,14 +257,14 @@ def unstamped(stamp_ns: int) -> str:
 def clocks_apart(block: Block) -> str:
     """Return a warning if all stamps are equal, or if readings have another clock; else ''."""
     stamps = block.accel_stamp_ns
-    if len(stamps) >= _FEWEST_READINGS and (stamps == stamps[0]).all():
+    if len(stamps) >= _FEWEST_STAMPS and (stamps == stamps[0]).all():
         return unstamped(int(stamps[0]))
     for name, readings in block.temperatures.items():
         inside = (readings.after > 0) & (readings.after < len(block))
         stamp_ns, after = readings.stamp_ns[inside], readings.after[inside]
         edges = block.accel_stamp_ns[after - 1], block.accel_stamp_ns[after]
         apart_s = (stamp_ns - np.clip(stamp_ns, *edges)) * 1e-9
-        if len(apart_s) >= _FEWEST_READINGS and abs(middle := np.median(apart_s)) > _APART_S:
+        if len(apart_s) >= _FEWEST_STAMPS and abs(middle := np.median(apart_s)) > _APART_S:
             return (
                 f'{name} readings are stamped {middle:+.0f} s from the samples around them: do '
                 'the stamps of thermometer and accelerometer come from two clocks?'
@@ -278,7 +277,7 @@ def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
     Turn a jump of the stamps by over an hour, forwards or backwards, into a gap of an hour.
     A clock that is set during a recording can leave a gap of years, too long for a time grid. A
     gap of an hour suffices to make the thermal state unknown. RecordingError for more than
-    `_MOST_JUMPS` jumps, or if the recording is too sparse (`_SPARSE_NS`, `_SPARSEST_NS`).
+    `_MOST_JUMPS` jumps, or if the recording is too sparse (`_LONG_NS`, `_SPARSEST_NS`).
     """
     last_ns: int | None = None
     offset = 0
@@ -297,7 +296,7 @@ def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
         n_jumps += int(np.count_nonzero(is_jump))
         n_messages += len(read)
         span_ns += int(np.sum(np.where(is_jump, LONGEST_PAUSE_NS, np.maximum(steps, 0))))
-        if n_jumps > _MOST_JUMPS or span_ns > max(_SPARSE_NS, n_messages * _SPARSEST_NS):
+        if n_jumps > _MOST_JUMPS or span_ns > max(_LONG_NS, n_messages * _SPARSEST_NS):
             reason = f'{n_messages} messages stamped over {span_ns / 86400e9:.0f} days with '
             reason += f'{n_jumps} jumps by more than an hour: no recording of a thermal test'
             raise RecordingError(clocks_apart(block) or reason, path)

@@ -34,9 +34,8 @@ HEAD_BYTES = 160  # bytes read at the begin of a record, enough for the head of 
 _CHUNK_HEAD = struct.Struct('<BQQQQII')
 _INDEX_HEAD = struct.Struct('<BQHI')
 _INDEX_ROW_BYTES = 16  # log time and offset of one message, 8 bytes each
-#: Number of bytes before the serialized message in a record, with and without `PREFIX`.
-MESSAGE_HEAD_BYTES = 31
-_MESSAGE_FIELDS_BYTES = MESSAGE_HEAD_BYTES - PREFIX.size
+MESSAGE_HEAD_BYTES = 31  # number of bytes before the serialized message in a record
+_MESSAGE_FIELDS_BYTES = MESSAGE_HEAD_BYTES - PREFIX.size  # number of these bytes after `PREFIX`
 MESSAGE = int(Opcode.MESSAGE)
 
 #: Reasons why `scan_records` stopped before the end of the data.

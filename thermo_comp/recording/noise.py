@@ -25,10 +25,9 @@ _SDS = 25.0  # smallest distance of a glitch from the mean of its neighbours, in
 _LEAST = 0.02
 _FEWEST = 30  # smallest number of samples that determines the noise, to search for glitches
 _TENTH, _NEVER = -1.2816, 6.7  # standard normal quantiles of the probabilities 0.1 and 1 - 1e-11
-# Noise is coloured if a cell's degrees of freedom are below this fraction of those of white noise;
-# smallest number of degrees of freedom of a cell; number of iterations in `spread_of_variances`
-# and of trial values in `roughest_at_rest`.
-_COLOURED, _FEWEST_FREE, _ITERATIONS = 0.5, 2.0, 30
+_COLOURED = 0.5  # coloured noise has fewer degrees of freedom than this fraction of white noise's
+_FEWEST_FREE = 2.0  # smallest number of degrees of freedom of a cell
+_ITERATIONS = 30  # number of iterations in `spread_of_variances`, of trials in `roughest_at_rest`
 
 
 def is_glitch(samples: Floats, quantum: Floats) -> Bools:

@@ -27,11 +27,10 @@ KELVINS = (180.0, 480.0)  # readings probably in kelvins: no board survives as m
 _RAMP_WINDOW_S = 120.0  # time over which the rate of a ramp is averaged [s]
 _CELL_S, _MIN_REST_S = 0.5, 3.0  # lengths of a cell and of the shortest still interval [s]
 _GAP_INTERVALS = 5.0  # shortest gap between samples / median interval in the first block
-# Largest share of samples of exactly 0 that is taken for glitches, and share of messages marked as
-# without acceleration above which the whole recording counts as without acceleration.
-_GLITCH_SHARE, _FAULT_SHARE = 0.01, 0.5
-# Ratio |a| / gravity at rest: range if a contains gravity, upper limit if gravity is subtracted.
-_WITH_GRAVITY, _WITHOUT_GRAVITY = (0.8, 1.25), 0.3
+_GLITCH_SHARE = 0.01  # largest share of samples of exactly 0 that is taken for glitches
+_FAULT_SHARE = 0.5  # largest share of messages marked as without acceleration
+_WITH_GRAVITY = (0.8, 1.25)  # range of |a| / gravity at rest if a contains gravity
+_WITHOUT_GRAVITY = 0.3  # largest |a| / gravity at rest if gravity is subtracted
 _NO_SAMPLES = (
     'no accelerometer samples: record accel/counts or imu/uncompensated, or name another topic '
     'with --topic counts=TOPIC or --topic imu=TOPIC'

@@ -45,8 +45,7 @@ from .wire import decode_blocks
 _MAX_BYTES = 1 << 24  # largest size of metadata.yaml [bytes], and largest number of its nodes
 _COMPRESSIONS = {'none': '', 'file': 'file', 'message': 'message'}  # by `compression_mode`
 #: Largest batch that is decoded at a time from a `ForeignFile`: messages, bytes, time [ns].
-_BATCH_MESSAGES = 1 << 14
-_BATCH_BYTES, _BATCH_NS = 1 << 23, 10 * 10**9
+_BATCH_MESSAGES, _BATCH_BYTES, _BATCH_NS = 1 << 14, 1 << 23, 10 * 10**9
 
 
 class RecordingReader(ExitStack):

@@ -26,16 +26,14 @@ from .noise import is_glitch, roughest_at_rest, spread_of_variances
 VARIANCE_RATIO = 4.0
 #: Largest sd of samples at rest [g]: above the noise of any sensor, below that of most flights.
 STILL_SD = 0.05
-# Limits of the angular rate in a cell at rest [rad/s]: sd, and difference of the mean rate from
-# the rate's bias, which is interpolated between medians over `_LEVEL_S` [s].
-_STILL_RATE_SD, _STILL_RATE = np.radians(2.0), np.radians(1.0)
-_LEVEL_S = 120.0
+_STILL_RATE_SD = np.radians(2.0)  # largest sd of the angular rate in a cell at rest [rad/s]
+_STILL_RATE = np.radians(1.0)  # largest distance of a cell's mean rate from the bias [rad/s]
+_LEVEL_S = 120.0  # the bias of the angular rate is interpolated between medians over this time [s]
 _ROTATION_S = 10.0  # `without_rotation` subtracts the median angular rate over this time [s]
 _STEP_SDS = 8.0  # smallest step between adjacent cells that ends a rest, in robust sd of steps
 _DRIFT_STEPS, _DRIFT = 9, 5e-5  # number of steps whose median is the drift; its limit [g/s]
-# Number of samples searched for a quantum; smallest number of changes from sample to sample from
-# which the smallest change is taken for the quantum if all changes are whole multiples of it.
-_QUANTUM_SAMPLES, _STEPS_NEEDED = 20000, 10
+_QUANTUM_SAMPLES = 20000  # number of samples that are searched for a quantum
+_STEPS_NEEDED = 10  # smallest number of changes that show a quantum by being its whole multiples
 STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # whole cells fill one of these numbers of windows
 _LONGEST_CELL_NS = 86400e9  # largest length of a cell, reached only with wrong stamps [ns]
 MIN_SAMPLES = 30  # usual smallest number of samples in a cell
