@@ -175,7 +175,7 @@ class TestTopics:
         assert seen['chosen'] is None
 
     def test_the_only_topic_of_its_type_is_taken_and_named(self, named, unit, cli):
-        text = '/imu/raw, its only Vector3Stamped, is taken for counts'
+        text = '/imu/raw, the only Vector3Stamped of the bag, is taken for counts'
         assert text in cli('info', named).stdout
         topics = ('--topic', 'board=/t1', '--topic', 'case=/t2')
         arguments = ('-o', named.with_name('out.mcap'), '--serial', '', *topics)

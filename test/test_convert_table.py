@@ -279,8 +279,9 @@ def test_the_command_convert_reads_a_bag(tmp_path, rng, cli):
     force = read_recording(tmp_path / 'out.mcap').columns.accel
     np.testing.assert_allclose(force.mean(axis=0), (0.0, 0.1 * G, G), atol=0.02)
     assert finished.stderr == (
-        f'thermo_comp: {bag}: /mpu/data, its only Imu, is taken for imu; /mpu/die, its nearest '
-        'Temperature, is taken for board; /baro/air, its nearest Temperature, is taken for case\n'
+        f'thermo_comp: {bag}: /mpu/data, the only Imu of the bag, is taken for imu; '
+        '/mpu/die, the nearest Temperature of the bag, is taken for board; '
+        '/baro/air, the nearest Temperature of the bag, is taken for case\n'
     )
     named = (f'--topic={x}' for x in ('imu=/mpu/data', 'board=/mpu/die', 'case=/baro/air'))
     finished = cli('convert', bag, '--unit', 'g', '-o', tmp_path / 'named.mcap', *named)

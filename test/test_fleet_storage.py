@@ -322,7 +322,7 @@ class TestRow:
         write_unit(tmp_path / 'shelf' / 'u', 1, 2, serial='', metadata=lot, counts='/imu/raw')
         row = processed(tmp_path).row
         assert (row['lot'], row['serial']) == ('L7', 'u')
-        assert row['chosen'] == '/imu/raw, its only Vector3Stamped, is taken for counts'
+        assert row['chosen'] == '/imu/raw, the only Vector3Stamped of the bag, is taken for counts'
 
     def test_the_row_has_no_sd_of_a_slope_that_the_positions_do_not_determine(self, tmp_path):
         # WHY: a fit of one position stated the sum of the slopes of bias and scale as the slope of

@@ -280,8 +280,8 @@ def test_the_only_topic_of_a_type_is_used_and_of_two_both_are_named(tmp_path):
     with open_recording(path, require=('accel', 'board')) as reader:
         assert reader.topics == {'accel': '/imu/ticks', 'board': '/imu/die'}
         assert reader.info.chosen == (
-            '/imu/ticks, its only Vector3Stamped, is taken for counts; '
-            '/imu/die, its only Temperature, is taken for board'
+            '/imu/ticks, the only Vector3Stamped of the bag, is taken for counts; '
+            '/imu/die, the only Temperature of the bag, is taken for board'
         )
     # No board topic is chosen by type if one is named, if there are two, or if it is the case's.
     with pytest.raises(RecordingError, match='my/die: no such topic'):

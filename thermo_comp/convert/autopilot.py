@@ -1,24 +1,24 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the reading of an IMU and a barometer from logs of autopilots, by the optional dependencies
-``px4`` and ``ardupilot``.
+Owns the reading of an IMU and a barometer from logs of autopilots, with the libraries of the
+optional dependencies ``px4`` and ``ardupilot``.
 
 The thermometer of an IMU lags the surroundings, so its readings become the board temperature. The
 thermometer of a barometer follows the surroundings, so its readings become the case temperature,
-or the board temperature if the IMU has no thermometer. A log without noise at rest, as of a
-simulator, is refused, because the fit cannot weight samples without noise.
+or the board temperature if the IMU has no thermometer. A log without noise at rest, such as a
+simulator's, is refused, because the fit cannot weight samples without noise.
 
 PX4's ULog (``.ulg``): ``sensor_accel`` holds the driver's samples before PX4's corrections, with
 the temperature of the same chip, at 1 Hz unless ``SDLOG_PROFILE`` sets a higher rate. If
 ``sensor_accel`` is missing, ``sensor_combined`` is read: its samples are corrected by PX4's
 calibration, and it has no temperature.
 
-ArduPilot's DataFlash (``.BIN``): old logs have a message type per IMU (``IMU``, ``IMU2``), new
-logs a message type with an instance number ``I``; the IMU's temperature is ``T`` or ``Temp``.
-Samples logged while ``INS_TCALn_ENABLE`` was 1 are dropped by default: their thermal drift is
-already corrected. While ``INS_TCALn_ENABLE`` is 2 (learning) nothing is corrected; ArduPilot sets
-``INS_TCALn_ENABLE`` to 1 after learning.
+ArduPilot's DataFlash (``.BIN``): old logs have one message type per IMU (``IMU``, ``IMU2``), new
+logs have one message type for all IMUs, whose field ``I`` is the number of the IMU; the IMU's
+temperature is ``T`` or ``Temp``. Samples logged while ``INS_TCALn_ENABLE`` was 1 are dropped by
+default, because ArduPilot has corrected their thermal drift. While ``INS_TCALn_ENABLE`` is 2
+(learning), ArduPilot does not correct the drift; after learning it sets the parameter to 1.
 
 https://docs.px4.io/main/en/dev_log/ulog_file_format
 https://ardupilot.org/copter/docs/logmessages.html
@@ -45,25 +45,26 @@ T = TypeVar('T')
 
 
 class _Correction(NamedTuple):
-    """A parameter that is 1 while the autopilot corrects thermal drift."""
+    """A parameter that is 1 while the autopilot corrects thermal drift, and its values."""
 
     parameter: str
-    course: Sequence[tuple[int, float]]  # (time since boot [ns], new value of the parameter)
-    advice: str
+    history: Sequence[tuple[int, float]]  # (time since boot [ns], value from this time on)
+    advice: str  # how to log samples without this correction
 
 
 #: Content of a log: IMUs with their thermal corrections, and barometers, by instance number.
-_Held = tuple[Mapping[int, tuple[ForeignLog, _Correction | None]], Mapping[int, Readings]]
+_Content = tuple[Mapping[int, tuple[ForeignLog, _Correction | None]], Mapping[int, Readings]]
 _Columns = dict[str, npt.NDArray[Any]]
 
 _CENTURY_US = 100 * 366 * 86400 * 10**6
-_NO_NOISE = 1e-6  # a smaller sd at rest is a rounding error, as in a simulator's log [g]
+_NO_NOISE = 1e-6  # largest sd at rest of a log without noise: the sd of rounding errors [g]
 _AXES = ('x', 'y', 'z')
 _PROFILE = 'add 4 to SDLOG_PROFILE (thermal calibration): PX4 then logs sensor_accel at 10 Hz'
 _BAROMETERS = {'vehicle_air_data': 'baro_temp_celcius', 'sensor_baro': 'temperature'}
 _TOPICS = ('sensor_accel', 'sensor_gyro', 'sensor_combined', *_BAROMETERS)
 _NOT_THERE = 2**31 - 1  # `accelerometer_timestamp_relative` of a message without an accelerometer
-_HEADER_BYTES = 3  # bytes before the content of a DataFlash message
+_HEADER_BYTES = 3  # number of bytes of a DataFlash message before its fields
+_MESSAGE_TYPES = re.compile(r'IMU\d?|BARO|BAR\d|PARM')  # DataFlash messages that are read
 _VECTORS = ('AccX', 'AccY', 'AccZ', 'GyrX', 'GyrY', 'GyrZ')
 
 
@@ -73,7 +74,7 @@ def read_autopilot(
     """Read an IMU and a barometer, by default those with the lowest numbers, counted from 0."""
     read = _ulog if path.suffix.lower() == '.ulg' else _dataflash
     try:
-        # Ignore overflows of integer conversions: `_stamps` finds impossible time stamps.
+        # Overflows of integer conversions need no warning: `_stamps` finds impossible times.
         with np.errstate(invalid='ignore', over='ignore'):
             imus, baros = read(path)
     except OSError as failure:
@@ -91,12 +92,12 @@ def read_autopilot(
             'the accelerometer at rest has no noise at all: this is a log of a simulator (SITL), '
             'which cannot calibrate a real sensor'
         )
-    heard = {number: _reported(readings) for number, readings in baros.items()}
+    valid = {number: _valid_readings(readings) for number, readings in baros.items()}
     if baro is None:
-        heard = {number: readings for number, readings in heard.items() if len(readings.celsius)}
-    readings = [_reported(temperature) for temperature in rows.temperatures.values()]
-    if heard or baro is not None:
-        readings.append(_instance(heard, baro, 'barometer'))
+        valid = {number: readings for number, readings in valid.items() if len(readings.celsius)}
+    readings = [_valid_readings(temperature) for temperature in rows.temperatures.values()]
+    if valid or baro is not None:
+        readings.append(_instance(valid, baro, 'barometer'))
     thinned = (thermometer.thinned() for thermometer in readings if len(thermometer.celsius))
     named = zip(('board', 'case'), thinned, strict=False)
     return replace(rows, temperatures=dict(named))
@@ -104,8 +105,8 @@ def read_autopilot(
 
 def _uncorrected(rows: ForeignLog, correction: _Correction) -> ForeignLog:
     """Drop samples that the autopilot has corrected; RecordingError if no sample is left."""
-    name, course, advice = correction
-    since_ns, values = zip(*course, strict=True)
+    name, history, advice = correction
+    since_ns, values = zip(*history, strict=True)
     at = np.searchsorted(np.array(since_ns, np.int64), rows.stamp_ns, 'right') - 1
     is_corrected = np.array(values)[np.maximum(at, 0)] == 1.0
     reason = 'the autopilot has already corrected the thermal drift of these samples'
@@ -120,7 +121,7 @@ def _uncorrected(rows: ForeignLog, correction: _Correction) -> ForeignLog:
     return replace(rows.take(~is_corrected), chosen=chosen)
 
 
-def _ulog(path: Path) -> _Held:
+def _ulog(path: Path) -> _Content:
     with open_regular(path) as file:
         log = _read('pyulog', 'ULog', 'px4', 'a ULog file', file, list(_TOPICS))
     by_topic: dict[str, dict[int, _Columns]] = {topic: {} for topic in _TOPICS}
@@ -137,18 +138,18 @@ def _ulog(path: Path) -> _Held:
     accels, gyros, hint = by_topic['sensor_accel'], by_topic['sensor_gyro'], ''
     correction = None
     if not accels:
-        both = {number: _combined(pair) for number, pair in by_topic['sensor_combined'].items()}
-        accels, gyros = ({number: pair[part] for number, pair in both.items()} for part in (0, 1))
+        for number, columns in by_topic['sensor_combined'].items():
+            accels[number], gyros[number] = _combined(columns)
         hint = (
             'the log has no sensor_accel: the samples are those of sensor_combined, which PX4 has '
             f'corrected by CAL_ACC*; to record raw samples, {_PROFILE}'
         )
         name = 'TC_A_ENABLE'
-        course = [(0, float(log.initial_parameters.get(name, 0)))]
-        course += [
+        history = [(0, float(log.initial_parameters.get(name, 0)))]
+        history += [
             (int(at) * 1000, float(x)) for at, key, x in log.changed_parameters if key == name
         ]
-        correction = _Correction(name, course, f'the log has only sensor_combined: {_PROFILE}')
+        correction = _Correction(name, history, f'the log has only sensor_combined: {_PROFILE}')
     imus = {}
     for number, columns in accels.items():
         stamp_ns = _stamps(columns)
@@ -199,7 +200,7 @@ def _vectors(columns: _Columns, names: Sequence[str]) -> Floats:
 
 
 def _matched(stamp_ns: Ints, columns: _Columns | None) -> Floats | None:
-    """Interpolate rates to n sample stamps; None if under n / 2 rates, or if any is not finite."""
+    """Interpolate rates to n stamps; None if any is not finite or there are fewer than n / 2."""
     if columns is None:
         return None
     gyro_ns, gyro = _stamps(columns), _vectors(columns, _AXES)
@@ -211,7 +212,7 @@ def _matched(stamp_ns: Ints, columns: _Columns | None) -> Floats | None:
     return np.column_stack([np.interp(at, where, gyro[:, i]) for i in range(3)])
 
 
-def _dataflash(path: Path) -> _Held:
+def _dataflash(path: Path) -> _Content:
     with open_regular(path) as file:
         magic = file.read(2)
     if magic != b'\xa3\x95':
@@ -227,9 +228,7 @@ def _dataflash(path: Path) -> _Held:
     metadata = notes if any(str(key).startswith('SIM_') for key in reader.params) else {}
     changes: dict[str, list[tuple[int, float]]] = {}
     try:
-        for name in sorted(reader.name_to_id):
-            if not re.fullmatch(r'IMU\d?|BARO|BAR\d|PARM', name):
-                continue
+        for name in filter(_MESSAGE_TYPES.fullmatch, sorted(reader.name_to_id)):
             table, short = _messages(reader, name)
             stamp_us = table.get('TimeUS', table.get('TimeMS', np.empty(0)) * 1000.0)
             if name == 'PARM' and table.keys() >= {'Name', 'Value'}:
@@ -237,10 +236,11 @@ def _dataflash(path: Path) -> _Held:
                     title = label.decode('ascii', 'replace')
                     changes.setdefault(title, []).append((int(at) * 1000, float(value)))
                 continue
-            old = int(name[-1]) - 1 if name[-1].isdigit() else 0  # `IMU2` has the number 1
-            table |= {'timestamp': stamp_us, 'I': table.get('I', np.full(len(stamp_us), old))}
-            for number in np.unique(table['I'][: len(stamp_us)]).tolist():
-                columns = {title: column[table['I'] == number] for title, column in table.items()}
+            by_name = int(name[-1]) - 1 if name[-1].isdigit() else 0  # `IMU2` has the number 1
+            numbers = table.get('I', np.full(len(stamp_us), by_name))
+            table['timestamp'] = stamp_us
+            for number in np.unique(numbers[: len(stamp_us)]).tolist():
+                columns = {title: column[numbers == number] for title, column in table.items()}
                 stamp_ns = _stamps(columns)
                 readings = Readings(stamp_ns, _column(columns, 'T' if 'T' in columns else 'Temp'))
                 if not name.startswith('IMU'):
@@ -257,16 +257,16 @@ def _dataflash(path: Path) -> _Held:
                     )
     finally:
         reader.close()
-    held = {}
+    corrected = {}
     for number, rows in imus.items():
         name = f'INS_TCAL{number + 1}_ENABLE'
-        course = changes.get(name) or [(0, float(reader.params.get(name, 0.0)))]
-        held[number] = rows, _Correction(name, course, f'set {name} to 0 and record again')
-    return held, baros
+        history = changes.get(name) or [(0, float(reader.params.get(name, 0.0)))]
+        corrected[number] = rows, _Correction(name, history, f'set {name} to 0 and record again')
+    return corrected, baros
 
 
 def _messages(reader: Any, name: str) -> tuple[_Columns, list[int]]:
-    """Return the columns of a message type, and the numbers, from 1, of truncated messages."""
+    """Return the columns of a message type, and the numbers (from 1) of truncated messages."""
     number = reader.name_to_id[name]
     layout = reader.formats[number]
     codes = re.findall(r'(\d*)([a-zA-Z])', layout.msg_struct)  # type codes of module `struct`
@@ -289,7 +289,7 @@ def _messages(reader: Any, name: str) -> tuple[_Columns, list[int]]:
 
 
 def _read(module: str, name: str, extra: str, what: str, *arguments: Any) -> Any:
-    """Read a file with class `name` of a library that is an optional dependency."""
+    """Read a file with the class `name` of a library, which the dependency `extra` installs."""
     read = getattr(import_extra(module, extra, what), name)
     with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
         # On damaged files the libraries raise any type of exception.
@@ -309,8 +309,8 @@ def _instance(present: Mapping[int, T], wanted: int | None, what: str) -> T:
     return present[number]
 
 
-def _reported(readings: Readings) -> Readings:
-    """Drop invalid readings; drop all if all are 0, because the sensor has no thermometer."""
+def _valid_readings(readings: Readings) -> Readings:
+    """Drop invalid readings; drop all readings of a sensor without a thermometer: all are 0."""
     use = np.isfinite(readings.celsius) & (readings.stamp_ns != NO_STAMP)
     use &= bool(readings.celsius[use].any())
     return readings.take(use)

@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the reading of bags, of ROS 1 and 2, with topics and units other than those of the node.
+Owns the reading of bags of ROS 1 and 2 whose topics or units differ from those of the node.
 
-Drivers choose their topic names, and some do not publish m/s^2. Topics that are not named are
-found by type. The board thermometer shares the most namespaces with the Imu. The case thermometer
-shares more namespaces with a barometer than with the Imu, or is the only other thermometer.
+Drivers choose their topic names, and some do not publish m/s^2. A topic that the caller does not
+name is found by its message type. The board's temperature topic is the one that shares the most
+leading namespaces with the Imu topic. The case's temperature topic shares more namespaces with a
+barometer's topic than with the Imu topic, or is the only other temperature topic.
 """
 
 from pathlib import Path, PurePosixPath
@@ -28,7 +29,7 @@ def bag_log(
     case: str | None = None,
     unit: Unit = 'm/s^2',
 ) -> ForeignLog:
-    """Read a bag; search for the topics given as None; `unit`: unit of the Imu's acceleration."""
+    """Read a bag; topics given as None are searched; `unit`: unit of the Imu's acceleration."""
     present = inspect_recording(path).topics
     inputs = find_topics(present, imu, board, case)
     chosen = []
@@ -63,7 +64,7 @@ def find_topics(
     present: Present, imu: str | None, board: str | None, case: str | None
 ) -> dict[str, str | None]:
     """Find the topics of ``imu``, ``board`` and ``case``; None for a missing thermometer."""
-    imu = imu or _most(of_kind(present, IMU), 'Imu')
+    imu = imu or _only(of_kind(present, IMU), 'Imu')
     if imu is None:
         raise RecordingError(
             'the bag holds no sensor_msgs/msg/Imu, which convert needs; a bag with accel/counts '
@@ -76,11 +77,11 @@ def find_topics(
     if case is None:
         baros = of_kind(present, _PRESSURE)
         nearer = [name for name in free() if _shared(name, baros) > _shared(name, [imu])]
-        case = _most(nearer, 'case')
+        case = _only(nearer, 'case')
     if board is None:
-        beside = max((_shared(name, [imu]) for name in free()), default=0)
-        board = _most([topic for topic in free() if _shared(topic, [imu]) == beside], 'board')
-    case = case or _most(free(), 'case')
+        most = max((_shared(name, [imu]) for name in free()), default=0)
+        board = _only([name for name in free() if _shared(name, [imu]) == most], 'board')
+    case = case or _only(free(), 'case')
     return {'imu': imu, 'board': board, 'case': case}
 
 
@@ -92,7 +93,7 @@ def _shared(name: str, others: list[str]) -> int:
     return max((len(namespaces & spaces) for spaces in theirs), default=0)
 
 
-def _most(names: list[str], what: str) -> str | None:
+def _only(names: list[str], what: str) -> str | None:
     if len(names) > 1:
         raise RecordingError(
             f'several topics may be the {what}: {", ".join(sorted(names))}; choose one with '

@@ -1,13 +1,14 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns column maps of tables: the content and unit of each column, and the message that it becomes.
+Owns column maps of tables: the content and unit of each column, and the message of its values.
 
 A map is a small YAML file; config/columns/ has examples. Without a map the columns are recognised
 by their headings (see `headings`). A table without headings must have the columns ``[t] ax ay az
-[wx wy wz]``, as for imu_tk. Times of unstated unit must rise in most rows. An unstated unit of
-acceleration is the unit in which the norm of samples at rest is gravity; an unstated unit of
-angular rate is deg/s if the numbers, as rad/s, would be faster than a turn by hand.
+[wx wy wz]``, as for imu_tk. If the unit of the times is not stated, the times must rise in most
+rows. If the unit of the acceleration is not stated, it is the unit in which the norm of samples at
+rest is gravity. If the unit of the angular rate is not stated, it is rad/s, or deg/s if the values
+in rad/s would exceed the rate of a turn by hand.
 """
 
 from collections.abc import Sequence
@@ -30,42 +31,33 @@ from .table import STAMP_EXPONENTS, Format, Stamp, Table, TimeUnit, read_parquet
 
 #: Slope and offset that convert a temperature of each unit to degC.
 _CELSIUS = {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}
-#: Range of plausible intervals between samples [s], which decides the unit of the times.
-_STEPS_S = (5e-5, 0.5)
-#: Longest plausible interval [s] if the unit turns by over `_TURN` [rad] between two still blocks
-#: (`_BLOCK` samples, sd below `_QUIET` [g]): with times in ms no hand could turn it so fast.
-_SLOW_S, _BLOCK, _TURN, _QUIET = 2.0, 12, 0.5, 0.02
+_STEPS_S = (5e-5, 0.5)  # range of plausible intervals between samples [s]
+_SLOW_S = 2.0  # longest plausible interval [s] if intervals in ms make a turn too fast for a hand
+_BLOCK, _QUIET = 12, 0.02  # number of samples of a block; largest sd of a still block [g]
+_TURN = 0.5  # smallest turn within a block that a hand cannot make if intervals are in ms [rad]
 _FASTEST_RAD_S = 20.0  # largest angular rate of a unit that is turned by hand [rad/s]
-#: Stamps of the years 2000 to 2038, and their largest interval [s]. A time since power-up in us,
-#: read as seconds, may look like a date up to 2038, but rises by over 60 s from row to row.
+#: Range of stamps from 2000 to 2038, and largest interval between such stamps [s]. Times since
+#: power-up in us, taken for seconds, may lie in this range, but have intervals above 60 s.
 _SINCE_1970_S, _SINCE_1970_STEP_S = (946_684_800.0, 2_147_483_648.0), 60.0
-#: Largest ratio of the range of temperatures in a log to the duration of the log [K/s]; a hair
-#: dryer warms a board by some 0.1 K/s.
-_FASTEST_K_S = 0.5
+_FASTEST_K_S = 0.5  # largest change of temperature / duration of a log; a hair dryer: 0.1 K/s
 # Largest share of rows in which a temperature in whole degrees changes. A column of the numbers of
 # boards or sensors alternates from row to row, so it changes in nearly all rows.
 _FEW_CHANGES = 0.1
 _RISING = 0.7  # smallest share of rows whose time is later than the time of the row before
-#: A step from the uppermost to the lowest tenth of the range of a 32-bit counter of time, such as
-#: Arduino's micros(), is an overflow (after 71.6 min).
-_WRAP_EDGE = 0.1
+_WRAP_EDGE = 0.1  # a step from the last to the first tenth of the 32-bit range is an overflow
 _A_MAP = 'a column map: --columns MAP'
 
 
 @dataclass(frozen=True)
 class Accel:
-    """
-    The accelerometer's three columns; `output` is the message written, counts or Imu (m/s^2).
-    `clip`: lowest and highest reading, at which the sensor is saturated, in the table's unit;
-    `offset`: reading at zero force, which is subtracted, such as 32768 in offset binary.
-    """
+    """The accelerometer's three columns; `clip` and `offset` are in `unit`."""
 
     columns: Triple
     unit: Unit
-    output: Literal['counts', 'imu']
+    output: Literal['counts', 'imu']  # message to write; Imu is in m/s^2
     counts_per_g: Positive | None = None
-    clip: tuple[float, float] | None = None
-    offset: float = 0.0
+    clip: tuple[float, float] | None = None  # lowest and highest reading: the sensor is saturated
+    offset: float = 0.0  # reading at zero force, which is subtracted, such as 32768
 
     def __post_init__(self) -> None:
         if self.unit == 'counts' and self.output == 'imu' and self.counts_per_g is None:
@@ -90,7 +82,7 @@ class Gyro:
 
 @dataclass(frozen=True)
 class Thermometer:
-    """A temperature column; unit raw: ``degC = reading * degc_per_count + degc_at_zero``."""
+    """A temperature column; if `unit` is raw, degC = reading * degc_per_count + degc_at_zero."""
 
     column: Column
     unit: Literal['degC', 'K', 'degF', 'raw'] = 'degC'
@@ -198,7 +190,7 @@ def table_log(path: Path, columns: ColumnMap) -> ForeignLog:
 
 
 def _without_wraps(table: Table, unit: TimeUnit | None) -> tuple[Ints, tuple[int, ...]]:
-    """Continue 32-bit times beyond overflows; return stamps, numbers of lines after overflows."""
+    """Continue 32-bit times beyond overflows; return stamps, and lines that follow overflows."""
     stamp_ns, rows = table.stamp_ns.copy(), np.flatnonzero(table.stamp_ns != NO_STAMP)
     if unit not in ('ms', 'us') or not len(rows):
         return stamp_ns, ()
@@ -214,8 +206,9 @@ def _without_wraps(table: Table, unit: TimeUnit | None) -> tuple[Ints, tuple[int
 def _read(
     path: Path, columns: Sequence[Column] | None, stamp: Stamp, style: Format | None = None
 ) -> Table:
-    read = read_parquet if path.suffix.lower() in ('.parquet', '.pq') else read_text
-    return read(path, columns, stamp, style)
+    if path.suffix.lower() in ('.parquet', '.pq'):
+        return read_parquet(path, columns, stamp)
+    return read_text(path, columns, stamp, style)
 
 
 def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
@@ -227,7 +220,7 @@ def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
         return np.column_stack([table.values[place.get(str(col), col)] for col in columns])
 
     def is_plausible(heading: str, unit: str) -> bool:
-        return _reads_temperature(values([heading])[:, 0], unit)
+        return _is_temperature(values([heading])[:, 0], unit)
 
     if table.headings:
         named = read_headings(table.headings, is_plausible)
@@ -241,7 +234,7 @@ def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
     accel = values(named.accel)
     unit = named.accel_unit
     if not unit:
-        # Rests are found without the true times: one second between samples is assumed.
+        # The unit of the times is not known yet: rests are searched as if sampled every second.
         still = find_stillness(np.arange(len(accel)) * 10**9, accel)
         unit, reason = infer_unit(still.magnitude)
         if unit == 'unknown':
@@ -290,7 +283,7 @@ def column_map_text(columns: ColumnMap) -> str:
     return ', '.join(parts)
 
 
-def _reads_temperature(values: Floats, unit: str) -> bool:
+def _is_temperature(values: Floats, unit: str) -> bool:
     """Whether the values of a column can be temperatures in a unit of `_CELSIUS`."""
     slope, offset = _CELSIUS[unit]
     celsius = values[np.isfinite(values)] * slope + offset
@@ -311,7 +304,7 @@ def _span(values: Floats) -> float:
 def _stamp(
     named: Headings, times: Floats | None, rate_hz: float | None, accel: Floats, span: float
 ) -> Stamp:
-    """Guess the unit of times by heading or values; `span` [K] bounds the duration."""
+    """Guess the unit of times by heading or values; `span`: range of the temperatures [K]."""
     if times is None:
         return Stamp(rate_hz=rate_hz)
     column = f'its column {named.time!r}'
@@ -335,10 +328,10 @@ def _stamp(
             f'rows: give {_A_MAP}, with `stamp: {{rate_hz: HZ}}` for samples at a fixed rate'
         )
     step, first = float(np.median(steps[steps > 0.0])), float(times[0])
-    # Shortest possible duration of the log [s]: temperatures change by `_FASTEST_K_S` at most.
-    shortest_s = span / _FASTEST_K_S
+    shortest_s = span / _FASTEST_K_S  # shortest plausible duration of the log [s]
     longest = _SLOW_S if _turns_at_once(accel) else _STEPS_S[1]
-    # Take the largest unit that gives a plausible interval between samples (5 ms, not 5 s).
+    # Take the largest unit that gives dates or plausible intervals. An interval above `longest`
+    # is accepted if the log would be shorter than `shortest_s` in the next smaller unit.
     for unit, exponent in STAMP_EXPONENTS.items():
         size = 10.0 ** (exponent - 9)
         begin, step_s = first * size, step * size
@@ -353,7 +346,7 @@ def _stamp(
 
 
 def _turns_at_once(accel: Floats) -> bool:
-    """Whether, with times in ms, a turn between still blocks would be too fast for a hand."""
+    """Whether the unit turns within a block of samples, between two still blocks."""
     blocks = accel[: len(accel) // _BLOCK * _BLOCK].reshape(-1, _BLOCK, 3)
     mean = blocks.mean(axis=1)
     size = np.linalg.norm(mean, axis=1, keepdims=True)

@@ -5,7 +5,8 @@ Owns the export of calibrations to the files of other tools, and the import of s
 
 All tools correct a reading N to a specific force ``a = A (N - b)``. In autopilots the bias b
 depends on temperature and the matrix A is the identity; in tools for tumble tests b and A are
-constant. An export's notes name the lost parts of the calibration, most with the resulting error.
+constant. The notes of an export list the parts of the calibration that the file cannot hold, most
+of them with the resulting error.
 """
 
 from dataclasses import replace
@@ -27,8 +28,7 @@ from ..unit.rate_bias import MILLIDEGREE, Gyroscope, RateCurve, RateSet
 from .tools import TOOLS, Content, ql, rotation_notes
 
 _GRID = 257  # number of temperatures at which a curve is computed
-#: White noise assumed for an imported gyroscope [rad/s/sqrt(Hz)].
-_RATE_NOISE = 1e-4
+_RATE_NOISE = 1e-4  # white noise assumed for an imported gyroscope [rad/s/sqrt(Hz)]
 #: A file is taken to be in m/s^2 if all scale factors are below this number and above its inverse.
 _NEAR_ONE = 2.0
 
@@ -68,8 +68,8 @@ def export_calibration(
     notes += [of_counts] * (calibration.unit.input == 'counts')
     white, walk = calibration.noise_density_m_s2_sqrt_hz, calibration.slow_noise_m_s2_sqrt_h
     noise = max(white), max(walk), 1.0 / calibration.unit.cycle_time_s
-    content = replace(content, notes=notes, noise=noise)
-    text = tool.write(content, number, device_id)
+    content = replace(content, notes=notes, noise=noise, number=number, device_id=device_id)
+    text = tool.write(content)
     title = f'Thermal calibration of unit {calibration.unit.serial}, by thermo_comp'
     # Write each note as a comment line; the reader of imu_tk does not accept comments.
     head = [] if to == 'imu_tk' else [f'# {one_line(line)}\n' for line in (title, *content.notes)]
@@ -77,13 +77,13 @@ def export_calibration(
 
 
 class _Curves(NamedTuple):
-    """Scale factor K, bias, and the curves of bias and scale in a soak, of the three axes."""
+    """Scale factors and biases of the three axes, and their static curves over temperature."""
 
-    temperature: Floats
-    K: Floats
-    level: Floats  # bias at the reference temperature, in input units, shape (3,)
+    temperature: Floats  # shape (n,)
+    K: Floats  # scale factors at the reference temperature, shape (3,)
+    level: Floats  # biases at the reference temperature, in units of the input, shape (3,)
     bias: Floats  # difference of the bias from `level` [m/s^2], shape (3, n)
-    scale: Floats  # relative change of the scale factor, shape (3, n)
+    scale: Floats  # relative difference of the scale factor from K, shape (3, n)
 
     @property
     def scale_drift(self) -> float:
@@ -109,7 +109,7 @@ def _thermal(
 ) -> Content:
     """Return each axis' offset over temperature as a cubic, for an autopilot."""
     d, notes = curves.temperature - reference_c, []
-    # Before the tool's correction the driver divides counts by K; samples in m/s^2 stay the same.
+    # The driver divides counts by K before the autopilot's correction, but not samples in m/s^2.
     gain = curves.K if calibration.unit.input == 'm/s^2' else np.ones(3)
     loads = calibration.gravity_m_s2 * np.array(up or (0.0, 0.0, 0.0))
     offset = (curves.level / curves.K)[:, None] + curves.bias + loads[:, None] * curves.scale
@@ -117,14 +117,14 @@ def _thermal(
     cubics, misfit = _cubics(d, offset)
     if misfit > 0.01 * MICRO_G:
         notes.append(f'cubics replace the bias functions: error up to {ug_text(misfit)}')
-    folded = 'included in the offset for one attitude'
+    place = 'included in the offset for one attitude' if up else 'lost'
     if curves.scale_drift > 1e-8:
-        lost = f'{_millionths(curves.scale_drift)} ppm'
-        notes.append(f'scale over temperature is {folded if up else "lost"}: up to {lost}')
+        size = _millionths(curves.scale_drift)
+        notes.append(f'scale over temperature is {place}: up to {size} ppm')
     constant = float(np.max(np.abs(gain - 1.0)))
     if constant > 1e-8:
-        lost = f'{1e6 * constant:.4g} ppm' + '; calibrate six faces in the autopilot' * (not up)
-        notes.append(f'the constant scale is {folded if up else "lost"}: up to {lost}')
+        advice = '; calibrate six faces in the autopilot' * (not up)
+        notes.append(f'the constant scale is {place}: up to {1e6 * constant:.4g} ppm{advice}')
     worst = float(np.max(np.abs(np.array(calibration.misalignment) - np.eye(3))))
     if worst:
         notes.append(f'misalignment is lost: up to {_millionths(worst)} urad')
@@ -133,8 +133,8 @@ def _thermal(
         triad = rate_triad(calibration)
         rate, _ = bias_and_scale(triad, ramp_states(triad, curves.temperature))
         rate_bias, misfit = _cubics(d, rate.T)
-        off = f'cubics replace the bias functions: error up to {misfit / MILLIDEGREE:.2g} mdeg/s'
-        of_rate = [*[off] * (misfit > 1e-3 * MILLIDEGREE), *_losses(triad)]
+        error = f'cubics replace the bias functions: error up to {misfit / MILLIDEGREE:.2g} mdeg/s'
+        of_rate = [*[error] * (misfit > 1e-3 * MILLIDEGREE), *_losses(triad)]
         notes += [f'angular rate: {note}' for note in of_rate]
     range_c = calibration.static.temperature_range_c
     return Content(np.eye(3), cubics, reference_c, range_c, notes, rate_bias=rate_bias)
@@ -173,10 +173,10 @@ def _losses(calibration: Calibration) -> list[str]:
     notes = []
     lost = sorted({term.group for term in calibration.response if any(term.bias + term.scale)})
     if lost:
-        worth = [group.explains_m_s2 for group in calibration.evidence if group.group in lost]
-        cost = f', up to {ug_text(float(np.linalg.norm(worth)))} RMS' if worth else ''
+        rms = [group.explains_m_s2 for group in calibration.evidence if group.group in lost]
+        size = f', up to {ug_text(float(np.linalg.norm(rms)))} RMS' if rms else ''
         notes.append(
-            f'the thermal response is lost ({", ".join(lost)}){cost}: heating and cooling get '
+            f'the thermal response is lost ({", ".join(lost)}){size}: heating and cooling get '
             'the same correction'
         )
     static, dynamic = (
@@ -258,5 +258,5 @@ def import_calibration(
 
 
 def _curves(bias: Floats) -> list[Polynomial]:
-    """Return the cubic of each axis without the constant term."""
+    """Return the cubics of the rows of `bias`, with constant terms of 0."""
     return [Polynomial((0.0, *row[1:])) for row in bias.tolist()]

@@ -40,9 +40,8 @@ _OTHER = re.compile('mag|mfield|orient|euler|quat|angle|lin|free|user|grav|pos|v
 _TEMPERATURE = re.compile(
     'temp|tmp|celsius|(^|_)t_?c($|_)|^t_(board|case|imu|die|chip|sensor|air|amb|room|baro)'
 )
-# Words in headings of thermometers that are not on the board.
-_OUTSIDE = re.compile('case|air|amb|baro|bmp|aht|room|hous|env')
-# Unit of a temperature at the end of a heading; words in headings that are not of a temperature.
+_OUTSIDE = re.compile('case|air|amb|baro|bmp|aht|room|hous|env')  # thermometers off the board
+# Unit of a temperature at the end of a heading; words of headings that name no temperature.
 _DEGREES_END = re.compile('(^|_)(deg_?[cfk]|kelvin|fahrenheit)$')
 _NO_READING = re.compile('(^|_)(raw|adc|counts?|lsb|id|rev|status|valid|voltage|volts?|mv)(_|$)')
 # A heading like `magnet_c` (ends in the unit's letter) or `board` (a place alone) is that of a
@@ -60,10 +59,10 @@ _RATES = {
     **dict.fromkeys(('rad/s', 'rad s^-1', 'rad_s', 'rads'), 'rad/s'),
 }
 _DEGREES = {
+    **dict.fromkeys(('c', '°c', 'ºc', 'degc', 'deg c', 'celsius'), 'degC'),
     **dict.fromkeys(('k', 'kelvin', 'degk', 'tempk'), 'K'),
     **dict.fromkeys(('f', '°f', 'degf', 'deg f', 'fahrenheit', 'tempf'), 'degF'),
 }
-_CELSIUS = ('c', '°c', 'ºc', 'degc', 'deg c', 'celsius')
 
 Column = str | int
 Triple = tuple[Column, Column, Column]
@@ -90,20 +89,21 @@ def read_headings(
     `is_plausible(heading, unit)`: whether the values of a column can be temperatures in this unit.
     """
     names = {_plain(heading): heading for heading in reversed(headings)}
-    times = [text for name, text in names.items() if _TIME.search(name) and not _is_warm(text)]
+    times = [text for name, text in names.items() if _TIME.search(name)]
+    times = [text for text in times if not _names_temperature(text)]
     # A heading like `T_magnet_C` is taken for the times only if no other heading names a time.
     times.sort(key=lambda text: _LETTER.search(_plain(text)) is None)
-    found = dict(_triads(names))
-    triads = {key: three for key, three in found.items() if not _OTHER.search(key)}
+    every = dict(_triads(names))
+    triads = {key: three for key, three in every.items() if not _OTHER.search(key)}
     accel = next((three for key, three in triads.items() if _ACCEL.search(key)), triads.get(''))
-    accel = accel or next((three for key, three in found.items() if _ROS_ACCEL.search(key)), None)
+    accel = accel or next((three for key, three in every.items() if _ROS_ACCEL.search(key)), None)
     if accel is None:
         return None
     gyro = next((three for key, three in triads.items() if _GYRO.search(key)), None)
     time = times[-1] if times else ''
     time_unit, accel_unit = _stated(time, _TIMES | _LONG_TIMES), _stated(accel[0], _ACCELS)
     gyro_unit = _stated(gyro[0], _RATES) if gyro else ''
-    taken = {time, *(heading for three in found.values() for heading in three)}
+    taken = {time, *(heading for three in every.values() for heading in three)}
     free = [heading for heading in headings if heading not in taken]
     thermometers = _thermometers(free, names, is_plausible)
     return Headings(time or None, time_unit, accel, accel_unit, gyro, gyro_unit, thermometers)
@@ -112,27 +112,24 @@ def read_headings(
 def _thermometers(
     headings: Sequence[str], names: Container[str], is_plausible: Callable[[str, str], bool]
 ) -> dict[str, tuple[str, str]]:
-    """
-    Return each thermometer's column and unit. A column whose heading is a place, like `board`, is
-    used only if its thermometer has no other column. `names`: `_plain` of all headings.
-    """
+    """Return each thermometer's column and unit; `names`: `_plain` of all headings."""
     units = {heading: _stated(heading, _DEGREES) or 'degC' for heading in headings}
-    warm, places = [], []
+    named, places = [], []
     for heading, unit in units.items():
         name = _plain(heading)
         # The last letters of headings like `phase_a`, `phase_b`, `phase_c` are not units.
         is_letter = _LETTER.search(name) is not None and f'{name[:-1]}b' not in names
-        if _is_warm(heading) or (is_letter and is_plausible(heading, unit)):
-            warm.append(heading)
+        if _names_temperature(heading) or (is_letter and is_plausible(heading, unit)):
+            named.append(heading)
         elif _PLACE.fullmatch(name) and is_plausible(heading, unit):
             places.append(heading)
     result: dict[str, tuple[str, str]] = {}
     outside = {heading for heading in headings if _OUTSIDE.search(_plain(heading))}
-    for heading in sorted((*warm, *places), key=outside.__contains__):
-        name = 'case' if result and (heading in outside or heading in warm) else 'board'
+    for heading in sorted((*named, *places), key=outside.__contains__):
+        name = 'case' if result and (heading in outside or heading in named) else 'board'
         if name not in result:
             result[name] = heading, units[heading]
-        elif heading in warm:
+        elif heading in named:  # a place is used only if its thermometer has no other column
             result[f't{len(result)}'] = heading, units[heading]
     return result
 
@@ -153,10 +150,10 @@ def _given(value: Any) -> Any:
     return list(map(_given, value)) if isinstance(value, tuple) else value
 
 
-def _is_warm(heading: str) -> bool:
+def _names_temperature(heading: str) -> bool:
     """Whether a heading names a temperature, by its words or by its unit."""
     unit, name = _UNIT.search(heading), _plain(heading)
-    is_unit = unit is not None and unit[1].strip().lower() in {*_DEGREES, *_CELSIUS}
+    is_unit = unit is not None and unit[1].strip().lower() in _DEGREES
     is_name = _TEMPERATURE.search(name) and not _NO_READING.search(name)
     return bool(is_unit or _DEGREES_END.search(name) or is_name)
 
@@ -177,7 +174,7 @@ def _stated(heading: str, units: dict[str, str]) -> str:
 
 
 def _triads(names: dict[str, str]) -> Iterator[tuple[str, tuple[str, str, str]]]:
-    """Find triads of headings that only differ in x, y, z; yield common part and headings."""
+    """Find triads of headings that differ only in x, y, z; yield common part and headings."""
     for name in reversed(names):
         for at in (match.start() for match in re.finditer('x', name)):
             three = [f'{name[:at]}{axis}{name[at + 1 :]}' for axis in 'xyz']

@@ -3,8 +3,9 @@
 """
 Owns the conversion of a log of any format to a bag: checks, and a report on the rows left out.
 
-At rest the norm of the specific force is gravity in any attitude. A log whose stated unit
-contradicts gravity is refused: otherwise a factor of 9.8 would remain in the calibration.
+At rest the norm of the specific force is gravity in any attitude. A log is refused if its samples
+at rest do not have this norm in the stated unit, because a wrong unit would remain in the
+calibration as a factor, such as 9.8.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,7 +23,7 @@ from ..files import shown_name
 from ..fitting.sources import digest
 from ..recording.blocks import ImuColumns, Readings
 from ..recording.overview import KELVINS
-from ..recording.stillness import CellAccumulator
+from ..recording.stillness import CellAccumulator, is_full
 from ..recording.topics import Topics
 from ..recording.writer import STAMP_END_NS, BagWriter
 from ..text import valid_serial
@@ -32,17 +33,12 @@ from ..unit.gravity import STANDARD_GRAVITY
 
 Unit = Literal['m/s^2', 'g', 'mg', 'counts']
 
-# |a| at rest in each unit, and the relative tolerance of |a|: above the errors of bias and scale
-# of cheap sensors, even in a chamber, and far below the ratios of m/s^2, g and mg.
-PER_G: dict[Unit, float] = {'g': 1.0, 'm/s^2': STANDARD_GRAVITY, 'mg': 1000.0}
-_TOLERANCE = 0.2
-# Usual sensitivities of 16-bit sensors with ranges from +-16 g to +-2 g [counts/g].
-_SENSITIVITIES = (2048, 4096, 8192, 16384)
+PER_G: dict[Unit, float] = {'g': 1.0, 'm/s^2': STANDARD_GRAVITY, 'mg': 1000.0}  # |a| at rest
+_TOLERANCE = 0.2  # relative tolerance of |a|: above the errors of cheap sensors in a chamber
+_SENSITIVITIES = (2048, 4096, 8192, 16384)  # 16-bit sensors of +-16 g to +-2 g [counts/g]
 
 _CELL_S, _MIN_SAMPLES = 0.5, 12  # length of a cell of samples [s], least number of samples in it
-# Ratio of a cell's sd to the lower quartile of the cells' sds, above which the cell is a movement;
-# noise alone gives cells of 12 samples a ratio below 2.
-_MOVING_RATIO = 4.0
+_MOVING_RATIO = 4.0  # largest sd of a still cell / lower quartile of all sds; by noise below 2
 _MERGE_NS = 10 * 10**9  # shortest rest between two separate movements [ns]
 
 NO_STAMP = np.iinfo(np.int64).min  # stands for the stamp of a row without a stamp
@@ -71,7 +67,7 @@ class ForeignLog:
     clip: tuple[float, float] | None = None  # readings at which the sensor is saturated
     frame_id: str = 'imu_link'
     serial: str = ''
-    short: Sequence[int] = ()  # lines, or numbers of messages, dropped for missing cells
+    short: Sequence[int] = ()  # numbers of the lines or messages dropped for missing cells
     not_used: tuple[str, ...] = ()  # columns of a table that are not written to the bag
     continued: tuple[int, ...] = ()  # numbers of the lines after an overflow of a 32-bit time
     metadata: Mapping[str, str] = field(default_factory=dict)
@@ -92,7 +88,7 @@ class Stillness:
 
     magnitude: float  # median |a| of the quiet cells
     noise: float  # median sd per axis of the quiet cells
-    still_s: float
+    still_s: float  # total time of the quiet cells
     moving_ns: tuple[tuple[int, int], ...]  # stamps of begin and end of each movement
 
 
@@ -288,13 +284,12 @@ def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:
         run = slice(first, first + _RUN_ROWS)
         reduced.add(stamp_ns[run], accel[run])
     cells = reduced.cells()
-    usual = float(np.median(cells.count)) if len(cells.count) else 0.0
-    full = cells.count >= max(_MIN_SAMPLES, 0.5 * usual)
+    full = is_full(cells, _MIN_SAMPLES)
     if not full.any():
         return Stillness(float('nan'), float('nan'), 0.0, ())
     sd = np.sqrt(cells.variance[full].mean(axis=1))
-    # The quiet level is the lower quartile of the cells' sd, as a unit may be handled for most of
-    # a log. The quiet level is at least a quantum, as smaller noise is not visible.
+    # The quiet level is the lower quartile and not the median of the cells' sd, because a unit
+    # may be handled for most of a log; it is at least a quantum: smaller noise is not visible.
     is_quiet = sd <= _MOVING_RATIO * max(np.quantile(sd, 0.25), cells.quantum.max())
     cell_ns = round(cells.cell_s * 1e9)
     moving: list[tuple[int, int]] = []

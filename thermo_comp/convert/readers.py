@@ -66,7 +66,7 @@ def read_log(path: Path, **given: Any) -> ForeignLog:
 def as_bags(
     paths: Sequence[Path], on_log: Callable[[ForeignLog], None] = lambda _: None, **given: Any
 ) -> Iterator[list[Path]]:
-    """Yield the given bags, and temporary bags made of tables and logs; `on_log` gets each log."""
+    """Yield the bags, and a temporary bag for each table and log; call `on_log` with each log."""
     others = [path for path in paths if path.is_file() and kind_of(path) != 'bag']
     if any(given.values()) and not others:
         flags = ' and '.join(f'`{name}`' for name in given)

@@ -33,7 +33,7 @@ from .log import NO_STAMP, import_extra
 TimeUnit = Literal['s', 'ms', 'us', 'ns', 'iso']
 
 _SNIFF_BYTES = 65536
-_LAYOUT_ROWS = 50  # number of rows at the end of the first 64 KiB from which the layout follows
+_LAYOUT_ROWS = 50  # number of rows, at the end of the first 64 KiB, that determine the layout
 _PREAMBLE_ROWS = 1000  # largest number of rows before the table, as some loggers write
 _ROWS_AT_ONCE = 4096  # number of rows whose cells are read together
 _MOST_ROWS_PER_BYTE = 4  # largest plausible number of rows per byte of a Parquet file
@@ -87,7 +87,7 @@ class Table:
     values: dict[Column, Floats]  # NaN if a cell is not a number
     stamp_ns: Ints  # `NO_STAMP` if a cell is not a number
     short: Sequence[int] = ()  # lines of dropped rows with too few cells, such as a cut row
-    not_used: tuple[str, ...] = ()  # headings, or else numbers, of the columns that were not read
+    not_used: tuple[str, ...] = ()  # headings (or numbers) of the columns that were not read
     headings: tuple[str, ...] = ()
 
 
@@ -128,7 +128,8 @@ def layout(head: str, delimiter: str | None = None) -> tuple[str, int]:
     for sign in (';', '\t', '|', ',', ' ') if delimiter is None else (delimiter,):
         rows = [row for _, row in _rows(lines, sign)]
         width, n_rows = _most_frequent([_n_cells(row) for row in rows[-_LAYOUT_ROWS:]])
-        # If a slow thermometer in the last column leaves most rows short, full rows set the width.
+        # If a slow thermometer is in the last column, most rows end in an empty cell: the width
+        # is then that of the rows without an empty cell.
         whole, _ = _most_frequent([len(row) for row in rows[-_LAYOUT_ROWS:]])
         is_whole = any(len(row) == whole and row[-1].strip() for row in rows)
         candidates.append((n_rows if width > 1 else 0, sign, whole if is_whole else width))
@@ -295,10 +296,8 @@ def _iso_ns(text: str) -> int:
     return seconds * 10**9 + int((fraction or '').ljust(9, '0'))
 
 
-def read_parquet(
-    path: Path, columns: Sequence[Column] | None, stamp: Stamp, _style: Format | None = None
-) -> Table:
-    """Read columns of a Parquet file, as `read_text`; if `columns` is None, texts become NaN."""
+def read_parquet(path: Path, columns: Sequence[Column] | None, stamp: Stamp) -> Table:
+    """Read columns of a Parquet file like `read_text`; with `columns` None, texts become NaN."""
     pq = import_extra('pyarrow.parquet', 'parquet', 'a Parquet file')
     import pyarrow as pa
 

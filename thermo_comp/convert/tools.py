@@ -31,10 +31,9 @@ from ..errors import CalibrationError
 from ..plain_yaml import load_plain_yaml
 from ..typing import Floats
 
-_ARDUPILOT_REFERENCE_C = 35.0
-_ARDUPILOT_SCALE = 1e6
-# ArduPilot's value for an unknown temperature of the offset calibration [degC].
-_NO_TEMPERATURE = -273.0
+_ARDUPILOT_REFERENCE_C = 35.0  # temperature at which d of ArduPilot's cubic is 0 [degC]
+_ARDUPILOT_SCALE = 1e6  # ArduPilot's coefficient / that in m/s^2 or rad/s per power of kelvin
+_NO_TEMPERATURE = -273.0  # ArduPilot's value for an unknown calibration temperature [degC]
 _AXES = ('X', 'Y', 'Z')
 _THERMAL_NOTE = (
     'imported: bias over the temperature of the board thermometer only; no scale, misalignment, '
@@ -50,7 +49,7 @@ _HEADING = re.compile(r'\s*(#|Misalignment Matrix|Scale Matrix|Bias Vector)')
 
 @dataclass(frozen=True)
 class Content:
-    """A tool's file: ``a = matrix (N - bias)``, N: readings, bias: cubic of temperature."""
+    """Content of a tool's file: ``a = matrix (N - bias)``, with the reading N."""
 
     matrix: Floats  # shape (3, 3); the identity in an autopilot's file
     bias: Floats  # coefficients of the cubic of each axis, in units of N, shape (3, 4)
@@ -58,6 +57,8 @@ class Content:
     range_c: tuple[float, float]
     notes: list[str]  # parts of the calibration that are lost or missing
     source: str = ''  # the tool and the parameter set that was read
+    number: int | None = None  # number of the parameter set or IMU to write
+    device_id: int = 0  # identity of the sensor in PX4; 0: unknown
     # White noise [m/s^2/sqrt(Hz)], random walk [m/s^2/sqrt(h)], sample rate [Hz]; in a file that
     # was read, 0 means that the file does not state the value.
     noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -65,12 +66,13 @@ class Content:
     text: str = ''  # the written file
 
 
-def _write_px4(content: Content, number: int | None, device_id: int) -> str:
+def _write_px4(content: Content) -> str:
     """Write PX4 parameters in QGroundControl's format; the n of ``TC_An`` counts from 0."""
-    instance = _within(number, 0)
+    instance = _within(content.number, 0)
     lower, upper = content.range_c
     lines = ['# Vehicle-Id Component-Id Name Value Type']
-    for letter, bias, known_id in (('A', content.bias, device_id), ('G', content.rate_bias, 0)):
+    sensors = ('A', content.bias, content.device_id), ('G', content.rate_bias, 0)
+    for letter, bias, known_id in sensors:
         if bias is None:
             continue
         prefix = f'TC_{letter}{instance}_'
@@ -86,9 +88,9 @@ def _write_px4(content: Content, number: int | None, device_id: int) -> str:
     return '\n'.join(lines) + '\n'
 
 
-def _write_ardupilot(content: Content, number: int | None, _device_id: int) -> str:
+def _write_ardupilot(content: Content) -> str:
     """Write ArduPilot parameters; the n of ``INS_TCALn`` counts from 1."""
-    imu = _within(number, 1)
+    imu = _within(content.number, 1)
     lower, upper = content.range_c
     content.notes.append(
         'the file has the changes of the offset with temperature, not the offset: calibrate the '
@@ -112,7 +114,7 @@ def _within(number: int | None, lowest: int) -> int:
 
 
 def _read_px4(text: str, number: int | None) -> Content | None:
-    """Read PX4 TC_A parameters (QGroundControl's format or ``NAME=VALUE``); None without any."""
+    """Read PX4 parameters (QGroundControl's format or ``NAME=VALUE``); None if no TC_A exists."""
     values = _Parameters(text)
     numbers = {int(name[4]) for name in values if re.match(r'TC_A\d_X1_', name)}
     if not numbers:
@@ -129,12 +131,13 @@ def _read_px4(text: str, number: int | None) -> Content | None:
     bias, reference, lower, upper = cubics(f'TC_A{number}_')
     rate_bias = None
     if values.get('TC_G_ENABLE', 1.0) == 1.0 and f'TC_G{number}_X1_0' in values:
-        rate_bias, rate_reference, *edges = cubics(f'TC_G{number}_')
+        rate_bias, rate_reference, *rate_range = cubics(f'TC_G{number}_')
+        # Expand the cubics about `reference`, the temperature at which d of TC_A is 0.
         moved = np.polynomial.Polynomial((reference - rate_reference, 1.0))
         for row in rate_bias:
             coefficients = np.polynomial.Polynomial(row)(moved).coef
             row[:] = np.pad(coefficients, (0, 4 - len(coefficients)))
-        lower, upper = max(lower, edges[0]), min(upper, edges[1])
+        lower, upper = max(lower, rate_range[0]), min(upper, rate_range[1])
     source, notes = f'PX4 TC_A{number}_*', [_THERMAL_NOTE]
     return Content(np.eye(3), bias, reference, (lower, upper), notes, source, rate_bias=rate_bias)
 
@@ -226,12 +229,12 @@ def rotation_notes(rotation: Floats) -> list[str]:
     yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
     angles = f'{roll:.6g} {pitch:.6g} {yaw:.6g}'
     return [
-        "the axes of the other tool's frame differ from those of thermo_comp's: the tf from the "
-        f"other tool's frame to thermo_comp's has roll, pitch, yaw {angles} rad"
+        "the axes of the other tool's frame differ from thermo_comp's: the tf from the other "
+        f"tool's frame to thermo_comp's has roll, pitch, yaw {angles} rad"
     ]
 
 
-def _write_imu_tk(content: Content, _number: int | None, _device_id: int) -> str:
+def _write_imu_tk(content: Content) -> str:
     """Write the three blocks of imu_tk's ``.calib``; imu_tk's reader accepts no comments."""
     rotation, upper = _qr(content.matrix)
     scale = np.diag(upper)
@@ -242,19 +245,19 @@ def _write_imu_tk(content: Content, _number: int | None, _device_id: int) -> str
     )
 
 
-def _write_imu_calib(content: Content, _number: int | None, _device_id: int) -> str:
+def _write_imu_calib(content: Content) -> str:
     bias = content.matrix @ content.bias[:, 0]
     return f'SM: {content.matrix.ravel().tolist()}\nbias: {bias.tolist()}\n'
 
 
-def _write_kalibr(content: Content, number: int | None, _device_id: int) -> str:
+def _write_kalibr(content: Content) -> str:
     """Write Kalibr's YAML of an IMU, without topic and gyroscope."""
     white, walk, rate = content.noise
     rows = ''.join(f'    - {row}\n' for row in np.linalg.inv(content.matrix).tolist())
     content.notes.append('Kalibr estimates the bias in each run and ignores the key `bias`')
     content.notes.append('the file lacks rostopic and gyroscope of the IMU: add these for Kalibr')
     return (
-        f'imu{number or 0}:\n  model: scale-misalignment\n  update_rate: {rate:.9g}\n'
+        f'imu{content.number or 0}:\n  model: scale-misalignment\n  update_rate: {rate:.9g}\n'
         f'  accelerometer_noise_density: {white!r}\n'
         f'  accelerometer_random_walk: {walk / 60.0!r}\n'
         f'  accelerometers:\n    M:\n{rows}    bias: {content.bias[:, 0].tolist()}\n'
@@ -350,7 +353,7 @@ def _array(value: object, key: str, size: int) -> Floats:
 class Tool:
     """Writer and reader of a tool's files, which hold bias curves (`is_thermal`) or constants."""
 
-    write: Callable[[Content, int | None, int], str]
+    write: Callable[[Content], str]
     read: Callable[[str, int | None], Content | None]  # returns None for the file of another tool
     is_thermal: bool = False
     reference_c: float | None = None  # the fixed reference temperature of an autopilot

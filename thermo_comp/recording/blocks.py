@@ -26,22 +26,17 @@ Role = str  # ``accel``, or the name of a thermometer
 
 ROLES: tuple[Role, ...] = ('accel', 'board', 'case')
 
-#: Messages per block; large enough that the per-block overhead is negligible.
-BLOCK_MESSAGES = 1 << 15
+BLOCK_MESSAGES = 1 << 15  # messages per block; the overhead per block is then negligible
 
-#: Stands for the stamp of a message without a stamp: the earliest stamp that a header can hold.
-NO_STAMP_NS = -(2**31) * 10**9
-_JUMP_NS = 10**9  # backward steps of the stamps above this are jumps of time [ns]
+NO_STAMP_NS = -(2**31) * 10**9  # stands for a missing stamp: the earliest that a header can hold
+_JUMP_NS = 10**9  # a backward step of the stamps by more than this is a jump of the clock [ns]
 LONGEST_PAUSE_NS = 3600 * 10**9  # longer jumps of the stamps are shortened to this length [ns]
-#: Largest number of jumps of the stamps by over an hour in a recording that is read.
-_MOST_JUMPS = 100
-# A thermometer is taken to use another clock than the accelerometer if the median distance [s] of
-# its readings (`_FEWEST_READINGS` or more) from the samples around them is above `_APART_S`.
-_FEWEST_READINGS, _APART_S = 10, 10.0
-#: Shortest time between successive equal readings in the result of `Readings.thinned` [ns].
-_REPEAT_NS = 10_000_000_000
-#: Longest mean interval between messages [ns] in a recording longer than `_SPARSE_NS` [ns].
-_SPARSE_NS, _SPARSEST_NS = 10 * 86400 * 10**9, 10 * 10**9
+_MOST_JUMPS = 100  # a recording with more jumps of the stamps by over an hour is refused
+_FEWEST_STAMPS = 10  # smallest number of stamps for a warning about their clock
+_APART_S = 10.0  # largest median distance of readings from samples of the same clock [s]
+_REPEAT_NS = 10 * 10**9  # `Readings.thinned` keeps an equal reading after this time [ns]
+_LONG_NS = 10 * 86400 * 10**9  # shortest duration of a long recording [ns]
+_SPARSEST_NS = 10 * 10**9  # largest mean interval of messages in a long recording [ns]
 
 
 class Topic(NamedTuple):
@@ -70,23 +65,17 @@ class BagFile:
 
 @dataclass(frozen=True, slots=True)
 class RecordingInfo:
-    """
-    The content of a bag, known before its messages are read.
-    `topics`: message type (several joined by `` | ``) and number of messages by name. `start_ns`
-    and `end_ns`: first and last log time, 0 without messages. `truncated` describes missing parts,
-    if any; `metadata` holds the key-value pairs stored in the bag; `input` is the input whose
-    topic has the samples; `chosen` has notes on topics selected by their type and on stamps.
-    """
+    """The content of a bag, known before its messages are read."""
 
     path: Path
     storage: str
-    topics: Mapping[str, tuple[str, int]]
-    start_ns: int
-    end_ns: int
-    truncated: str | None = None
-    metadata: Mapping[str, str] = field(default_factory=dict)
-    input: Literal['counts', 'imu'] | None = None
-    chosen: str | None = None
+    topics: Mapping[str, tuple[str, int]]  # type (or types joined by ' | ') and number of messages
+    start_ns: int  # first log time, 0 without messages
+    end_ns: int  # last log time, 0 without messages
+    truncated: str | None = None  # description of missing parts
+    metadata: Mapping[str, str] = field(default_factory=dict)  # pairs stored in the bag
+    input: Literal['counts', 'imu'] | None = None  # input whose topic has the samples
+    chosen: str | None = None  # notes on topics selected by their type, and on stamps
 
     @property
     def n_messages(self) -> int:
@@ -95,20 +84,17 @@ class RecordingInfo:
 
 
 class ImuColumns(NamedTuple):
-    """
-    Fields of sensor_msgs/Imu: quaternion x, y, z, w, shape (n, 4), rates [rad/s], shape (n, 3),
-    covariances, shape (n, 9). A writer repeats an array of one row for all messages.
-    """
+    """Fields of sensor_msgs/Imu; a writer repeats an array of one row for all messages."""
 
-    orientation: Floats
-    orientation_covariance: Floats
-    angular_velocity: Floats
+    orientation: Floats  # quaternion x, y, z, w, shape (n, 4)
+    orientation_covariance: Floats  # like the other covariances of shape (n, 9)
+    angular_velocity: Floats  # [rad/s], shape (n, 3)
     angular_velocity_covariance: Floats
     linear_acceleration_covariance: Floats
 
     @classmethod
     def of_rate(cls, rate: Floats | None) -> ImuColumns:
-        """Build from angular rates, None if absent; orientation marked as absent (REP 145)."""
+        """Build from angular rates (None: absent); the orientation is marked absent (REP 145)."""
         none, unknown = np.array([-1.0] + 8 * [0.0]), np.zeros(9)
         level = np.array([0.0, 0.0, 0.0, 1.0])
         if rate is None:
@@ -148,20 +134,15 @@ class Readings(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """
-    Consecutive messages in reading order, as columns; a block ends where `frame_id` changes.
-    `accel`, shape (n, 3), is in counts per conversion cycle, or m/s^2 if the input is
-    sensor_msgs/Imu; `imu` holds its other fields. `temperatures` has a key for each thermometer;
-    `log_ns` and, if requested, the serialized messages `raw` also have the key ``accel``.
-    """
+    """Consecutive messages in reading order, as columns; a block ends where `frame_id` changes."""
 
     accel_stamp_ns: Ints
-    accel: Floats
+    accel: Floats  # counts per conversion cycle, or m/s^2 of sensor_msgs/Imu, shape (n, 3)
     frame_id: str
-    imu: ImuColumns | None
-    temperatures: Mapping[str, Readings]
+    imu: ImuColumns | None  # the other fields of sensor_msgs/Imu
+    temperatures: Mapping[str, Readings]  # by thermometer
     log_ns: Mapping[Role, Ints]
-    raw: Mapping[Role, Messages] = field(default_factory=dict)
+    raw: Mapping[Role, Messages] = field(default_factory=dict)  # serialized, if requested
 
     def __len__(self) -> int:
         """Return the number of accelerometer messages."""
@@ -274,16 +255,16 @@ def unstamped(stamp_ns: int) -> str:
 
 
 def clocks_apart(block: Block) -> str:
-    """Return a warning for equal stamps, or for samples and readings of two clocks, or ''."""
+    """Return a warning if all stamps are equal, or if readings have another clock; else ''."""
     stamps = block.accel_stamp_ns
-    if len(stamps) >= _FEWEST_READINGS and (stamps == stamps[0]).all():
+    if len(stamps) >= _FEWEST_STAMPS and (stamps == stamps[0]).all():
         return unstamped(int(stamps[0]))
     for name, readings in block.temperatures.items():
         inside = (readings.after > 0) & (readings.after < len(block))
         stamp_ns, after = readings.stamp_ns[inside], readings.after[inside]
         edges = block.accel_stamp_ns[after - 1], block.accel_stamp_ns[after]
         apart_s = (stamp_ns - np.clip(stamp_ns, *edges)) * 1e-9
-        if len(apart_s) >= _FEWEST_READINGS and abs(middle := np.median(apart_s)) > _APART_S:
+        if len(apart_s) >= _FEWEST_STAMPS and abs(middle := np.median(apart_s)) > _APART_S:
             return (
                 f'{name} readings are stamped {middle:+.0f} s from the samples around them: do '
                 'the stamps of thermometer and accelerometer come from two clocks?'
@@ -296,7 +277,7 @@ def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
     Turn a jump of the stamps by over an hour, forwards or backwards, into a gap of an hour.
     A clock that is set during a recording can leave a gap of years, too long for a time grid. A
     gap of an hour suffices to make the thermal state unknown. RecordingError for more than
-    `_MOST_JUMPS` jumps, or if the recording is too sparse (`_SPARSE_NS`, `_SPARSEST_NS`).
+    `_MOST_JUMPS` jumps, or if the recording is too sparse (`_LONG_NS`, `_SPARSEST_NS`).
     """
     last_ns: int | None = None
     offset = 0
@@ -315,7 +296,7 @@ def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
         n_jumps += int(np.count_nonzero(is_jump))
         n_messages += len(read)
         span_ns += int(np.sum(np.where(is_jump, LONGEST_PAUSE_NS, np.maximum(steps, 0))))
-        if n_jumps > _MOST_JUMPS or span_ns > max(_SPARSE_NS, n_messages * _SPARSEST_NS):
+        if n_jumps > _MOST_JUMPS or span_ns > max(_LONG_NS, n_messages * _SPARSEST_NS):
             reason = f'{n_messages} messages stamped over {span_ns / 86400e9:.0f} days with '
             reason += f'{n_jumps} jumps by more than an hour: no recording of a thermal test'
             raise RecordingError(clocks_apart(block) or reason, path)

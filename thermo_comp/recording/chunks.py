@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the spans of an MCAP file that hold messages: decompresses them and finds their messages.
+Owns the parts of an MCAP file that hold messages: decompresses the parts, finds the messages.
 
 A complete chunk must expand to the size that it declares, at most 64 MiB. The message index of a
 chunk is only used if the messages in the index fill the chunk without gap or overlap; otherwise
@@ -34,12 +34,11 @@ HEAD_BYTES = 160  # bytes read at the begin of a record, enough for the head of 
 _CHUNK_HEAD = struct.Struct('<BQQQQII')
 _INDEX_HEAD = struct.Struct('<BQHI')
 _INDEX_ROW_BYTES = 16  # log time and offset of one message, 8 bytes each
-#: Number of bytes before the serialized message in a record, with and without `PREFIX`.
-MESSAGE_HEAD_BYTES = 31
-_MESSAGE_FIELDS_BYTES = MESSAGE_HEAD_BYTES - PREFIX.size
+MESSAGE_HEAD_BYTES = 31  # number of bytes before the serialized message in a record
+_MESSAGE_FIELDS_BYTES = MESSAGE_HEAD_BYTES - PREFIX.size  # number of these bytes after `PREFIX`
 MESSAGE = int(Opcode.MESSAGE)
 
-#: Reasons why reading record by record stopped.
+#: Reasons why `scan_records` stopped before the end of the data.
 _ENDS_EARLY = 'a record ends too early'
 _ZERO_OPCODE = 'a record has the opcode 0'
 MAX_CHUNK_BYTES = 1 << 26  # largest declared content of a chunk [bytes]
@@ -47,7 +46,7 @@ MAX_CHUNK_BYTES = 1 << 26  # largest declared content of a chunk [bytes]
 _MAX_GROWTH = 1024
 _FREE_GROWTH_BYTES = 1 << 26
 _MAX_WINDOW = 1 << 27  # largest window of zstd [bytes]
-_STEP_BYTES = 1 << 16  # bytes decompressed at a time; the first damaged piece of data is lost
+_STEP_BYTES = 1 << 16  # bytes decompressed at a time; pieces of this size before damage are kept
 _ENGINES: Mapping[str, Callable[[], Any]] = {
     'lz4': lz4.frame.LZ4FrameDecompressor,
     'bz2': bz2.BZ2Decompressor,
@@ -81,15 +80,12 @@ def translated(path: Path, *, is_foreign: bool = False) -> Iterator[None]:
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """
-    A part of a file: a chunk, a chunk without end ('torn'), or messages outside chunks ('loose').
-    `length` excludes the message indexes after the part; `size`: decompressed size [bytes].
-    """
+    """Part of a file: a chunk, a chunk without end ('torn'), messages outside chunks ('loose')."""
 
     position: int
-    length: int
+    length: int  # without the message indexes after the part
     index_length: int = 0
-    size: int = 0
+    size: int = 0  # number of bytes after decompression
     start_ns: int = 0
     end_ns: int = 0
     kind: Literal['chunk', 'torn', 'loose'] = 'chunk'
@@ -166,7 +162,7 @@ def _indexed(data: Bytes, index: memoryview) -> Messages | None:
         is_sound = opcode == Opcode.MESSAGE_INDEX and content == length + 6
         if not is_sound or length % _INDEX_ROW_BYTES or begin + length > len(index):
             return None
-        # An unsigned offset above 2^63 becomes negative: `is_inside` refuses negative offsets.
+        # An unsigned offset of 2^63 or more becomes negative, which `is_inside` refuses.
         columns.append(np.frombuffer(index, '<i8', length // 8, begin)[1::2])
         begin += length
     at = np.sort(np.concatenate(columns), kind='stable') if columns else np.empty(0, np.int64)
@@ -174,7 +170,7 @@ def _indexed(data: Bytes, index: memoryview) -> Messages | None:
     if begin != len(index) or not is_inside:
         return None
     head = gather(data, at, MESSAGE_HEAD_BYTES)
-    # For a too small length the unsigned difference is huge, which the next test refuses.
+    # For a length that is too small, the unsigned difference is huge, which the next test refuses.
     length = number_at(head, 1, '<u8') - np.uint64(_MESSAGE_FIELDS_BYTES)
     if int(np.max(length)) > len(data) or (number_at(head, 0, 'u1') != MESSAGE).any():
         return None
@@ -264,7 +260,7 @@ def inflate_ros1_chunk(packed: bytes) -> bytes:
 
 
 def _pieces(compression: str, source: Any, limit: int, step: int) -> Iterator[bytes]:
-    """Decompress bytes or a zstd file in pieces of `step` bytes; DamagedError above `limit`."""
+    """Decompress a source in pieces of `step` bytes; DamagedError above `limit` bytes in all."""
     n_left = limit
     for piece in iter(partial(_reader(compression, source), step), b''):
         n_left -= len(piece)

@@ -22,7 +22,8 @@ from ..typing import Floats, Ints
 from .blocks import NO_STAMP_NS
 from .serialized import Messages, gather, number_at
 
-_STEP = re.compile(r'([A-Za-z]\w*)(?:\[([0-9]{1,6})\])?')
+_STEP = re.compile(r'([A-Za-z]\w*)(?:\[([0-9]{1,6})\])?')  # name of a field, index of an element
+#: Numpy types of the basic types of numbers in messages.
 _KINDS = {
     'bool': 'u1', 'byte': 'u1', 'char': 'u1', 'octet': 'u1', 'int8': 'i1', 'uint8': 'u1',
     'int16': 'i2', 'uint16': 'u2', 'int32': 'i4', 'uint32': 'u4', 'int64': 'i8', 'uint64': 'u8',
@@ -30,7 +31,7 @@ _KINDS = {
 }  # fmt: skip
 _EXTREME = re.compile('(^|_)(min|max)(_|$)')
 _HEADER = 'std_msgs/msg/Header'
-_IDL = '=' * 80 + '\nIDL: '
+_IDL = '=' * 80 + '\nIDL: '  # text before the name of each type in a definition in IDL
 
 #: Constants and fields of message types; a field is its name and a description as in `rosbags`.
 Definitions = Mapping[str, tuple[Any, list[tuple[str, Any]]]]
@@ -139,12 +140,11 @@ class Field:
         return cursor.number(_KINDS[description[1][0]])
 
 
-# Kinds of a field's description in `rosbags`: basic type, message, array (4: sequence).
-_BASE, _NAME, _ARRAY = 1, 2, 3
+_BASE, _NAME, _ARRAY = 1, 2, 3  # kinds of fields in `rosbags`; `_NAME`: message, 4: sequence
 
 
 class _Cursor:
-    """The place up to which each of many messages has been read [bytes after encapsulation]."""
+    """The offset up to which each message of a batch has been read [bytes after encapsulation]."""
 
     def __init__(self, messages: Messages, definitions: Definitions) -> None:
         self._messages, self._definitions = messages, definitions

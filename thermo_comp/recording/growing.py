@@ -24,12 +24,12 @@ from .reader import open_recording
 from .topics import Topics
 from .writer import BagWriter
 
-_CHUNK_BYTES = 1 << 17  # chunk size [bytes]: a kill loses at most 17 s of counts at 100 Hz
+_CHUNK_BYTES = 1 << 17  # chunk size [bytes]; a killed process loses up to 17 s of counts at 100 Hz
 _PERIOD_S = 1.0  # shortest pause between two passes over the growing bag [s]
 _NEVER_NS = 2**63 - 1
 #: Hidden name of an unfinished bag: number of the bag, and id of the process that writes the bag.
 _LEFT = re.compile(r'\.(?P<number>\d+)\.(?P<process>\d+)-[0-9a-f]+\.partial\.mcap')
-_SHARE = 0.2  # largest duration of a pass over the bag / pause after the pass
+_SHARE = 0.2  # largest ratio of the duration of a pass over the bag to the pause after the pass
 
 #: A new block with its serialized messages, and a description of its bag (None: live topics).
 News = tuple[Block, RecordingInfo | None]
@@ -48,7 +48,7 @@ def growing_blocks(
         try:
             reader = open_recording(path, topics, require=())
         except RecordingError:
-            # A recorder creates a file before writing records: wait if the file is empty or grows.
+            # A recorder creates a file before it writes: wait while the file is empty or grows.
             files = path.iterdir() if path.is_dir() else [path]
             before, size = size, sum(file.stat().st_size for file in files)
             if n_seen or 0 < size == before:
@@ -108,7 +108,7 @@ def finish(path: Path, number: int) -> Path | None:
 
 
 class PositionBags:
-    """Writes a bag per position; a bag gets its number when its first message is written."""
+    """Writes one bag per position; a bag gets its number when its first message is written."""
 
     def __init__(self, folder: Path, serial: str | None, number: int | None = None) -> None:
         self._folder, self._serial = folder, serial

@@ -33,13 +33,12 @@ from .serialized import Messages, join_messages
 
 MAGIC = b'\x89MCAP0\r\n'
 _BEGIN = MAGIC + bytes([Opcode.HEADER])
-#: Name of the metadata record with the key-value pairs of this package's writer.
-METADATA_NAME = 'thermo_comp'
+METADATA_NAME = 'thermo_comp'  # name of the metadata record that this package writes
 
 _FOOTER_BYTES = PREFIX.size + 20 + len(MAGIC)
-_MAX_SUMMARY_BYTES = 1 << 28
-_MAX_SMALL_RECORD = 1 << 22
-_WINDOW_BYTES = 1 << 22
+_MAX_SUMMARY_BYTES = 1 << 28  # a larger summary is not read [bytes]
+_MAX_SMALL_RECORD = 1 << 22  # largest schema, channel or metadata record that is read [bytes]
+_MAX_LOOSE_BYTES = 1 << 22  # largest span of messages outside chunks [bytes]
 _MAX_HELD_BYTES = 1 << 26  # largest memory for messages of overlapping chunks [bytes]
 #: Texts for a file that ends inside a record, by the record's opcode; -1: any other opcode.
 _CUTS = {
@@ -133,10 +132,10 @@ class McapFile(BagFile):
             reader = StreamReader(BytesIO(content), skip_magic=True, emit_chunks=True)
             for record in reader.records:
                 records_of.setdefault(type(record), []).append(record)
-            (text,) = records_of[Statistics]
+            (statistics,) = records_of[Statistics]
         except Exception:  # noqa: BLE001 - damaged bytes may raise any type of exception
             return
-        counts, n_messages = text.channel_message_counts, text.message_count
+        counts, n_messages = statistics.channel_message_counts, statistics.message_count
         channels: dict[int, Channel] = {c.id: c for c in records_of.get(Channel, [])}
         chunks = sorted(records_of.get(ChunkIndex, []), key=lambda index: index.chunk_start_offset)
         spans = [
@@ -149,7 +148,7 @@ class McapFile(BagFile):
         if (
             sum(counts.values()) != n_messages
             or not counts.keys() <= channels.keys()
-            or not len(spans) == len({span.position for span in spans}) == text.chunk_count
+            or not len(spans) == len({span.position for span in spans}) == statistics.chunk_count
             or any(span.position + span.length + span.index_length > self._size for span in spans)
         ):
             return
@@ -159,7 +158,8 @@ class McapFile(BagFile):
         if self.spans:
             self._counts.update(counts)
             if n_messages:
-                self.start_ns, self.end_ns = text.message_start_time, text.message_end_time
+                self.start_ns = statistics.message_start_time
+                self.end_ns = statistics.message_end_time
         for index in records_of.get(MetadataIndex, []):
             is_small = PREFIX.size <= index.length <= _MAX_SMALL_RECORD
             if index.name == METADATA_NAME and is_small and index.offset < self._size:
@@ -184,7 +184,7 @@ class McapFile(BagFile):
     def _scan(self, at: int, end: int | None) -> None:
         """Read the file record by record; if `end` is None, up to the last complete message."""
         stop = self._size if end is None else end
-        words = 'it ends between two records, so further records may be missing'
+        ending = 'it ends between two records, so further records may be missing'
         spans = [Span(0, 0)]
         while at < stop:
             head = self._read_at(at, min(HEAD_BYTES, stop - at))
@@ -194,7 +194,7 @@ class McapFile(BagFile):
             if len(head) < PREFIX.size or at + step > stop or opcode == 0:
                 if end is not None:
                     raise DamagedError(f'the record at byte {at} is not complete')
-                words = _CUTS.get(opcode, _CUTS[-1]).format('{}', at=at)
+                ending = _CUTS.get(opcode, _CUTS[-1]).format('{}', at=at)
                 if opcode == 0 and at == last.position + last.length:
                     # Add zero bytes to the span, so that `scan_records` drops the last message.
                     kind = last.kind if last.kind == 'loose' else 'torn'
@@ -209,7 +209,7 @@ class McapFile(BagFile):
             elif opcode == Opcode.MESSAGE_INDEX and is_next:
                 spans[-1] = replace(last, index_length=last.index_length + step)
             elif opcode == Opcode.MESSAGE:
-                if is_next and last.kind == 'loose' and last.length + step < _WINDOW_BYTES:
+                if is_next and last.kind == 'loose' and last.length + step < _MAX_LOOSE_BYTES:
                     spans[-1] = replace(last, length=last.length + step)
                 else:
                     spans.append(Span(at, step, kind='loose'))
@@ -219,15 +219,15 @@ class McapFile(BagFile):
                 limit = f'limit {_MAX_SMALL_RECORD} bytes'
                 raise DamagedError(f'the record at byte {at} has {length} bytes, {limit}')
             elif opcode in {Opcode.DATA_END, Opcode.FOOTER}:
-                words = 'its summary is missing, but all messages are there'
+                ending = 'its summary is missing, but all messages are there'
                 break
             at += step
-        words = self._count(spans[1:], words, end is not None)
+        ending = self._count(spans[1:], ending, end is not None)
         if end is None:
-            self.truncated = f'the file is cut off at byte {self._size}: {words}'
+            self.truncated = f'the file is cut off at byte {self._size}: {ending}'
 
-    def _count(self, spans: Sequence[Span], words: str, is_whole: bool) -> str:
-        """Read all messages once to count them and to find their first and last log times."""
+    def _count(self, spans: Sequence[Span], ending: str, is_whole: bool) -> str:
+        """Count all messages and find their log times; return the completed text `ending`."""
         n_torn = 0
         for span in spans:
             try:
@@ -235,7 +235,7 @@ class McapFile(BagFile):
             except DamagedError:
                 if is_whole or span is not spans[-1] or span.kind != 'chunk':
                     raise
-                words += '; its last chunk is damaged and left out'
+                ending += '; its last chunk is damaged and left out'
                 break
             n_torn = len(messages) if span.kind == 'torn' else 0
             if len(messages):
@@ -244,11 +244,11 @@ class McapFile(BagFile):
                 self.spans.append(replace(span, start_ns=start, end_ns=end))
         self.start_ns = min((span.start_ns for span in self.spans), default=None)
         self.end_ns = max((span.end_ns for span in self.spans), default=None)
-        return words.format(n_torn)
+        return ending.format(n_torn)
 
 
 def _in_order(pieces: Iterable[tuple[int, Messages, int | None]]) -> Iterator[Messages]:
-    """Merge pieces by log time; a piece: place in file, messages, next piece's first log time."""
+    """Merge pieces (place in file, messages, first log time of the next piece) by log time."""
     # Messages before the first log time of the next piece are final; later messages are held.
     held: dict[int, Messages] = {}
     for row, piece, next_ns in pieces:

@@ -41,7 +41,7 @@ _COMPRESSORS: Mapping[Compression, Callable[[Any, int], Any]] = {
 }
 #: Transient-local topics (a late subscriber gets the last message), without their namespace.
 _LATCHED = tuple(topic.name for topic in OUTPUTS if topic.is_latched)
-_INFINITE = {'sec': 9223372036, 'nsec': 854775807}
+_INFINITE = {'sec': 9223372036, 'nsec': 854775807}  # an infinite duration of a QoS profile
 # Typed as any callable: the type hints differ between versions of the `mcap` library.
 _new_builder: Callable[[], Any] = RecordBuilder
 #: Head of a message record: opcode, length, channel, sequence, log time, publish time.
@@ -194,8 +194,8 @@ class McapOutput:
 
     def _put_chunk(self, messages: Messages) -> None:
         log_ns, channel, size = messages.log_ns, messages.channel, messages.size
-        laid = messages.packed(MESSAGE_HEAD_BYTES)
-        data, at = laid.data, laid.start - MESSAGE_HEAD_BYTES
+        spaced = messages.packed(MESSAGE_HEAD_BYTES)
+        data, at = spaced.data, spaced.start - MESSAGE_HEAD_BYTES
         heads: Any = np.zeros(len(at), _RECORD_HEAD)
         heads['f0'], heads['f1'] = MESSAGE, size + (MESSAGE_HEAD_BYTES - PREFIX.size)
         heads['f2'], heads['f4'], heads['f5'] = channel, log_ns, log_ns
@@ -266,6 +266,6 @@ def _offered_qos(topic: str) -> dict[str, Any]:
 
 def dump_yaml(content: Any) -> str:
     """Write YAML in block style with the keys in their order."""
-    # Write repeated values in full, without YAML aliases.
+    # The dumper writes repeated values in full, without YAML aliases.
     dumper: Any = type('Dumper', (yaml.SafeDumper,), {'ignore_aliases': lambda *_: True})
     return str(yaml.dump(content, None, dumper, sort_keys=False, allow_unicode=True, width=10_000))

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the noise of samples at rest: finds glitches (single samples with wrong bits, as after a
-transfer error), and limits of a cell's variance and roughness for low-pass filtered noise.
+Owns the noise of samples at rest: glitches (single samples with wrong bits, as after a transfer
+error), and limits of a cell's variance and roughness for low-pass filtered noise.
 
 A cell is a run of samples of 0.5 s or longer; its roughness is half the mean square change from
 sample to sample, which equals the variance for white noise.
@@ -19,19 +19,15 @@ from ..typing import Bools, Floats
 if TYPE_CHECKING:
     from .stillness import Cells
 
-# Smallest distance of a glitch from the mean of its neighbours, in sd of the noise.
-_SDS = 25.0
-# Smallest distance of a glitch from the mean of its neighbours, divided by the samples' norm. One
-# count more or less, as by the remainder that a converter carries over, is no glitch.
+_SDS = 25.0  # smallest distance of a glitch from the mean of its neighbours, in sd of the noise
+# Smallest distance of a glitch from the mean of its neighbours, divided by the samples' norm. A
+# change by one count, as by the remainder that a converter carries over, is no glitch.
 _LEAST = 0.02
-# Smallest number of samples in which glitches are searched; fewer do not determine the noise.
-_FEWEST = 30
-# Standard normal quantiles of the probabilities 0.1 and 1 - 1e-11.
-_TENTH, _NEVER = -1.2816, 6.7
-# Noise is coloured if a cell's degrees of freedom are below this fraction of those of white noise;
-# smallest number of degrees of freedom of a cell; number of iterations in `spread_of_variances`
-# and of trial values in `roughest_at_rest`.
-_COLOURED, _FEWEST_FREE, _ITERATIONS = 0.5, 2.0, 30
+_FEWEST = 30  # smallest number of samples that determines the noise, to search for glitches
+_TENTH, _NEVER = -1.2816, 6.7  # standard normal quantiles of the probabilities 0.1 and 1 - 1e-11
+_COLOURED = 0.5  # coloured noise has fewer degrees of freedom than this fraction of white noise's
+_FEWEST_FREE = 2.0  # smallest number of degrees of freedom of a cell
+_ITERATIONS = 30  # number of iterations in `spread_of_variances`, of trials in `roughest_at_rest`
 
 
 def is_glitch(samples: Floats, quantum: Floats) -> Bools:
@@ -88,8 +84,8 @@ def roughest_at_rest(cells: Cells, quiet: Bools, is_coloured: Bools, ratio: floa
     """
     Return the largest roughness of a cell at rest, per axis; infinite for white noise. `ratio`:
     largest variance at rest / noise variance. In coloured noise a step does not show in mean and
-    variance, but in the changes from sample to sample. The roughness is taken as chi-square
-    distributed, with degrees of freedom by the ratio of its tenth percentile to its median.
+    variance, but in the changes from sample to sample. The roughness is assumed chi-square
+    distributed; the ratio of its tenth percentile to its median gives the degrees of freedom.
     """
     result = np.full(3, np.inf)
     for axis in np.flatnonzero(is_coloured) if quiet.any() else ():

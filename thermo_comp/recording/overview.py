@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the survey of a recording before a fit: duration, rates, temperatures, rests, gaps, and the
-messages for recordings that are not of an accelerometer at rest.
+Owns the survey of a recording before a fit: duration, rates, temperatures, rests and gaps, and
+messages on samples that an accelerometer at rest does not send.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -23,16 +23,14 @@ from .reader import RecordingReader, open_recording
 from .stillness import STILL_SD, CellAccumulator, Cells, still_intervals, why_restless
 from .topics import PLAIN, Topics, shown
 
-#: Range of readings that are probably in kelvins: no board survives such temperatures in degC.
-KELVINS = (180.0, 480.0)
+KELVINS = (180.0, 480.0)  # readings probably in kelvins: no board survives as many degC
 _RAMP_WINDOW_S = 120.0  # time over which the rate of a ramp is averaged [s]
 _CELL_S, _MIN_REST_S = 0.5, 3.0  # lengths of a cell and of the shortest still interval [s]
 _GAP_INTERVALS = 5.0  # shortest gap between samples / median interval in the first block
-# Largest share of samples of exactly 0 that is taken for glitches, and share of messages marked as
-# without acceleration above which the whole recording counts as without acceleration.
-_GLITCH_SHARE, _FAULT_SHARE = 0.01, 0.5
-# Ratio |a| / gravity at rest: range if a contains gravity, upper limit if gravity is subtracted.
-_WITH_GRAVITY, _WITHOUT_GRAVITY = (0.8, 1.25), 0.3
+_GLITCH_SHARE = 0.01  # largest share of samples of exactly 0 that is taken for glitches
+_FAULT_SHARE = 0.5  # largest share of messages marked as without acceleration
+_WITH_GRAVITY = (0.8, 1.25)  # range of |a| / gravity at rest if a contains gravity
+_WITHOUT_GRAVITY = 0.3  # largest |a| / gravity at rest if gravity is subtracted
 _NO_SAMPLES = (
     'no accelerometer samples: record accel/counts or imu/uncompensated, or name another topic '
     'with --topic counts=TOPIC or --topic imu=TOPIC'
@@ -54,16 +52,16 @@ class ThermometerSurvey:
 
 @dataclass(frozen=True)
 class Survey:
-    """Summary of a recording: still intervals of 3 s or more, findings on obstacles to a fit."""
+    """Summary of a recording with `n` samples."""
 
     info: RecordingInfo
     n: int
     duration_s: float
     rate_hz: float  # inverse of the median interval between samples of the first block
-    n_still: int
-    still_s: float
+    n_still: int  # number of still intervals of 3 s or more
+    still_s: float  # sum of the lengths of these intervals
     thermometers: Mapping[str, ThermometerSurvey]
-    findings: list[str]
+    findings: list[str]  # problems of the recording, and what a fit lacks
 
 
 def thermal_findings(
@@ -129,8 +127,7 @@ def survey_recording(
         topic = reader.topics.get('accel')
         total = reader.info.topics[topic][1] if topic else 0
         accumulator, causes = CellAccumulator(_CELL_S, None), CauseCounter()
-        # All temperature readings fit into memory: a test has far fewer readings than samples.
-        readings: dict[str, list[Readings]] = {}
+        readings: dict[str, list[Readings]] = {}  # all in memory: far fewer than the samples
         clock = _Clock()
         for block in reader.blocks():
             for name, temperature in block.temperatures.items():
@@ -166,14 +163,14 @@ def survey_recording(
 
 @dataclass
 class _Clock:
-    """Statistics of the stamps so far: first block's median interval, gaps, stamps not rising."""
+    """Statistics of the samples' stamps: their median interval, gaps and backward steps."""
 
     n: int = 0
     earliest_ns: int = 0
     latest_ns: int = 0
     last_ns: int = 0
     newest_ns: int = 0  # newest stamp since the last restart of the clock
-    step_ns: float = 0.0
+    step_ns: float = 0.0  # median interval of the first stamps that rise
     n_backwards: int = 0  # number of stamps not later than the newest stamp before
     n_restarts: int = 0  # number of steps back by more than `LONGEST_PAUSE_NS`
     n_gaps: int = 0

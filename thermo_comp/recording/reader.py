@@ -40,22 +40,20 @@ from .fields import Field, definitions_of
 from .mcap_file import McapFile
 from .serialized import Messages
 from .topics import WHOLE, Selected, Topics, select_topics, shown
-from .wire import Feed, decode_blocks
+from .wire import decode_blocks
 
-_MAX_BYTES = 1 << 24
-_COMPRESSIONS = {'none': '', 'file': 'file', 'message': 'message'}
+_MAX_BYTES = 1 << 24  # largest size of metadata.yaml [bytes], and largest number of its nodes
+_COMPRESSIONS = {'none': '', 'file': 'file', 'message': 'message'}  # by `compression_mode`
 #: Largest batch that is decoded at a time from a `ForeignFile`: messages, bytes, time [ns].
-_BATCH_MESSAGES = 1 << 14
-_BATCH_BYTES, _BATCH_NS = 1 << 23, 10 * 10**9
+_BATCH_MESSAGES, _BATCH_BYTES, _BATCH_NS = 1 << 14, 1 << 23, 10 * 10**9
 
 
 class RecordingReader(ExitStack):
     """
     An open bag: a rosbag2 directory, a bare ``.mcap`` or ``.db3`` file, or a ROS 1 ``.bag``.
     A role is ``accel`` or the name of a thermometer; the roles in `require` must be in the bag.
-    `info` describes the bag; after all blocks are read, `info.truncated` names the missing
-    messages. `topics`: topic of each role; `fields`: field with the reading of a thermometer, by
-    role; `definitions`: encoding and text of each message type's definition.
+    After all blocks are read, `info.truncated` names the missing messages. The keys of `topics`
+    and `fields` are roles; the keys of `definitions` (encoding and text) are message types.
     Raises RecordingError if the file is not a bag, is damaged, or a topic is missing or ambiguous.
     """
 
@@ -73,8 +71,8 @@ class RecordingReader(ExitStack):
                 selected = select_topics(self.info.topics, topics, require, self.info.metadata)
                 self.topics: Mapping[Role, str] = selected.topics
                 self.fields = dict(self._fields(selected))
-            bare = [role for role, field in self.fields.items() if not field.header]
-            note = f'no stamps in {", ".join(bare)}: a reading gets the stamp of the sample before'
+            bare = ', '.join(role for role, field in self.fields.items() if not field.header)
+            note = f'readings of {bare} have no stamp: each gets that of the sample before it'
             chosen = _notes(selected.chosen, note if bare else '')
             self.info = replace(self.info, input=selected.input, chosen=chosen)
         except BaseException as error:
@@ -83,8 +81,7 @@ class RecordingReader(ExitStack):
                 raise RecordingError(f'cannot be opened: {error.strerror}', path) from error
             raise
         self._part = topics.part
-        #: Time from the first sample of the bag to that of the selected part [s]; 0 until read.
-        self.since_s = 0.0
+        self.since_s = 0.0  # time from the first sample of the bag to that of the part read [s]
         self.apart = ''  # warning about stamps that are all equal, or of a second clock
 
     def _fields(self, selected: Selected) -> Iterator[tuple[Role, Field]]:
@@ -137,14 +134,12 @@ class RecordingReader(ExitStack):
     def _blocks(self, raw: bool = False) -> Iterator[Block]:
         def decoded() -> Iterator[Block]:
             for path, topics, messages in self._read(set(self.topics.values()), {'cdr', 'ros1'}):
-                feeds = [
-                    Feed(number, role, topic, self.fields.get(role))
+                channels = {
+                    role: {number: topic for number, topic in topics.items() if topic.name == name}
                     for role, name in self.topics.items()
-                    for number, topic in topics.items()
-                    if topic.name == name
-                ]
+                }
                 with translated(path):
-                    blocks = decode_blocks(messages, feeds, self.topics, keep_raw=raw)
+                    blocks = decode_blocks(messages, channels, self.fields, keep_raw=raw)
                 yield from blocks
 
         n_read = dict.fromkeys(self.topics, 0)
@@ -228,7 +223,7 @@ def read_recording(
 ) -> Recording:
     """Read a whole bag into memory; raises as `open_recording` does, also for damaged data."""
     with open_recording(path, topics, require=require) as reader:
-        blocks = list(reader.blocks()) or decode_blocks(Messages.of([], [], []), (), ROLES)
+        blocks = list(reader.blocks()) or decode_blocks(Messages.of([], [], []), {}, {})
         return Recording(reader.info, joined(blocks))
 
 
@@ -240,7 +235,7 @@ def inspect_recording(path: str | Path) -> RecordingInfo:
 
 @dataclass(frozen=True, slots=True)
 class _Description:
-    """Files of a bag, their compression, number of messages by topic, a note on missing parts."""
+    """Files of a bag, compression, `counts` of messages by topic, `note` on missing parts."""
 
     storage: str
     files: tuple[Path, ...]

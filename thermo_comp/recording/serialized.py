@@ -78,10 +78,10 @@ class Messages:
 
     def places_of(self, numbers: Collection[int]) -> Ints:
         """Return the indices of the messages of some channels."""
-        is_own = np.zeros(len(self), np.bool_)
+        is_chosen = np.zeros(len(self), np.bool_)
         for number in numbers:  # several times as fast as `np.isin`
-            is_own |= self.channel == number
-        return np.flatnonzero(is_own)
+            is_chosen |= self.channel == number
+        return np.flatnonzero(is_chosen)
 
     def of_channels(self, numbers: Collection[int]) -> Messages:
         """Select the messages of some channels."""
@@ -95,7 +95,7 @@ class Messages:
         return self.take(np.argsort(self.log_ns, kind='stable'))
 
     def packed(self, room: int = 0) -> Messages:
-        """Copy the messages, so that `data` can be freed; put `room` free bytes before each."""
+        """Copy the messages, so that `data` can be freed; leave `room` bytes before each."""
         ends = np.cumsum(self.size + room)
         data = np.empty(int(ends[-1]) if len(ends) else 0, np.uint8)
         for each in np.unique(self.size[self.size > 0]).tolist():

@@ -5,10 +5,11 @@ Owns still intervals: sums samples in short cells (count, mean, variance) and fi
 
 Two tests are relative to the noise of the bag's quiet cells: the variance inside a cell
 (vibration, handling) and the step of the mean between adjacent cells (a turn, a knock). A step
-starts a new interval, because a tilt by a microradian changes a sample by a micro-g. Temperature
-tilts a unit at rest, too: a steady change of the mean by at most 50 micro-g/s in several cells is
-a drift, no step. Two tests have absolute limits, because even a flight has quiet cells: at rest
-the sd of samples is below `still_sd`, and the angular rate within 1 deg/s of its median.
+starts a new interval, because a tilt by a microradian changes a sample by a micro-g. A change of
+temperature tilts a unit at rest, too: if the mean changes steadily by at most 50 micro-g/s over
+several cells, this is a drift and not a step. Two tests have absolute limits, because even a
+flight has quiet cells: at rest the sd of samples is at most `still_sd`, and the angular rate is
+within 1 deg/s of its median.
 """
 
 from collections.abc import Sequence
@@ -25,61 +26,46 @@ from .noise import is_glitch, roughest_at_rest, spread_of_variances
 VARIANCE_RATIO = 4.0
 #: Largest sd of samples at rest [g]: above the noise of any sensor, below that of most flights.
 STILL_SD = 0.05
-# Limits of the angular rate in a cell at rest [rad/s]: sd, and difference of the mean rate from
-# the rate's bias, which is interpolated between medians over `_LEVEL_S` [s].
-_STILL_RATE_SD, _STILL_RATE = np.radians(2.0), np.radians(1.0)
-_LEVEL_S = 120.0
-# `without_rotation` subtracts from the angular rate its median over this time [s].
-_ROTATION_S = 10.0
-# Smallest step between adjacent cells that ends a rest, in robust sd of all steps.
-_STEP_SDS = 8.0
-# Number of steps between cells whose median is the drift; largest drift [g/s].
-_DRIFT_STEPS, _DRIFT = 9, 5e-5
-# Number of samples searched for a quantum; smallest number of changes from sample to sample that
-# show a quantum if all changes are whole multiples of the smallest change.
-_QUANTUM_SAMPLES, _STEPS_NEEDED = 20000, 10
+_STILL_RATE_SD = np.radians(2.0)  # largest sd of the angular rate in a cell at rest [rad/s]
+_STILL_RATE = np.radians(1.0)  # largest distance of a cell's mean rate from the bias [rad/s]
+_LEVEL_S = 120.0  # the bias of the angular rate is interpolated between medians over this time [s]
+_ROTATION_S = 10.0  # `without_rotation` subtracts the median angular rate over this time [s]
+_STEP_SDS = 8.0  # smallest step between adjacent cells that ends a rest, in robust sd of steps
+_DRIFT_STEPS, _DRIFT = 9, 5e-5  # number of steps whose median is the drift; its limit [g/s]
+_QUANTUM_SAMPLES = 20000  # number of samples that are searched for a quantum
+_STEPS_NEEDED = 10  # smallest number of changes that show a quantum by being its whole multiples
 STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # whole cells fill one of these numbers of windows
-_LONGEST_CELL_NS = 86400e9  # limit of a cell's length, for wrong stamps [ns]
+_LONGEST_CELL_NS = 86400e9  # largest length of a cell, reached only with wrong stamps [ns]
 MIN_SAMPLES = 30  # usual smallest number of samples in a cell
 _LARGEST = 1e100  # largest valid sample: squares of larger samples may overflow
 _WORD = 32768.0  # middle of the range of unsigned 16-bit numbers
-_LONGER = (23, 31)  # magnitude bits of 24- and 32-bit words
+_LONGER = (23, 31)  # numbers of bits of 24- and 32-bit words, without the sign
 _STUCK = 0.3  # ratio of the noise's sd to the quantum below which most samples are equal
 
 
 @dataclass(frozen=True)
 class Cells:
-    """
-    Statistics of the n cells of a bag, shape (n,) or (n, 3); a cell is a short run of samples.
-    `start_ns` and `end_ns` are the stamps of the first and last sample of the bag; `time` is the
-    mean time of a cell's samples since `start_ns` [s]; `index` the cell's number on the time grid.
-    Samples that are not finite or whose stamp does not rise are dropped, as are glitches, see
-    `is_glitch`. `n_repeated` counts samples with the same stamp as the sample before. `quantum` is
-    the step between the possible values of the samples, or 0 if unknown; `middle` is 32768 for
-    unsigned 16-bit words, else 0; rates are in rad/s. `roughness` is half the mean square change
-    from sample to sample, which equals the variance for white noise; `seam` is a cell's first
-    sample less the last sample of the cell before, 0 after a gap.
-    """
+    """Statistics of the n cells (short runs of samples) of a bag, of shape (n,) or (n, 3)."""
 
-    start_ns: int
-    end_ns: int
+    start_ns: int  # stamp of the first sample of the bag
+    end_ns: int  # stamp of the last sample of the bag
     cell_s: float
-    n_dropped: int
+    n_dropped: int  # number of samples dropped: not finite, or with a stamp that does not rise
     n_saturated: int
-    n_glitches: int
-    n_repeated: int
-    is_integer: bool
-    quantum: Floats
-    middle: float
-    time: Floats
-    count: Ints
-    index: Ints
+    n_glitches: int  # number of samples dropped as glitches, see `is_glitch`
+    n_repeated: int  # number of samples with the same stamp as the sample before
+    is_integer: bool  # whether all samples are whole numbers
+    quantum: Floats  # step between the possible values of an axis; 0: unknown; shape (3,)
+    middle: float  # 32768 for unsigned 16-bit words, else 0
+    time: Floats  # mean time of a cell's samples since `start_ns` [s]
+    count: Ints  # number of samples in a cell
+    index: Ints  # number of a cell on the time grid
     mean: Floats
     variance: Floats
-    roughness: Floats
-    seam: Floats
-    rate: Floats
-    rate_variance: Floats
+    roughness: Floats  # half the mean square change from sample to sample
+    seam: Floats  # first sample of a cell less the last sample of the cell before; 0 after a gap
+    rate: Floats  # mean angular rate [rad/s]
+    rate_variance: Floats  # [rad^2/s^2]
 
     def part(self, which: slice) -> 'Cells':
         """Select consecutive cells."""
@@ -91,6 +77,7 @@ class CellAccumulator:
     """
     Reduces streamed samples to cells of `cell_s`, or of `least` samples if these last longer.
     Whole cells fill a window of `window_s` or, if a cell is longer than a window, 2 to 60 windows.
+    Samples of `full_scale` or more are saturated and dropped.
     """
 
     def __init__(
@@ -106,8 +93,9 @@ class CellAccumulator:
         self._last_ns: int | None = None
         self._last = np.zeros((0, 3))  # last sample of the previous block
         self._shift = np.zeros(3)
-        # Row of a cell: its number, number of samples, sums of times, samples and their squares;
-        # change from the cell before; sum of squared changes. The last cell may grow.
+        # Columns of a cell's row: its number; number of samples; sums of the times, of samples
+        # (and rates) and of their squares; change of the samples from the cell before; sums of
+        # squared changes from sample to sample. The last row changes while samples are added.
         self._sums: list[Floats] = [np.empty((0, 15))]
         self._n_dropped = self._n_saturated = self._n_glitches = self._n_repeated = 0
         self._n_looked_at = 0
@@ -147,13 +135,10 @@ class CellAccumulator:
             self._quantum = np.where(self._quantum > 0.0, self._quantum, quantum)
             self._n_looked_at += int((part[1:] != part[:-1]).any(axis=1).sum()) + 1
         self._is_integer = self._is_integer and bool((samples == np.rint(samples)).all())
-        rate = None if rate is None else rate[use]
         glitches = is_glitch(samples, self._quantum)
-        if glitches.any():
-            self._n_glitches += int(glitches.sum())
-            stamp_ns, samples = stamp_ns[~glitches], samples[~glitches]
-            rate = None if rate is None else rate[~glitches]
-        self._accumulate(stamp_ns, samples, rate)
+        self._n_glitches += int(glitches.sum())
+        rate = None if rate is None else rate[use][~glitches]
+        self._accumulate(stamp_ns[~glitches], samples[~glitches], rate)
 
     def forget(self, stamp_ns: int) -> None:
         """Drop the cells before a stamp [ns]."""
@@ -250,7 +235,7 @@ def widened(full_scale: float, samples: Floats) -> float:
 
 
 def _part_of(window_s: float, least_ns: float) -> float:
-    """Raise a cell length [ns] so that whole cells fill 1 to 60 windows, unless it is longer."""
+    """Raise a cell length [ns] to one that divides 1 to 60 windows; a longer cell is kept."""
     for stretch in STRETCHES:
         n_cells = int(stretch * window_s * 1e9 / least_ns * (1.0 + 1e-6))
         if n_cells:
@@ -259,10 +244,7 @@ def _part_of(window_s: float, least_ns: float) -> float:
 
 
 def _quantum_of(samples: Floats, few: list[Floats]) -> Floats:
-    """
-    Return the quantum of each axis from the changes between samples; 0 without a quantum.
-    `few`: the changes of earlier samples of each axis, as long as these are fewer than three.
-    """
+    """Return each axis's quantum, 0 if unknown; `few`: up to two earlier changes of each axis."""
     result = np.zeros(3)
     for axis in range(3):
         changes = np.abs(np.diff(samples[:, axis]))
@@ -303,7 +285,7 @@ def still_runs(
     Return the runs of still cells of any length for each value of `ratios`, the largest ratio of a
     still cell's variance to the noise variance; `still_sd` is the largest sd at rest [g].
     """
-    full = _is_full(cells)
+    full = is_full(cells)
     plausible = full & is_under(cells, still_sd) & ~_is_turning(cells)
     if not plausible.any():
         return [[] for _ in ratios]
@@ -311,9 +293,9 @@ def still_runs(
     level = np.quantile(cells.variance[plausible], 0.1, axis=0)
     colour = spread_of_variances(cells, plausible, level)
     # A sensor that repeats one number does not show its noise; samples that toggle between two
-    # adjacent numbers have a variance of a quarter quantum squared. For white noise and cells of
-    # 60 samples, 1.3 times the tenth percentile of the variances equals the mean variance; for
-    # cells of 32 samples, 0.9 times the mean variance.
+    # adjacent numbers have a variance of a quarter quantum squared. For white noise, 1.3 times
+    # the tenth percentile of the variances equals the mean variance if cells have 60 samples, and
+    # 0.9 times the mean variance if cells have 32 samples.
     noise = np.maximum(1.3 * level * colour, 0.25 * cells.quantum**2)
     # A drift of d within a cell has a variance of d^2 / 12; twice this variance allows for noise.
     within = np.concatenate((drift[:1], (drift[1:] + drift[:-1]) / 2.0, drift[-1:]))
@@ -350,7 +332,7 @@ def without_rotation(cells: Cells) -> Cells:
 
 def why_restless(cells: Cells, still_sd: float = STILL_SD) -> str:
     """Describe why a bag has no rests."""
-    full, under = _is_full(cells), is_under(cells, still_sd)
+    full, under = is_full(cells), is_under(cells, still_sd)
     if full.any() and not (full & under).any():
         quietest = np.sqrt(np.min(cells.variance[full].max(axis=1))) / _one_g(cells)
         return (
@@ -367,9 +349,10 @@ def why_restless(cells: Cells, still_sd: float = STILL_SD) -> str:
     return text + 'but must rest in each position'
 
 
-def _is_full(cells: Cells) -> Bools:
+def is_full(cells: Cells, least: float = 2.0) -> Bools:
+    """Whether a cell has `least` samples or more, and at least half of the median number."""
     usual = float(np.median(cells.count)) if len(cells.count) else 0.0
-    return np.asarray(cells.count >= max(2.0, 0.5 * usual))
+    return np.asarray(cells.count >= max(least, 0.5 * usual))
 
 
 def _one_g(cells: Cells) -> float:

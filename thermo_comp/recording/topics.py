@@ -36,8 +36,7 @@ _MAX_SHOWN = 80  # largest length of a name in a message [characters]
 
 _FIRST_STAMP_S = 1e8  # a limit of a `BagPart` of at least this time [s] is a stamp (after 1973)
 
-#: Message type and number of messages of each topic of a bag.
-Present = Mapping[str, tuple[str, int]]
+Present = Mapping[str, tuple[str, int]]  # type and number of messages of each topic of a bag
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +134,7 @@ _USUAL = Topics()
 
 
 class Selected(NamedTuple):
-    """Topics and fields by role (``accel``, thermometers), counts or imu, note on topics."""
+    """Topics and fields by role; input of the samples; `chosen`: notes on topics, or None."""
 
     topics: dict[Role, str]
     fields: dict[Role, str]
@@ -179,7 +178,8 @@ def choice_note(name: str, key: str, wanted: str, among: str) -> str:
     """Return the note that a topic was chosen by its type; '' if its name is the wanted one."""
     if is_called(name, split_field(wanted)[0]):
         return ''
-    return f'{shown(name)}, its {among} {_TYPES[key].rpartition("/")[2]}, is taken for {key}'
+    kind = _TYPES[key].rpartition('/')[2]
+    return f'{shown(name)}, the {among} {kind} of the bag, is taken for {key}'
 
 
 def select_topics(
@@ -193,6 +193,7 @@ def select_topics(
         raise RecordingError('the bag holds no messages')
     name_of: dict[Role, str] = {}
     keys: dict[Role, str] = {}
+    chosen: list[str] = []
     corrected = _corrected(present, metadata)
     inputs = ['counts', 'imu'] if topics.input == 'auto' else [topics.input]
     for role, wanted in {'accel': inputs, 'board': ['board'], 'case': ['case']}.items():
@@ -202,15 +203,12 @@ def select_topics(
             name = _of_type(present, names[key], _TYPES[key], getattr(topics, key))
             if present[name][1]:
                 name_of[role], keys[role] = name, key
+                among = "driver's" if is_called(name, _RAW) else 'only'  # by REP 145, or by type
+                chosen.append(choice_note(name, key, getattr(topics, key), among))
             elif role in require:
                 raise RecordingError('the topic has no messages', key=shown(name))
         elif role in require:
             raise _missing(present, {key: getattr(topics, key) for key in wanted}, corrected)
-    chosen = []
-    for role, key in keys.items():
-        name = name_of[role]
-        among = "driver's" if is_called(name, _RAW) else 'only'  # named as in REP 145, or by type
-        chosen.append(choice_note(name, key, getattr(topics, key), among))
     if corrected and 'accel' not in name_of:
         chosen.append(_text_of_corrected(corrected))
     name_of |= _further(present, topics, name_of, is_read=bool(require))
@@ -288,22 +286,22 @@ def _further(
     present: Present, topics: Topics, topics_of: Mapping[Role, str], *, is_read: bool
 ) -> dict[str, str]:
     """Find `topics.further`, and further thermometers in the namespace of board or case."""
-    both = {}
+    further = {}
     for sensor, wanted in topics.further.items():
         name = _match(present, wanted, thermometer(sensor))
         if name is not None:
-            both[sensor] = _of_type(present, name, TEMPERATURE, wanted)
+            further[sensor] = _of_type(present, name, TEMPERATURE, wanted)
         elif is_read:
             raise _missing(present, {thermometer(sensor): wanted})
     beside = topics_of.get('board') or topics_of.get('case') or ''
     namespace, is_usual, _ = beside.rpartition('temperature/')
     front = f'{namespace}temperature/' if is_usual else '/temperature/'
-    taken = {*topics_of.values(), *both.values()}
+    taken = {*topics_of.values(), *further.values()}
     for name in of_kind(present, TEMPERATURE):
         sensor = name.removeprefix(front)
         if sensor != name and name not in taken and is_thermometer(sensor):
-            both.setdefault(sensor, name)
-    return dict(sorted(both.items()))
+            further.setdefault(sensor, name)
+    return dict(sorted(further.items()))
 
 
 def _of_type(present: Present, name: str, expected: str, wanted: str) -> str:
@@ -325,15 +323,15 @@ def is_called(name: str, wanted: str) -> bool:
 def _match(present: Present, wanted: str, key: str) -> str | None:
     """Return the topic with a name, or else the only topic with this name in a namespace."""
     bare = split_field(wanted)[0].strip('/')
-    spaced = [name for name in present if name.strip('/') == bare][:1]
-    spaced = spaced or sorted(name for name in present if name.endswith('/' + bare))
-    if len(spaced) > 1:
+    names = [name for name in present if name.strip('/') == bare][:1]
+    names = names or sorted(name for name in present if name.endswith('/' + bare))
+    if len(names) > 1:
         raise RecordingError(
-            f'several topics end in this name: {", ".join(map(shown, spaced[:_MAX_LISTED]))}; '
+            f'several topics end in this name: {", ".join(map(shown, names[:_MAX_LISTED]))}; '
             f'choose one with --topic {key}=TOPIC',
             key=wanted,
         )
-    return spaced[0] if spaced else None
+    return names[0] if names else None
 
 
 def _missing(present: Present, wanted: Mapping[str, str], corrected: str = '') -> RecordingError:

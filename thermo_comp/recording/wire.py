@@ -14,10 +14,10 @@ The size of messages of one type depends on `frame_id` alone; messages of one la
 of bytes, with stamps and numbers as views. `rosbags` converts ROS 1 messages one by one.
 """
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from struct import pack
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,62 +31,58 @@ from .serialized import Messages, gather, number_at
 from .topics import shown
 
 #: Indices of the fields of `ImuColumns` among the 37 numbers of sensor_msgs/Imu.
-_IMU_COLUMNS = (slice(0, 4), slice(4, 13), slice(13, 16), slice(16, 25), slice(28, 37))
-_IMU_ACCELERATION = slice(25, 28)
+IMU_COLUMNS = (slice(0, 4), slice(4, 13), slice(13, 16), slice(16, 25), slice(28, 37))
+IMU_ACCELERATION = slice(25, 28)
 
-HEAD_BYTES = 16
-_MAX_PADDING = 7
-_NS = 1_000_000_000
-
-
-class Feed(NamedTuple):
-    """A channel of a bag, its role (``accel`` or a thermometer), its topic, the field to read."""
-
-    channel: int
-    role: Role
-    topic: Topic
-    field: Field | None = None
+HEAD_BYTES = 16  # number of bytes before the characters of frame_id
+_MAX_PADDING = 7  # largest number of bytes after the numbers
+_NS = 1_000_000_000  # nanoseconds per second
 
 
 def decode_blocks(
-    messages: Messages, feeds: Collection[Feed], roles: Iterable[Role], *, keep_raw: bool = False
+    messages: Messages,
+    channels: Mapping[Role, Mapping[int, Topic]],
+    fields: Mapping[Role, Field],
+    *,
+    keep_raw: bool = False,
 ) -> list[Block]:
     """
-    Decode messages in their order; a block ends where `frame_id` changes. `roles` lists the inputs
-    found in the whole bag. A temperature in a field of another message type is in `raw` as a
-    Temperature message. RecordingError, without a path, if the bytes do not fit the message type.
+    Decode messages in their order; a block ends where `frame_id` changes. `channels`: numbers and
+    topics of the channels of each input of the bag; `fields`: the field to read of a thermometer.
+    A temperature in a field of another message type is in `raw` as a Temperature message.
+    RecordingError, without a path, if the bytes do not fit the message type.
     """
-    roles = tuple(dict.fromkeys((*ROLES, *roles)))
-    topics = {feed.role: feed.topic for feed in feeds}
-    fields = {feed.role: feed.field for feed in feeds if feed.field is not None}
-    is_imu = 'accel' in topics and topics['accel'].type == IMU
+    is_imu = any(topic.type == IMU for topic in channels.get('accel', {}).values())
     temperatures, log_ns, raw = {}, {}, {}
-    for role in roles:
+    for role in dict.fromkeys((*ROLES, *channels)):
         kind = TEMPERATURE if role != 'accel' else IMU if is_imu else VECTOR3_STAMPED
-        channels = {feed.channel: feed.topic for feed in feeds if feed.role == role}
-        rank = messages.places_of(channels)
+        topics = channels.get(role, {})
+        rank = messages.places_of(topics)
         taken = messages.take(rank)
+        topic = next(iter(topics.values()), Topic('', kind, 'cdr'))
         try:
-            if len({topic[:3] for topic in channels.values()}) > 1:
+            if len({other[:3] for other in topics.values()}) > 1:
                 raise RecordingError('its messages have several encodings')
-            if role in topics and topics[role].encoding == 'ros1':
-                taken = as_cdr(taken, topics[role].type)
-            if role in fields:
+            if topic.encoding == 'ros1':
+                taken = as_cdr(taken, topic.type)
+            if topics and role in fields:
                 read_ns, values = fields[role].read(taken)
-                rows = encode_stamped(read_ns, '', N_NUMBERS[kind], [(0, values[:, None])])
+                pieces = [(slice(0, 1), values[:, None])]
+                rows = encode_stamped(read_ns, '', N_NUMBERS[kind], pieces)
                 taken = Messages.of_rows(rows, taken.channel, taken.log_ns)
             stamp_ns, numbers, frame = decode_stamped(taken, kind)
         except RecordingError as error:
-            raise RecordingError(error.message, key=shown(topics[role].name)) from error
+            raise RecordingError(error.message, key=shown(topic.name)) from error
         if role == 'accel':
-            # Comparing bytes is a fast test of whether frame_id is constant.
-            text = frame.tobytes()
+            text = frame.tobytes()  # comparing bytes is a fast test of a constant frame_id
             is_equal = text == text[: frame.itemsize] * len(frame)
             changes = [] if is_equal else rank[1:][frame[1:] != frame[:-1]].tolist()
             if changes:
                 runs = (slice(*run) for run in pairwise([0, *changes, len(messages)]))
-                pieces = (messages.take(run) for run in runs)
-                return [decode_blocks(part, feeds, roles, keep_raw=keep_raw)[0] for part in pieces]
+                return [
+                    decode_blocks(messages.take(run), channels, fields, keep_raw=keep_raw)[0]
+                    for run in runs
+                ]
             accel, samples_ns, samples, frames = rank, stamp_ns, numbers, frame
         else:
             after = np.searchsorted(accel, rank).astype(np.int64)
@@ -94,11 +90,11 @@ def decode_blocks(
         log_ns[role] = taken.log_ns
         if keep_raw and len(taken):
             raw[role] = taken.packed()
-    imu = ImuColumns(*(samples[:, c] for c in _IMU_COLUMNS)) if is_imu else None
+    imu = ImuColumns(*(samples[:, c] for c in IMU_COLUMNS)) if is_imu else None
     if imu is not None:
         # A covariance with the first element -1 marks an acceleration that was not measured.
         is_absent = imu.linear_acceleration_covariance[:, :1] == -1.0
-        samples = np.where(is_absent, np.nan, samples[:, _IMU_ACCELERATION])
+        samples = np.where(is_absent, np.nan, samples[:, IMU_ACCELERATION])
     frame_id = frames[0].decode('utf-8', 'replace') if len(frames) else ''
     return [Block(samples_ns, samples, frame_id, imu, temperatures, log_ns, raw)]
 
@@ -144,11 +140,11 @@ def decode_stamped(messages: Messages, kind: str) -> tuple[Ints, Floats, NDArray
 
 
 def encode_stamped(
-    stamp_ns: Ints, frame_id: str, n_numbers: int, pieces: Sequence[tuple[int, Floats]]
+    stamp_ns: Ints, frame_id: str, n_numbers: int, pieces: Sequence[tuple[slice, Floats]]
 ) -> Bytes:
     """
     Serialize (CDR, little-endian) a header and float64 numbers as rows of bytes, shape (n, size).
-    Each piece is the index of its first number in the message, and values of shape (n, width), or
+    A piece has the indices of its numbers in a message, and their values, of shape (n, width), or
     (width,) if equal in all messages; other numbers are 0.
     """
     text = frame_id.encode() + b'\0'
@@ -156,18 +152,18 @@ def encode_stamped(
     body = 4 + (len(head) + 3) // 8 * 8
     row = np.frombuffer(bytearray(head.ljust(body, b'\0') + bytes(8 * n_numbers)), np.uint8)
     # Values that are equal in all messages are written once, into `row`, before `row` is copied.
-    for column, values in pieces:
+    for place, values in pieces:
         if values.ndim == 1:
-            row[body:].view('<f8')[column : column + len(values)] = values
+            row[body:].view('<f8')[place] = values
     data = np.empty((len(stamp_ns), len(row)), np.uint8)
     data[:] = row
     seconds = stamp_ns // _NS
     data[:, 4:8].view('<i4')[:, 0] = seconds
     data[:, 8:12].view('<u4')[:, 0] = stamp_ns - seconds * _NS
     numbers = data[:, body:].view('<f8')
-    for column, values in pieces:
+    for place, values in pieces:
         if values.ndim > 1:
-            numbers[:, column : column + values.shape[1]] = values
+            numbers[:, place] = values
     return data
 
 

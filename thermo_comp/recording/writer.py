@@ -24,15 +24,14 @@ from ..typing import Ints
 from .blocks import ImuColumns
 from .mcap_out import Compression, McapOutput, dump_yaml, known_definition
 from .serialized import Messages
-from .wire import encode_stamped
+from .wire import IMU_ACCELERATION, IMU_COLUMNS, encode_stamped
 
 STAMP_END_NS = 2**31 * 10**9  # upper limit of ROS stamps, exclusive [ns]
 _AUTO_FLUSH_BYTES = 1 << 26
-#: Formats of tables by the suffix of the file.
-TABLES: Mapping[str, Kind] = {'.csv': CSV, '.parquet': PARQUET}
+TABLES: Mapping[str, Kind] = {'.csv': CSV, '.parquet': PARQUET}  # formats by the file's suffix
 WriteRows = Callable[[Mapping[str, NDArray[Any]]], None]
-#: Field of a message: index of its first number, name, values of all messages, count of numbers.
-_Column = tuple[int, str, ArrayLike, int]
+#: Field of a message: indices of its numbers, name, values of all messages.
+_Column = tuple[slice, str, ArrayLike]
 
 
 class BagWriter(AbstractContextManager['BagWriter']):
@@ -77,8 +76,8 @@ class BagWriter(AbstractContextManager['BagWriter']):
         log_ns: ArrayLike | None = None,
     ) -> None:
         """Write geometry_msgs/Vector3Stamped messages: counts per cycle, shape (n, 3)."""
-        column = (0, 'xyz', xyz, 3)
-        self._write_stamped(topic, VECTOR3_STAMPED, stamp_ns, log_ns, frame_id, [column])
+        columns = [(slice(0, 3), 'xyz', xyz)]
+        self._write_stamped(topic, VECTOR3_STAMPED, stamp_ns, log_ns, frame_id, columns)
 
     def write_temperature(
         self,
@@ -89,7 +88,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
         frame_id: str = '',
     ) -> None:
         """Write sensor_msgs/Temperature messages: degC, shape (n,), with unknown variance."""
-        columns = [(0, 'celsius', np.reshape(celsius, (-1, 1)), 1)]
+        columns = [(slice(0, 1), 'celsius', np.reshape(celsius, (-1, 1)))]
         self._write_stamped(topic, TEMPERATURE, stamp_ns, log_ns, frame_id, columns)
 
     def write_imu(
@@ -107,12 +106,12 @@ class BagWriter(AbstractContextManager['BagWriter']):
         Without `imu`, orientation and rate are marked as absent: their covariances begin with -1.
         """
         columns: list[_Column] = [
-            (25, 'linear_acceleration', linear_acceleration, 3),
-            (28, 'linear_acceleration_covariance', linear_acceleration_covariance, 9),
+            (IMU_ACCELERATION, 'linear_acceleration', linear_acceleration),
+            (IMU_COLUMNS[-1], 'linear_acceleration_covariance', linear_acceleration_covariance),
         ]
-        imu = imu or ImuColumns.of_rate(None)
-        places = zip((0, 4, 13, 16), imu._fields, imu, (4, 9, 3, 9), strict=False)
-        columns += [(at, f'imu.{name}', part, width) for at, name, part, width in places]
+        fields = (imu or ImuColumns.of_rate(None))._asdict().items()
+        others = zip(IMU_COLUMNS[:-1], fields, strict=False)
+        columns += [(place, f'imu.{name}', values) for place, (name, values) in others]
         self._write_stamped(topic, IMU, stamp_ns, log_ns, frame_id, columns)
 
     def write_raw(
@@ -185,13 +184,13 @@ class BagWriter(AbstractContextManager['BagWriter']):
             raise ValueError(f'`stamp_ns` must be below 2**31 s, got {int(np.max(stamps))} ns')
         times = stamps if log_ns is None else _as_times('log_ns', log_ns, len(stamps))
         pieces = []
-        for at, name, values, width in columns:
-            numbers = np.asarray(values, np.float64)
+        for place, name, values in columns:
+            numbers, width = np.asarray(values, np.float64), place.stop - place.start
             if numbers.shape not in {(len(stamps), width), (width,)}:
                 raise ValueError(
                     f'`{name}` must have shape ({len(stamps)}, {width}), got {numbers.shape}'
                 )
-            pieces.append((at, numbers))
+            pieces.append((place, numbers))
         rows = encode_stamped(stamps, frame_id, N_NUMBERS[kind], pieces)
         self._add(topic, kind, Messages.of_rows(rows, np.zeros(len(rows), np.uint16), times))
 

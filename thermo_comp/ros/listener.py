@@ -15,7 +15,7 @@ from ..recording.blocks import NO_STAMP_NS, Role, Topic, with_stamps
 from ..recording.growing import News
 from ..recording.serialized import Messages
 from ..recording.topics import Topics, is_thermometer, split_field
-from ..recording.wire import Feed, decode_blocks
+from ..recording.wire import decode_blocks
 from ..topics import SAMPLES, TEMPERATURE, thermometer
 from .messages import LiveField, live_field, message_class
 from .waitloop import RawSubscription, WaitLoop, separate_node
@@ -82,8 +82,8 @@ class LiveTopics:
             # Delete only copied messages: the receiving thread may have appended others since.
             del self._received[: len(waiting)]
             if waiting:
-                feeds = [Feed(k, *source) for k, source in enumerate(self._feeds.items())]
-                numbers = {feed.role: feed.channel for feed in feeds}
+                numbers = {role: number for number, role in enumerate(self._feeds)}
+                channels = {role: {numbers[role]: topic} for role, topic in self._feeds.items()}
                 messages = Messages.of(
                     [
                         message
@@ -93,7 +93,7 @@ class LiveTopics:
                     [numbers[role] for role, messages, _ in waiting for _ in messages],
                     [stamp for _, _, received_ns in waiting for stamp in received_ns],
                 ).in_order()
-                for decoded in decode_blocks(messages, feeds, numbers, keep_raw=True):
+                for decoded in decode_blocks(messages, channels, {}, keep_raw=True):
                     block, self._last_ns = with_stamps(decoded, self._last_ns)
                     yield block, None
             yield None
