@@ -127,6 +127,8 @@ def test_a_move_between_parts_gives_two_rests_and_parts_without_a_rest_are_joine
     (bag,) = joined(reduced([before, moved]))
     first, second = bag.intervals
     assert first.time[-1] < 300.0 < second.time[0]
+    # WHY: the second rest began at 0 s, so windows of `evaluate` were off by up to half a window.
+    assert second.begin_s == pytest.approx(second.time[0] - 0.5 * bag.window_s, abs=0.01)
 
 
 def test_a_split_recording_gives_the_calibration_of_the_whole_recording():

@@ -118,7 +118,8 @@ def _intervals(parts: Sequence[ReducedBag]) -> tuple[StillInterval, ...]:
         for number, rest in enumerate(part.intervals):
             # Windows count as whole if their length is within 1 % of that in the first part.
             n_whole = rest.n_whole if is_alike else 0
-            shifted = replace(rest, time=rest.time + shift_s, n_whole=n_whole)
+            begin_s, time = rest.begin_s + shift_s, rest.time + shift_s
+            shifted = replace(rest, begin_s=begin_s, time=time, n_whole=n_whole)
             is_first = bool(result) and number == 0
             if is_first and _is_one_rest(result[-1], shifted, part.window_s):
                 result[-1] = _continued(result[-1], shifted)

@@ -214,14 +214,12 @@ def choose(
     if fits.loss(used | odd, odd) > CLEAR_GAIN:
         gain, error = fits.left_out_gain(used | odd, odd)
         used = fits.thinned(used | odd) if gain > error else used
-    evidence: dict[int, tuple[float, float]] = {}
     for at in sorted(at for at in used if at < k):
         gain, error = fits.left_out_gain(used, fits.term(at))
         if gain <= error and fits.is_determined(used, at):
             used -= fits.term(at)
-        else:
-            evidence[at] = fits.loss(used, fits.term(at)), gain
-    for at in evidence:
+    kept = sorted(at for at in used if at < k)
+    for at in kept:
         per_kelvin = frozenset((k + at,))
         if fits.is_determined(used, k + at) and fits.loss(used, per_kelvin) < -LEAST_GAIN:
             used -= per_kelvin
@@ -231,7 +229,8 @@ def choose(
         for trial in selected.trials
     )
     terms = []
-    for at, of_term in evidence.items():
+    for at in kept:
+        of_term = fits.loss(used, fits.term(at)), fits.left_out_gain(used, fits.term(at))[0]
         places = posterior.layout.nonlinear[:, [at, k + at]]
         determined = max(float(posterior.determined[places[places >= 0]].sum()), 0.0)
         terms.append(_blank_term(forces.kinds[at], float(sd[at]), determined, *of_term))

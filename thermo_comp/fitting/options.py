@@ -111,15 +111,6 @@ class FitOptions:
         refuse_impossible(self)
         if self.offset is not None and not math.isfinite(self.offset):
             raise ValueError(f'`offset` must be finite, got {self.offset}')
-        if self.prior is not None:
-            if not isinstance(self.prior, Calibration):
-                raise ValueError(f'`prior` must be a Calibration, see `load`, got {self.prior!r}')
-            if self.prior.unit.input != self.input:
-                known = self.prior.unit.input
-                raise ValueError(
-                    f'`prior` is in {known}, the samples are in {self.input}: a prior must be in '
-                    'the unit of the samples'
-                )
         allowed: dict[str, tuple[str, ...]] = {
             'input': ('counts', 'm/s^2'),
             'model': ('response', 'golovach'),
@@ -136,6 +127,15 @@ class FitOptions:
             for word in given if isinstance(given, tuple | list) else (given,):
                 if word is not None and word not in words:
                     raise ValueError(f'`{name}` must be one of {", ".join(words)}, got {word!r}')
+        if self.prior is not None:
+            if not isinstance(self.prior, Calibration):
+                raise ValueError(f'`prior` must be a Calibration, see `load`, got {self.prior!r}')
+            if self.prior.unit.input != self.input:
+                known = self.prior.unit.input
+                raise ValueError(
+                    f'`prior` is in {known}, the samples are in {self.input}: a prior must be in '
+                    'the unit of the samples'
+                )
 
     def nonlinear_sd(self, kind: Kind) -> float:
         """Return the prior sd of a nonlinear term [g/g^2], or of the cube [g/g^3]."""
