@@ -24,8 +24,7 @@ DEPTH_LIMIT = 12  # largest number of nested lists and mappings
 #: Largest number of keys, values, lists and mappings of a file: three times the number in a file
 #: with all columns of `unit.columns.bank` for two thermometers, except the kind `bend`.
 NODE_LIMIT = 20_000
-# Size limit of YAML files written by hand [bytes]; usual files have a few kB.
-_FILE_LIMIT = 1 << 16
+_FILE_LIMIT = 1 << 16  # size limit of YAML files written by hand [bytes]; usual: a few kB
 _INTEGER_DIGITS = 20  # digits of the longest integer accepted; a float64 needs no more
 _INTEGER = re.compile(r'[-+]?[0-9]+')
 _FLOAT = re.compile(r'[-+]?(?:(?:[0-9]+\.[0-9]*|\.[0-9]+|[0-9]+)(?:[eE][-+]?[0-9]+)?|\.inf)|\.nan')
@@ -38,8 +37,7 @@ class PlainYamlError(ValueError):
 
     def __init__(self, problem: str, line: int | None = None, detail: str = '') -> None:
         where = '' if line is None else f' (line {line})'
-        # The error message for users who may not read the file: without `detail`.
-        self.rule = f'{problem}{where}'
+        self.rule = f'{problem}{where}'  # the message for users who may not read the file
         super().__init__(f'{problem}: {detail}{where}' if detail else self.rule)
 
 
@@ -69,7 +67,7 @@ def read_plain_yaml(path: str | Path) -> Any:
 
 
 def is_plain_text(text: str) -> bool:
-    """Whether this reader takes an unquoted scalar as a text."""
+    """Whether `load_plain_yaml` reads an unquoted scalar as a text."""
     return not (text in _WORDS or _INTEGER.fullmatch(text) or _FLOAT.fullmatch(text))
 
 

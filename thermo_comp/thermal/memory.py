@@ -23,14 +23,14 @@ from .lags import BOARD_INPUT, Lag, MemorySpec, first_order_lags
 #: Interval between readings / time constant of a lag above which variance is added, because the
 #: time at which the input changed between the readings is unknown.
 SPARSE_SHARE: Final = 0.1
-#: Smallest weight of an old input in `_recursion`: below it a term is lost in double precision.
+#: Smallest weight of an old input in `_recursion`; a smaller weight has no effect in float64.
 _LEAST_WEIGHT: Final = 1e-18
 
 
 class LagBank:
     """
-    First-order lags of one input with the time constants `taus` [s]; `start_ns` is the first stamp
-    since the last `forget`.
+    First-order lags of one input with the time constants `taus` [s]. `stamp_ns`, `start_ns`: last
+    and first stamp of the input since the last `forget`.
     """
 
     def __init__(self, taus: tuple[float, ...]) -> None:
@@ -82,7 +82,7 @@ class LagBank:
         self.extra = [variance + change * change for variance in self.extra]
 
     def at(self, stamp_ns: int, value: float) -> tuple[list[float], list[float]]:
-        """Return each ``u - L`` [K] at u = `value`, and its variance for a known initial state."""
+        """Return `lagging` and `extra` at a stamp at which the input is `value` [K]."""
         seen_ns = self.stamp_ns
         if seen_ns is None or stamp_ns <= seen_ns or not self.taus:
             return self.lagging, self.extra
@@ -126,7 +126,7 @@ class ThermalMemory:
         }
         self.board = self.banks[BOARD_INPUT]
         self.is_empty = not spec.lags and not spec.plays
-        #: For each lag: index and weight of its first-order lags; [] if all lags have order 1.
+        #: For each lag: index and weight of its first-order lags; [] if all lags are first-order.
         self._sums = [weights(lag) for lag in spec.lags]
         if self._sums == [[(k, 1.0)] for k in range(len(terms))]:
             self._sums = []
@@ -136,16 +136,15 @@ class ThermalMemory:
         self._followed = [weights(play.lag) if play.lag else [] for play in spec.plays]
         self._needs_sensors = any(play.inputs != (BOARD_INPUT,) for play in spec.plays)
         self._widths = [play.width_k for play in spec.plays]
-        self._held: list[float] = []
-        #: Rate of a ramp in which the unit may have been switched on [K/s], by the board's rate
-        #: shortly after the start; lower bound of this rate: largest (rate less two sd) so far.
-        self.start_rate = self.sure_rate = 0.0
+        self.forget()
 
     def forget(self) -> None:
         """Forget all inputs; the next board temperature sets each play equal to its input."""
         for bank in self.banks.values():
             bank.forget()
-        self._held = []
+        self._held: list[float] = []  # output of each play; empty before the first temperature
+        #: Rate of a ramp in which the unit may have been switched on [K/s], estimated from the
+        #: board's rate shortly afterwards; lower bound of this rate by its sd.
         self.start_rate = self.sure_rate = 0.0
 
     def forget_input(self, name: str) -> None:
@@ -174,7 +173,7 @@ class ThermalMemory:
         ]
 
     def note_jump(self, change: float) -> None:
-        """Add the square of a wrong step of a board reading [K] to the variance of each lag."""
+        """Add the square of a wrong step of the board readings [K] to the variance of each lag."""
         for bank in self.banks.values():
             bank.note_jump(change)
 

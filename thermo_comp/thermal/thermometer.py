@@ -26,27 +26,26 @@ from typing import Final
 
 from .settings import ThermometerSettings
 
-OUTLIER_SIGMAS: Final = 6.0  # innovation in sd beyond which a reading is down-weighted
-OUTLIER_LIMITS: Final = 5.0  # innovation / outlier limit, beyond which a reading is rejected
-RESTART_READINGS: Final = 4  # number of consecutive outliers of equal sign for a restart
+OUTLIER_SIGMAS: Final = 6.0  # innovation / its sd above which a reading is down-weighted
+OUTLIER_LIMITS: Final = 5.0  # innovation / limit of an outlier above which a reading is rejected
+RESTART_READINGS: Final = 4  # consecutive outliers of equal sign after which the filter restarts
 # Mean time in the quiet mode [s]; the mean time in the bending mode is the lag of the sensor.
 SOAK_S: Final = 900.0
-# Sd of the noise that drives the temperature's second derivative: quiet filter / bending filter;
-# `CELL_SHARE` is this ratio for a sensor whose readings never change by noise alone.
+# Sd of the noise that drives the temperature's second derivative: quiet filter / bending filter.
 QUIET_SHARE: Final = 5e-3
-CELL_SHARE: Final = 0.2
+CELL_SHARE: Final = 0.2  # this ratio for a sensor whose readings never change by noise alone
 _ROOT_HALF: Final = 0.7071067811865476  # 1 / sqrt(2)
 _DENSITY_AT_0: Final = 0.3989422804014327  # 1 / sqrt(2 pi)
 #: Range of readings accepted as temperatures [degC]; the lower end is absolute zero.
 COLDEST: Final = -273.15
 HOTTEST: Final = 1000.0
 HORIZON_INTERVALS: Final = 5.0  # longest linear extrapolation [reading intervals]
-LONGEST_STEP_SHARE: Final = 0.125  # longest step of a prediction / lag of the sensor
+LONGEST_STEP_SHARE: Final = 0.125  # longest time step of `predict` / lag of the sensor
 NOISE_MEMORY: Final = 200.0  # number of innovations over which the noise factor is averaged
 
-# The filters of the two modes are written out in floats: matrix operations would be slower.
+#: Temperature, rate, acceleration; then elements 00, 01, 02, 11, 12, 22 of their covariance. The
+#: filters are written out in floats, because matrix operations would be slower.
 State = tuple[float, float, float, float, float, float, float, float, float]
-"""Temperature, rate, acceleration; then elements 00, 01, 02, 11, 12, 22 of their covariance."""
 
 _NOWHERE: State = (nan, nan, nan, inf, 0.0, 0.0, inf, 0.0, inf)  # state before the first reading
 
@@ -70,8 +69,8 @@ class Thermometer:
         noise, quantum = settings.noise_sd_c, settings.quantum_c
         self._noise = noise * noise
         self._flat = noise * noise + quantum * quantum / 12.0
-        self._noise_scale = 1.0  # actual / declared noise variance
-        self._n_turns = 8.0  # number of innovations in `_noise_scale`, with 8 for the prior
+        self._noise_scale = 1.0  # noise factor: actual / declared noise variance
+        self._n_turns = 8.0  # number of innovations in `_noise_scale`, 8 of which are its prior
         self._has_cells = settings.has_cells
         self._quantum = quantum
         self._lag = settings.lag_s
@@ -151,13 +150,8 @@ class Thermometer:
             if self._n_turns < NOISE_MEMORY:
                 self._n_turns += 1.0
             self._noise_scale = max(1.0, scale * (1.0 + excess / self._n_turns))
-        # The cheap test comes first: an outlier's innovation is at least OUTLIER_SIGMAS standard
-        # deviations.
-        if surprise * surprise > OUTLIER_SIGMAS**2 * spread and abs(surprise) > (
-            limit := OUTLIER_SIGMAS * sqrt(spread)
-            + 5.0 * self._bend * dt * dt
-            + 1.5 * self._quantum
-        ):
+        limit = OUTLIER_SIGMAS * sqrt(spread) + 5.0 * self._bend * dt * dt + 1.5 * self._quantum
+        if abs(surprise) > limit:
             self._n_strange = 1 if is_turning else self._n_strange + 1
             if self._n_strange >= RESTART_READINGS:
                 self.n_restarts += 1
@@ -175,8 +169,8 @@ class Thermometer:
                 reading_c, expected, variance, rate * dt, bent[6] * dt * dt
             )
 
-        # Update the filter of each mode, and the probability of the bending mode from the
-        # likelihoods of the innovations of both filters.
+        # Update the filters of both modes, and the probability of the bending mode by the
+        # likelihoods of their innovations.
         if noise < inf:
             quiet, innovation, s = correct(quiet, measured, noise)
             bent, bent_innovation, bent_s = correct(bent, measured, noise)
@@ -225,7 +219,7 @@ class Thermometer:
         rate = self.rate
         unknown = 0.0
         if not -horizon <= ahead <= horizon:
-            # After the extrapolation horizon the temperature is held constant, with a variance
+            # Beyond the extrapolation horizon the temperature is held constant, with a variance
             # that grows by the square of the change that its rate or an unseen ramp would cause.
             dt = horizon if ahead > 0.0 else -horizon
             beyond = ahead - dt
@@ -269,7 +263,7 @@ class Thermometer:
         half = 0.5 * self._quantum
         noise = self._noise
         if variance < 4.0 * noise:
-            # The sd of the prediction is less than twice the noise: match the moments of the
+            # The sd of the prediction is below twice that of the noise: match the moments of the
             # prediction truncated to the reading's cell. Alternating readings show a cell's edge.
             spread = variance + noise
             sd = sqrt(spread)
@@ -295,8 +289,8 @@ class Thermometer:
         box = half * half / 3.0
         if variance > box:
             return reading, variance * box / (variance - box)
-        # A prediction outside the reading's cell (one quantum wide) is corrected to the edge; all
-        # readings taken while the prediction changes by its sd count as one measurement.
+        # A prediction outside the reading's cell is corrected to the edge; all readings taken
+        # while the prediction changes by its sd count together as one measurement.
         if abs(expected - reading) > half:
             edge = reading + (half if expected > reading else -half)
             return edge, variance * max(1.0, sqrt(variance) / (abs(move) + 1e-30))
