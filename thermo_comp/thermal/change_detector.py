@@ -71,12 +71,12 @@ class ChangeDetector:
         self.rate = 0.0
         self.swing = self._ripple_rate
         self._baseline = 0.0
-        # Largest error of the rate in a soak [K/s]: the first rate may be at a crest of a ripple.
+        # Largest error of the baseline [K/s]: at first the rate may be at a crest of a ripple.
         self._baseline_error = self.swing
         self._trend = 0.0
         self._is_above = False
-        self._turned_s = 0.0
-        self._peak = self._peak_before = 0.0
+        self._turned_s = 0.0  # age at which the rate last crossed its trend [s]
+        self._peak = self._peak_before = 0.0  # largest distances of the rate from its trend [K/s]
 
     def settle(self, sensor: Thermometer, least_error: float = 0.0) -> None:
         """Begin a soak: the rate becomes the baseline, with at least the error `least_error`."""

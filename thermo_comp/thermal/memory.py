@@ -11,7 +11,7 @@ input u is linear between two readings (first-order hold), the state m becomes, 
 
 import math
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import accumulate
 from typing import Final
 
@@ -167,10 +167,7 @@ class ThermalMemory:
             board - sum([share * values[k] for k, share in lag]) if lag else board
             for lag in self._followed
         ]
-        self._held = [
-            v - r if p < v - r else v + r if p > v + r else p
-            for p, v, r in zip(self._held or inputs, inputs, self._widths, strict=True)
-        ]
+        self._held = list(map(_follow, self._held or inputs, inputs, self._widths))
 
     def note_jump(self, change: float) -> None:
         """Add the square of a wrong step of the board readings [K] to the variance of each lag."""
@@ -261,7 +258,8 @@ def memory_on_grid(
     columns = [part for lag in behind.values() for part in (lag, np.zeros_like(lag))]
     for play in spec.plays:
         v = board - behind[play.lag] if play.lag else board
-        columns.append(_play(v, play.width_k) - v)
+        held = accumulate(v.tolist(), partial(_follow, width=play.width_k))
+        columns.append(np.array(list(held)) - v)
     return np.column_stack(columns) if columns else np.zeros((len(board), 0), dtype=np.float64)
 
 
@@ -275,8 +273,6 @@ def _recursion(decay: float, driven: Floats) -> Floats:
     return result
 
 
-def _play(v: Floats, width: float) -> Floats:
-    def step(p: float, v: float) -> float:
-        return v - width if p < v - width else v + width if p > v + width else p
-
-    return np.array(list(accumulate(v.tolist(), step)))
+def _follow(p: float, v: float, width: float) -> float:
+    """Return the output of a play at the input `v`; `p`: output before."""
+    return v - width if p < v - width else v + width if p > v + width else p

@@ -353,18 +353,8 @@ def correct(state: State, measured: float, variance: float) -> tuple[State, floa
     k1 = p01 / spread
     k2 = p02 / spread
     left = variance / spread
-    return (
-        (
-            t + k0 * innovation,
-            v + k1 * innovation,
-            a + k2 * innovation,
-            left * p00,
-            left * p01,
-            left * p02,
-            p11 - k1 * p01,
-            p12 - k1 * p02,
-            p22 - k2 * p02,
-        ),
-        innovation,
-        spread,
-    )
+    corrected = (
+        t + k0 * innovation, v + k1 * innovation, a + k2 * innovation,
+        left * p00, left * p01, left * p02, p11 - k1 * p01, p12 - k1 * p02, p22 - k2 * p02,
+    )  # fmt: skip
+    return corrected, innovation, spread
