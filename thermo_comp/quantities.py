@@ -142,7 +142,7 @@ def refuse_impossible(value: Any) -> None:
     cls: type = type(value)
     for name, bounds in _bounds_of(cls).items():
         given = getattr(value, name)
-        is_optional = getattr(cls, name, 0) is None  # the default
+        is_optional = getattr(cls, name, 0) is None  # None is the default
         for bound in () if given is None and is_optional else bounds:
             if fault := bound.fault(given):
                 raise ValueError(f'`{name}` {fault}, got {given}')

@@ -283,7 +283,7 @@ def learn(
             changes += (best,)
         model = Model(rows, calibration, since, changes)
         inverse = model.inverse(ageing)
-        deviation = (inverse @ rows.y) / np.sqrt(np.diag(inverse))  # from the other rows, in sd
+        deviation = (inverse @ rows.y) / np.sqrt(np.diag(inverse))  # from the prediction, in sd
         is_outlier = np.isin(used.start, rows.start[np.abs(deviation) > 5.0])
         # If more than 10 % of the rests would be left out, the model is wrong: keep all rests.
         if not 0 < is_outlier.sum() <= 0.1 * len(used):

@@ -243,7 +243,7 @@ def _axis_changes(
 
 
 def _judged(series: RestSeries, model: Model, solution: Solution, determined: Bools) -> Judged:
-    """Score updates by earlier rests on the rests of each day (of each start below 5 days)."""
+    """Score updates by earlier rests on the rests of each day or, below 5 days, of each start."""
     over, labels = 'days', series.day
     if len(np.unique(labels)) < 5:
         over, labels = 'starts', series.start

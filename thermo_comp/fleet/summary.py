@@ -35,7 +35,7 @@ _CONSTANTS = tuple(column for column in QUANTITIES if column.sd and '_slope_' no
 
 class Spread(NamedTuple):
     """
-    Spread of a quantity over the units about its median `middle`, and the distance `z` of each.
+    Spread of a quantity over the units about the median `middle`, and distance `z` of each unit.
 
     Only units whose data determine the quantity (`is_counted`) are used for `middle`, `sd` and
     `limit`. A distance `z` is the deviation from the median divided by ``sqrt(sd^2 + s^2)``; s: sd

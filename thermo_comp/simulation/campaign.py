@@ -59,7 +59,7 @@ PLAN_NAMES = (
     *('chamber-18', 'chamber-9', 'tumble-3', 'tumble-1', 'tumble', 'held-out'),
     *('centrifuge', 'rate-table'),
 )
-# Begins [s] of the runs through all rotation rates: half an hour before the ends of the soaks.
+# Times [s] at which a run through all rotation rates begins: half an hour before each soak ends.
 _BEGINS_S = tuple(end - 1800.0 for end in (3600.0, 8100.0, 13500.0))
 _DWELL_S, _RAMP_S = 300.0, 60.0  # duration of each rotation rate, and of each change of the rate
 # Radius [m] and rotation rates [rad/s] of the simulated centrifuge (2 to 10 g horizontally) and of

@@ -167,7 +167,7 @@ class Bend:
 
 @dataclass(frozen=True)
 class SwitchedLoad:
-    """Electronics that heat a part with `power` [W], off and on for times within `spell` [s]."""
+    """Electronics that heat a part with `power` [W]; `spell`: range of times off and on [s]."""
 
     part: str
     power: float

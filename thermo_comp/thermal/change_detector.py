@@ -143,7 +143,7 @@ class ChangeDetector:
         self._reading = sensor.reading
 
     def _tune(self, dt: float) -> None:
-        """Compute each filter's threshold for (rate beyond its limit)^2 / variance of the rate."""
+        """Compute each filter's threshold of (excess of the rate)^2 / variance of the rate."""
         self._dt = dt
         self._thresholds: list[float] = []
         for power in self._powers[::-1]:

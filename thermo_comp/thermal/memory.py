@@ -47,7 +47,7 @@ class LagBank:
         self.lagging = self.extra = [0.0] * len(self.taus)
 
     def step(self, stamp_ns: int, value: float, sd: float = 0.0) -> None:
-        """Use the next input value [K], of error sd `sd`; the input is linear between values."""
+        """Use the next input value, with an error of the sd `sd` [K]; it is linear in between."""
         if self.stamp_ns is None:
             self.stamp_ns = self.start_ns = stamp_ns
             self.input = value
@@ -274,5 +274,5 @@ def _recursion(decay: float, driven: Floats) -> Floats:
 
 
 def _follow(p: float, v: float, width: float) -> float:
-    """Return the output of a play at the input `v`; `p`: output before."""
+    """Return the output of a play of half-width `width` at the input `v`; `p`: output before."""
     return v - width if p < v - width else v + width if p > v + width else p

@@ -45,9 +45,9 @@ LEAD_K: Final = 0.5  # limit in K
 LEAD_SHARE: Final = 0.15  # limit relative to the larger change
 LEAD_READINGS: Final = 5
 LEAD_RATE_SHARE: Final = 0.3  # least ratio of the slower to the faster rate at such a reading
-#: Ratio of the two rates above which the board's variance is increased if the board leads.
+#: Ratio of the slower to the faster rate above which a leading board gets a larger variance.
 DOUBTFUL_RATE_SHARE: Final = 0.03
-#: Number of changed readings in a row that equal the board's, in a sensor that copies the board's.
+#: A sensor copies the board if this number of its readings in a row change and equal the board's.
 COPIED_READINGS: Final = 10
 _TOGETHER_NS: Final = 10_000_000  # largest time between two readings that are compared [ns]
 _NOISE_SDS: Final = 6.0  # largest deviation of a temperature due to noise, in sd
@@ -110,7 +110,7 @@ class SensorCheck:
         self._expected = 0.0
         self._moved = 0.0
         self._seen_ns: int | None = None
-        #: Stamps and values [degC] of the first two readings; None once the third has judged them.
+        #: Stamps and values [degC] of the first two readings; None from the third reading on.
         self._first: list[tuple[int, float]] | None = []
 
     @property
@@ -196,7 +196,7 @@ class SensorCheck:
         if self.lag_s > 0.0:
             dt = (now_ns - (self._seen_ns or now_ns)) * 1e-9
             if dt > 0.0:
-                # The judged sensor should follow the other sensor with a first-order lag.
+                # Expect the judged sensor to follow the other sensor with a first-order lag.
                 self._expected += dt / (dt + self.lag_s) * (moved - self._expected)
         else:
             # The board may approach, but not pass, the constant temperature of `sensor`.
@@ -220,7 +220,7 @@ class SensorCheck:
         return Fault.FROZEN if self._moved > OTHER_MOVED + margin else Fault.STILL
 
     def note_jump(self, stamp_ns: int, change: float) -> None:
-        """Note a jump of the sensor's readings [K]: those before or after the jump are wrong."""
+        """Note a jump of the readings [K]: the readings before or after the jump are wrong."""
         self._jumped = self._jump_at(stamp_ns) + change * change
         self._jumped_ns = stamp_ns
 

@@ -3,7 +3,7 @@
 """
 Owns the settings of thermometers, detector and tracker.
 
-A calibration file states the settings of thermometers and detector. The user sets the tracker.
+A calibration file states the settings of thermometers and detector, the user those of the tracker.
 """
 
 from dataclasses import dataclass, field
