@@ -57,10 +57,8 @@ class ChangeDetector:
         # ``share * onset`` [K/s^2] in readings at 1 Hz determines the spectral density of the
         # filter's process noise for any interval of readings.
         self._noise = sensor.noise_sd_c**2 + sensor.quantum_c**2 / 12.0
-        onset = smallest_rate / sensor.lag_s
-        memories = [
-            TUNING * math.pow(sqrt(self._noise) / (share * onset), 0.4) for share in BEND_SHARES
-        ]
+        noise_sd, onset = sqrt(self._noise), smallest_rate / sensor.lag_s
+        memories = [TUNING * math.pow(noise_sd / (share * onset), 0.4) for share in BEND_SHARES]
         self._powers = [self._noise / memory**4 for memory in memories]
         # A filter has ``acos(rho) / (2 pi dt) exp(-h^2 / 2)`` false alarms of each sign per second
         # at a threshold of h sd; rho: correlation of the noise of two rates at times dt apart.
@@ -100,12 +98,8 @@ class ChangeDetector:
         """
         stamp = self._stamp_ns
         dt = 0.0 if stamp is None else (stamp_ns - stamp) * 1e-9
-        if (
-            stamp is None
-            or dt > self._baseline_s
-            or sensor.n_restarts != self._n_restarts
-            or not sensor.is_ready
-        ):
+        is_lost = stamp is None or dt > self._baseline_s or not sensor.is_ready
+        if is_lost or sensor.n_restarts != self._n_restarts:
             self._start(stamp_ns, sensor)
             return 0
         if dt <= 0.0:

@@ -99,9 +99,8 @@ def _coefficients(taus: tuple[float, ...], dt_ns: int) -> tuple[list[float], lis
     """Return ``e`` and ``(1 - e) tau / dt`` of each lag, ``e = exp(-dt / tau)``, dt in ns."""
     dt = dt_ns * 1e-9
     lost = [-math.expm1(-dt / tau) for tau in taus]
-    return [1.0 - part for part in lost], [
-        part * (tau / dt) for part, tau in zip(lost, taus, strict=True)
-    ]
+    gains = [part * (tau / dt) for part, tau in zip(lost, taus, strict=True)]
+    return [1.0 - part for part in lost], gains
 
 
 class ThermalMemory:

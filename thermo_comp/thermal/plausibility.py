@@ -160,13 +160,11 @@ class SensorCheck:
         self._other_then = nan
         age = (stamp_ns - last_ns) * 1e-9
         # Accept at once a reading within `LARGEST_STEP` of the temperature expected now.
-        if (
-            fault is Fault.NONE
-            and abs(celsius - sensor.temperature) + abs(sensor.rate) * age < LARGEST_STEP
-        ):
+        is_near = abs(celsius - sensor.temperature) + abs(sensor.rate) * age < LARGEST_STEP
+        if fault is Fault.NONE and is_near:
             self._n_used += 1
             return True
-        self.is_revived = fault is Fault.STILL or fault is Fault.FROZEN
+        self.is_revived = fault in (Fault.STILL, Fault.FROZEN)
         if self._n_used >= SETTLED_READINGS and not self.is_revived:
             expected, _, variance = sensor.at(stamp_ns)
             step = celsius - expected

@@ -103,11 +103,11 @@ class RegimeDetector:
                     self._open(stamp_ns, direction, lead)
         else:
             self._turn(stamp_ns, _obvious(lead, change.swing))
+        dwell_ns = self._dwell_ns * (1.0 + 2.0 * change.swing / self._relaxed_rate)
         if (
             self._calm_ns is not None
             and self.regime is not Regime.STATIC
-            and stamp_ns - self._calm_ns
-            >= self._dwell_ns * (1.0 + 2.0 * change.swing / self._relaxed_rate)
+            and stamp_ns - self._calm_ns >= dwell_ns
             and (self._held_until_ns is None or stamp_ns >= self._held_until_ns)
         ):
             # Before the first soak the rate's swing is unknown: allow a larger baseline error.

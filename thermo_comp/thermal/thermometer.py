@@ -164,19 +164,15 @@ class Thermometer:
             self._n_strange = 0
         measured = reading_c
         if self._has_cells:
-            rate = quiet[1] + prior_bending * (bent[1] - quiet[1])
-            measured, noise = self._cell(
-                reading_c, expected, variance, rate * dt, bent[6] * dt * dt
-            )
+            move = (quiet[1] + prior_bending * (bent[1] - quiet[1])) * dt
+            measured, noise = self._cell(reading_c, expected, variance, move, bent[6] * dt * dt)
 
         # Update the filters of both modes, and the probability of the bending mode by the
         # likelihoods of their innovations.
         if noise < inf:
             quiet, innovation, s = correct(quiet, measured, noise)
-            bent, bent_innovation, bent_s = correct(bent, measured, noise)
-            evidence = 0.5 * (
-                innovation * innovation / s - bent_innovation * bent_innovation / bent_s
-            )
+            bent, of_bent, bent_s = correct(bent, measured, noise)
+            evidence = 0.5 * (innovation * innovation / s - of_bent * of_bent / bent_s)
             if not -30.0 < evidence < 30.0:
                 evidence = 30.0 if evidence > 0.0 else -30.0
             odds = prior_bending * sqrt(s / bent_s) * exp(evidence)
