@@ -274,9 +274,8 @@ def _block(
     readings = {}
     for name, value in given.items():
         reading_ns, celsius = _readings(name, value, stamps, _is_date(time_s))
-        readings[name] = Readings(
-            reading_ns + start_ns, celsius, np.searchsorted(stamps, reading_ns)
-        )
+        first = np.searchsorted(stamps, reading_ns)
+        readings[name] = Readings(reading_ns + start_ns, celsius, first)
     return Block(stamps + start_ns, samples, '', None, readings, {})
 
 

@@ -102,8 +102,8 @@ class Watch:
             how = f'again within its claim since {since}' if since else 'within its claim'
             text = f'the unit is {how} up to {self.last} ({week}); '
             if self.forecast:
-                when = 'on any day' if self.forecast[1] < 1.0 else self._date(1, 'about ')
-                text += f'forecast: it will leave its claim {when}'
+                when = 'on any day' if self.forecast[1] < 1.0 else self._date(1, 'on about ')
+                text += f'forecast: its error will exceed its claim {when}'
                 text += f' (10 to 90 %: {self._date(0)} .. {self._date(2)})'
             else:
                 text += 'a forecast needs rests of 3 starts of the node'

@@ -113,15 +113,13 @@ def fit_fleet(
                 rows[name] = row if is_fitted(row) else {**rows[name], **kept}
     ordered = tuple(rows[unit.name] for unit in units)
     summary = summarise(ordered, earlier)
-    parquet, csv = write_tables(ordered, results.folder)
+    tables = write_tables(ordered, results.folder)
     page = results.folder / PAGE
     content = render_fleet(ordered, summary, results.certificate_of).encode()
     files.write_atomically(page, content, files.PAGE)
     prior_path = None if prior is None else results.folder / PRIOR
     skipped = folders_of_tables(storage)
-    return FleetResult(
-        ordered, summary, len(done), parquet, csv, page, prior_path, no_prior, skipped
-    )
+    return FleetResult(ordered, summary, len(done), *tables, page, prior_path, no_prior, skipped)
 
 
 def _require_packages() -> None:

@@ -224,14 +224,12 @@ class ThermalMemory:
         return values, extra
 
     def remaining_shares(self, stamp_ns: int) -> list[float]:
-        """Return the share of each lag's initial state that remains at a stamp, 1 to 0."""
-        ages_s = {
+        """Return `Lag.remaining_share` of each lag at a stamp, 1 to 0."""
+        ages = {
             name: 0.0 if bank.start_ns is None else max(stamp_ns - bank.start_ns, 0) * 1e-9
             for name, bank in self.banks.items()
         }
-        return [
-            lag.remaining_share(min(ages_s[of] for of in lag.inputs)) for lag in self.spec.lags
-        ]
+        return [lag.remaining_share(min(ages[of] for of in lag.inputs)) for lag in self.spec.lags]
 
 
 def memory_on_grid(

@@ -68,6 +68,4 @@ class StateLayout:
         numbers = [number for each in quantities for number in (each, (each, 'variance'))]
         self.numbers = (Board(), VAR_BOARD, Rate(), WEIGHT, UNKNOWN, *numbers, *spec.plays)
         self.width = len(self.numbers)
-        self.places = {
-            number: k for k, number in enumerate(self.numbers) if isinstance(number, Quantity)
-        }
+        self.places = {key: k for k, key in enumerate(self.numbers) if isinstance(key, Quantity)}
