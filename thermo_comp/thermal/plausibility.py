@@ -106,9 +106,10 @@ class SensorCheck:
         self._n_used = 0
         self._jumped = 0.0
         self._jumped_ns = 0
+        # Temperature of the other sensor at the last change of this sensor's reading. Since then:
+        # change expected of this sensor, largest change of the other sensor [K].
         self._other_then = nan
-        self._expected = 0.0
-        self._moved = 0.0
+        self._expected = self._moved = 0.0
         self._seen_ns: int | None = None
         #: Stamps and values [degC] of the first two readings; None from the third reading on.
         self._first: list[tuple[int, float]] | None = []

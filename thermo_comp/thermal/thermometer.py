@@ -97,8 +97,8 @@ class Thermometer:
         self._covariance = 0.0  # covariance of temperature and rate
         self._quiet: State = _NOWHERE
         self._bent: State = _NOWHERE
-        self._surprise = 0.0
-        self._n_strange = 0
+        self._innovation = 0.0
+        self._n_outliers = 0
 
     def update(self, stamp_ns: int, reading_c: float) -> bool:
         """
@@ -140,28 +140,28 @@ class Thermometer:
         scale = self._noise_scale
         noise = self._flat * scale
         spread = variance + noise
-        surprise = reading_c - expected
-        is_turning = surprise * self._surprise < 0.0
-        self._surprise = surprise
+        innovation = reading_c - expected
+        is_turning = innovation * self._innovation < 0.0
+        self._innovation = innovation
         if is_turning and not self._has_cells:
             # Estimate the noise from innovations whose sign differs from that of the innovation
             # before: a change of the rate gives innovations of equal sign.
-            excess = min(surprise * surprise / spread - 1.0, 8.0)
+            excess = min(innovation * innovation / spread - 1.0, 8.0)
             if self._n_turns < NOISE_MEMORY:
                 self._n_turns += 1.0
             self._noise_scale = max(1.0, scale * (1.0 + excess / self._n_turns))
         limit = OUTLIER_SIGMAS * sqrt(spread) + 5.0 * self._bend * dt * dt + 1.5 * self._quantum
-        if abs(surprise) > limit:
-            self._n_strange = 1 if is_turning else self._n_strange + 1
-            if self._n_strange >= RESTART_READINGS:
+        if abs(innovation) > limit:
+            self._n_outliers = 1 if is_turning else self._n_outliers + 1
+            if self._n_outliers >= RESTART_READINGS:
                 self.n_restarts += 1
                 self._start(stamp_ns, reading_c)
                 return True
-            if abs(surprise) > OUTLIER_LIMITS * limit:
+            if abs(innovation) > OUTLIER_LIMITS * limit:
                 return False
-            noise = max(noise, surprise * surprise / OUTLIER_SIGMAS**2 - variance)
+            noise = max(noise, innovation * innovation / OUTLIER_SIGMAS**2 - variance)
         else:
-            self._n_strange = 0
+            self._n_outliers = 0
         measured = reading_c
         if self._has_cells:
             move = (quiet[1] + prior_bending * (bent[1] - quiet[1])) * dt
@@ -170,9 +170,9 @@ class Thermometer:
         # Update the filters of both modes, and the probability of the bending mode by the
         # likelihoods of their innovations.
         if noise < inf:
-            quiet, innovation, s = correct(quiet, measured, noise)
+            quiet, of_quiet, s = correct(quiet, measured, noise)
             bent, of_bent, bent_s = correct(bent, measured, noise)
-            evidence = 0.5 * (innovation * innovation / s - of_bent * of_bent / bent_s)
+            evidence = 0.5 * (of_quiet * of_quiet / s - of_bent * of_bent / bent_s)
             if not -30.0 < evidence < 30.0:
                 evidence = 30.0 if evidence > 0.0 else -30.0
             odds = prior_bending * sqrt(s / bent_s) * exp(evidence)
