@@ -103,7 +103,7 @@ class Rows:
     of the rests of a start, with all information of the rests about bias and scale.
 
     y, `by_...`, lack: combinations of ``|f| - g`` [m/s^2] and of the fields of `RestSeries`
-    noise, scatter: variance of the noise of a row; factor of the variance of the scatter
+    noise, scatter: variance of a row by noise; by scatter, relative to the variance for one rest
     rank: number of the row among the rows of its start, from 0
     above_reference: mean board temperature of a start's rests less the reference temperature [K]
     """

@@ -37,7 +37,8 @@ from ..unit.provenance import Source
 from .rest import SUFFIX, Rest, Start, rests_of
 
 _DAY_NS = 86_400e9
-_UNTIL = 'rests until '  # in the name of an update's source, before the time of the last rest
+# Texts in the name of an update's source.
+_UNTIL = 'rests until '  # before the time of the last rest
 _AGED = ', claim aged '  # before the number of days of ageing that the covariance includes
 
 

@@ -34,7 +34,7 @@ def sha256(content: str | bytes) -> str:
 
 @dataclass(frozen=True)
 class FleetOptions:
-    """Options of the fits of all units; the bags replace `serial` and `input` of `fit`."""
+    """Options of the fits of all units; the bags determine `serial` and `input` of `fit`."""
 
     fit: FitOptions
     topics: Topics | None = None

@@ -70,8 +70,8 @@ class Effect(ABC):
 class PartEffect(Effect):
     """
     Temperature coefficient of a part, or stress or thermo-EMF between two parts. The two signals
-    are the temperature d of `part` less that in the reference state [K], and d^2; each less the
-    same of the part `cold`, if given.
+    are the temperature d of `part` less that in the reference state [K], and d^2; if a part `cold`
+    is given, each less the signal of `cold`.
     """
 
     part: str

@@ -96,7 +96,7 @@ class ThermalNetwork:
         return A, b, p
 
     def convection(self, state: Floats, air: float) -> Floats:
-        """Return the nonlinear part of ``dx/dt``, by paths with an exponent not 1, shape (k,)."""
+        """Return the part of ``dx/dt`` by which heat paths are nonlinear, shape (k,)."""
         index, at = self._places, np.append(state, air)
         flow = np.zeros(len(at))
         for link in self.links:

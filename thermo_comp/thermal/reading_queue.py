@@ -34,7 +34,7 @@ class ReadingQueue:
         return self._entries[0][0] if self._entries else NEVER_NS
 
     def push(self, name: str, stamp_ns: int, celsius: float) -> list[str]:
-        """Add a reading; return the thermometer of each dropped reading (full, other clock)."""
+        """Add a reading; return the thermometers of readings dropped: full queue or new clock."""
         dropped = []
         last_ns, self._last_ns[name] = self._last_ns.get(name, -NEVER_NS), stamp_ns
         if stamp_ns < last_ns - DISORDER_NS:

@@ -25,10 +25,10 @@ from .settings import OBVIOUS_SHARE, DetectorSettings, ThermometerSettings
 from .thermometer import Thermometer
 
 HOLD_LAGS: Final = 0.75  # shortest duration of the dynamic state / lag of the leading sensor
-# Number of its sds by which a rate must be below a limit: only 0.5, because in a soak most of
+# Number of sds of a rate by which it must be below a limit: only 0.5, because in a soak most of
 # the variance of the rate is an allowance for a ramp that may begin at any time.
 SURE_SIGMAS: Final = 0.5
-OBVIOUS_SIGMAS: Final = 5.0  # number of its sds by which a rate must exceed a limit
+OBVIOUS_SIGMAS: Final = 5.0  # number of sds of a rate by which it must exceed a limit
 FIRST_READINGS: Final = 20  # number of readings from which the noise estimate is reliable
 
 
@@ -191,9 +191,9 @@ class _Watch:
         return -limit < ahead < limit
 
 
-def _obvious(sensor: Thermometer, rate: float) -> int:
-    """Return the sign of a sensor's rate if it exceeds `rate` by `OBVIOUS_SIGMAS` sd, else 0."""
-    margin = abs(sensor.rate) - rate
+def _obvious(sensor: Thermometer, limit: float) -> int:
+    """Return the sign of a rate that exceeds a limit by `OBVIOUS_SIGMAS` sd, 0 for other rates."""
+    margin = abs(sensor.rate) - limit
     if margin > 0.0 and margin * margin > OBVIOUS_SIGMAS**2 * sensor.var_rate:
         return 1 if sensor.rate > 0.0 else -1
     return 0

@@ -134,7 +134,7 @@ class ThermalTracker:
             memory.board_step(stamp_ns, board.temperature, error)
             age_s = (stamp_ns - (memory.board.start_ns or 0)) * 1e-9
             if age_s <= max(self._board_lag_s, board.settings.lag_s):
-                # The board's rate shows a ramp that began before the start within the board's lag.
+                # A ramp that began before the start shows in the board's rate within this time.
                 rate = abs(board.rate)
                 memory.sure_rate = max(memory.sure_rate, rate - 2.0 * sqrt(board.var_rate))
                 memory.start_rate = max(memory.sure_rate, rate)
@@ -164,7 +164,7 @@ class ThermalTracker:
         n_before, has_jumped = sensor.n_in_row, check.fault is Fault.STEP
         is_rejected = not check.admits(stamp_ns, celsius)
         if is_rejected:
-            # Restart the estimate if all readings of the time-out were rejected as steps.
+            # Restart the estimate if all readings during the time-out were rejected as steps.
             age_s = 0.0 if before_ns is None else (stamp_ns - before_ns) * 1e-9
             config, is_board = self.config, sensor is self.board
             timeout_s = config.temperature_timeout_s if is_board else config.case_timeout_s
