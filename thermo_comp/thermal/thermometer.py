@@ -301,16 +301,11 @@ def mix(state: State, other: State, share: float) -> State:
     apart = share * (1.0 - share)
     at, av = apart * dt, apart * dv
     return (
-        t + share * dt,
-        v + share * dv,
-        a + share * da,
-        p00 + share * (r00 - p00) + at * dt,
-        p01 + share * (r01 - p01) + at * dv,
-        p02 + share * (r02 - p02) + at * da,
-        p11 + share * (r11 - p11) + av * dv,
-        p12 + share * (r12 - p12) + av * da,
-        p22 + share * (r22 - p22) + apart * da * da,
-    )
+        t + share * dt, v + share * dv, a + share * da,
+        p00 + share * (r00 - p00) + at * dt, p01 + share * (r01 - p01) + at * dv,
+        p02 + share * (r02 - p02) + at * da, p11 + share * (r11 - p11) + av * dv,
+        p12 + share * (r12 - p12) + av * da, p22 + share * (r22 - p22) + apart * da * da,
+    )  # fmt: skip
 
 
 def predict(state: State, dt: float, lag: float, power: float) -> State:
