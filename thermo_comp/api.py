@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the functions for scripts that work on arrays: read a recording, correct, fit a calibration.
+Owns the functions for scripts: read a recording as arrays, correct samples, fit a calibration.
 
 Times are seconds since any origin, or datetime64. Anything that numpy converts to an array is
 accepted: lists, pandas columns, xarray arrays.
@@ -55,8 +55,8 @@ class Columns:
     name : str, optional
         Name of the recording in messages.
     specific_force : str, optional
-        |f| of rests that are not at 1 g, written as in a bag's metadata; if empty, |f| at rest is
-        gravity.
+        Known |f| of rests, in the form of the key `specific_force_magnitude_m_s2` of a bag's
+        metadata; if empty, |f| at rest is gravity.
 
     """
 
@@ -103,7 +103,7 @@ def correct(
     **sensors: Temperature,
 ) -> Corrected:
     """
-    Correct arrays of samples, to the same bits as the node and ``replay`` at equal stamps.
+    Correct arrays of samples; the node and ``replay`` give the same bits at equal stamps.
 
     Parameters
     ----------
@@ -254,10 +254,9 @@ def fit(
                 nothing: Temperature = ([], [])
                 readings = {'board': nothing, 'case': nothing, **item.temperatures}
                 block = _block(item.time_s, item.counts, readings, item.start_ns)
-                text = item.specific_force
-                known = KnownForce(item.name, parse_sections(text)) if text else None
-                source = FitSource(item.name, partial(list, [block]), None, item.serial, known)
-                sources.append(source)
+                name, text = item.name, item.specific_force
+                known = KnownForce(name, parse_sections(text)) if text else None
+                sources.append(FitSource(name, partial(list, [block]), None, item.serial, known))
         return run(sources, FitOptions(gravity=gravity, **options)).calibration
 
 
@@ -275,9 +274,8 @@ def _block(
     readings = {}
     for name, value in given.items():
         reading_ns, celsius = _readings(name, value, stamps, _is_date(time_s))
-        readings[name] = Readings(
-            reading_ns + start_ns, celsius, np.searchsorted(stamps, reading_ns)
-        )
+        first = np.searchsorted(stamps, reading_ns)
+        readings[name] = Readings(reading_ns + start_ns, celsius, first)
     return Block(stamps + start_ns, samples, '', None, readings, {})
 
 

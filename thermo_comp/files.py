@@ -28,10 +28,10 @@ _INDEX = 'metadata.yaml'
 
 @dataclass(frozen=True)
 class Kind:
-    """The kind of an output: files are recognised by their first bytes, folders by file names."""
+    """The kind of an output, by which an existing file or folder of this kind is recognised."""
 
     name: str
-    mark: bytes
+    mark: bytes  # regular expression of the first bytes of a file, or of the names in a folder
     is_folder: bool = False
     suffixes: tuple[str, ...] = ()  # accepted file suffixes; an empty tuple accepts any suffix
 
@@ -66,16 +66,14 @@ BAG = Kind('rosbag2 directory', rb'\A(metadata\.yaml|.+\.(mcap|db3)(\.zstd)?)\Z'
 
 
 def bag_kind(path: str | Path, others: str = '') -> Kind:
-    """Return the kind of an output bag by its suffix; `others`: endings to name in an error."""
+    """Return the kind of an output bag by its suffix; an error names *.mcap, then `others`."""
     suffix = Path(path).suffix
     if suffix == '.mcap':
         return MCAP
     if suffix[1:2].isalpha():
-        raise OutputError(
-            f'cannot be written: {suffix} is none of the endings *.mcap{others}; a name without '
-            'an ending makes a folder',
-            path,
-        )
+        endings = f'{suffix} is none of the endings *.mcap{others}'
+        text = f'cannot be written: {endings}; a name without an ending makes a folder'
+        raise OutputError(text, path)
     return BAG
 
 
@@ -116,20 +114,17 @@ def read_bounded(path: str | Path, limit: int, within: Path | None = None) -> by
 def check_output(
     path: str | Path, kind: Kind, *, overwrite: bool = False, others: Iterable[str | Path] = ()
 ) -> None:
-    """Refuse an output that may not be written, or is, contains or lies in one of `others`."""
+    """Raise OutputError if an output may not be written, or overlaps with a path of `others`."""
     target = Path(os.path.realpath(path))
     for other in others:
         if _overlaps(target, Path(os.path.realpath(other))):
-            raise OutputError(
-                f'is, contains or lies in {other}, which the command needs: choose another output',
-                path,
-            )
+            text = f'is, contains or lies in {other}, which the command needs'
+            raise OutputError(f'{text}: choose another output', path)
     suffix = target.suffix.lower()
     if kind.suffixes and suffix[1:2].isalpha() and suffix not in kind.suffixes:
-        names = ' or '.join(f'*{suffix}' for suffix in kind.suffixes)
-        raise OutputError(
-            f'cannot be written: its name must end in {names}, not in {suffix}', path
-        )
+        names = ' or '.join(f'*{wanted}' for wanted in kind.suffixes)
+        text = f'cannot be written: its name must end in {names}, not in {suffix}'
+        raise OutputError(text, path)
     if target.exists():
         if not overwrite:
             raise OutputError('exists already; --force overwrites it', path)
@@ -192,7 +187,7 @@ class Draft:
     def _move_folder(self) -> None:
         old = None
         if self._is_replacing and self._target.exists():
-            # Rename the old folder first: the operating system only replaces an empty folder.
+            # Rename the old folder first, because a folder can only replace an empty folder.
             old = self._target.rename(_hidden_sibling(self._target))
         try:
             self.partial.rename(self._target)

@@ -24,8 +24,8 @@ DEPTH_LIMIT = 12  # largest number of nested lists and mappings
 #: Largest number of keys, values, lists and mappings of a file: three times the number in a file
 #: with all columns of `unit.columns.bank` for two thermometers, except the kind `bend`.
 NODE_LIMIT = 20_000
-# Size limit of YAML files written by hand [bytes]; usual files have a few kB.
-_FILE_LIMIT = 1 << 16
+_FILE_LIMIT = 1 << 16  # size limit of YAML files written by hand [bytes]; usual: a few kB
+_INVALID = 'not valid YAML'
 _INTEGER_DIGITS = 20  # digits of the longest integer accepted; a float64 needs no more
 _INTEGER = re.compile(r'[-+]?[0-9]+')
 _FLOAT = re.compile(r'[-+]?(?:(?:[0-9]+\.[0-9]*|\.[0-9]+|[0-9]+)(?:[eE][-+]?[0-9]+)?|\.inf)|\.nan')
@@ -38,8 +38,7 @@ class PlainYamlError(ValueError):
 
     def __init__(self, problem: str, line: int | None = None, detail: str = '') -> None:
         where = '' if line is None else f' (line {line})'
-        # The error message for users who may not read the file: without `detail`.
-        self.rule = f'{problem}{where}'
+        self.rule = f'{problem}{where}'  # the message for users who may not read the file
         super().__init__(f'{problem}: {detail}{where}' if detail else self.rule)
 
 
@@ -51,9 +50,9 @@ def load_plain_yaml(text: str | bytes, node_limit: int = NODE_LIMIT) -> Any:
         mark = getattr(error, 'problem_mark', None)
         problem = getattr(error, 'problem', None) or str(error).splitlines()[0]
         line = None if mark is None else mark.line + 1
-        raise PlainYamlError('not valid YAML', line, problem) from error
+        raise PlainYamlError(_INVALID, line, problem) from error
     except UnicodeEncodeError as error:
-        raise PlainYamlError('not valid YAML', detail=error.reason) from error
+        raise PlainYamlError(_INVALID, detail=error.reason) from error
 
 
 def read_plain_yaml(path: str | Path) -> Any:
@@ -69,7 +68,7 @@ def read_plain_yaml(path: str | Path) -> Any:
 
 
 def is_plain_text(text: str) -> bool:
-    """Whether this reader takes an unquoted scalar as a text."""
+    """Whether `load_plain_yaml` reads an unquoted scalar as a text."""
     return not (text in _WORDS or _INTEGER.fullmatch(text) or _FLOAT.fullmatch(text))
 
 
@@ -97,9 +96,9 @@ def _load(text: str | bytes, node_limit: int) -> Any:
         for key_event in inner:
             key, line = value(key_event, depth + 1), key_event.start_mark.line + 1
             if type(key) is not str:
-                raise _invalid(line, f'a key must be a text, got {key!r:.40}')
+                raise PlainYamlError(_INVALID, line, f'a key must be a text, got {key!r:.40}')
             if key in collected:
-                raise _invalid(line, f'the key {key!r:.60} occurs twice')
+                raise PlainYamlError(_INVALID, line, f'the key {key!r:.60} occurs twice')
             collected[key] = value(next(events), depth + 1)
         return collected
 
@@ -120,12 +119,9 @@ def _scalar(text: str, line: int) -> Any:
         return text
     if _INTEGER.fullmatch(text):
         if len(text) > _INTEGER_DIGITS:
-            raise _invalid(line, f'an integer of {len(text)} digits is not accepted')
+            detail = f'an integer of {len(text)} digits is not accepted'
+            raise PlainYamlError(_INVALID, line, detail)
         return int(text)
     if _FLOAT.fullmatch(text):
         return float(text.replace('.inf', 'inf').replace('.nan', 'nan'))
     return text
-
-
-def _invalid(line: int, detail: str) -> PlainYamlError:
-    return PlainYamlError('not valid YAML', line, detail)

@@ -69,10 +69,6 @@ def _nil_or(lower: float, upper: float, unit: str, why: str) -> Bounds:
     return Bounds(at_least=0.0, nil_or=lower, at_most=upper, unit=unit, why=why)
 
 
-def _up_to(upper: float, unit: str, why: str) -> Bounds:
-    return Bounds(at_least=0.0, at_most=upper, unit=unit, why=why)
-
-
 _PREPARED: dict[str, Bounds] = {
     # Bounds of the constants of the unit.
     'full scale': _positive(1e-6, 1e16, 'input units', 'float64 holds integers to 9e15'),
@@ -101,24 +97,26 @@ _PREPARED: dict[str, Bounds] = {
     'rate noise density': _positive(
         1e-12, 1e3, 'rad/s/sqrt(Hz)', 'from far below any sensor to 57000 deg/s'
     ),
-    'slow noise': _up_to(1e3, 'm/s^2/sqrt(h)', 'a random walk of 100 g in an hour'),
-    'rate slow noise': _up_to(1e3, 'rad/s/sqrt(h)', 'a random walk of 57000 deg/s in an hour'),
-    'deviation': _up_to(1e4, 'm/s^2', 'an sd of 1000 g is no information'),
-    'rate deviation': _up_to(1e3, 'rad/s', 'an sd of 57000 deg/s is no information'),
-    'misalignment deviation': _up_to(1.0, 'rad', 'an sd of 1 rad is no information'),
-    'nonlinearity': _up_to(1.0, 'g/g^2 or g/g^3', 'at the bound an axis reads 2 g at 1 g'),
+    'slow noise': _between(0.0, 1e3, 'm/s^2/sqrt(h)', 'a random walk of 100 g in an hour'),
+    'rate slow noise': _between(
+        0.0, 1e3, 'rad/s/sqrt(h)', 'a random walk of 57000 deg/s in an hour'
+    ),
+    'deviation': _between(0.0, 1e4, 'm/s^2', 'an sd of 1000 g is no information'),
+    'rate deviation': _between(0.0, 1e3, 'rad/s', 'an sd of 57000 deg/s is no information'),
+    'misalignment deviation': _between(0.0, 1.0, 'rad', 'an sd of 1 rad is no information'),
+    'nonlinearity': _between(0.0, 1.0, 'g/g^2 or g/g^3', 'at the bound an axis reads 2 g at 1 g'),
     # Bounds of the results of a fit, and of numbers of samples.
-    'error': _up_to(1e7, 'm/s^2', 'the largest full-scale force'),
-    'number': _up_to(1e15, '', 'a float64 holds integers up to 9e15 exactly'),
+    'error': _between(0.0, 1e7, 'm/s^2', 'the largest full-scale force'),
+    'number': _between(0.0, 1e15, '', 'a float64 holds integers up to 9e15 exactly'),
     'log evidence': _between(-1e15, 1e15, '', 'a sum over at most 1e15 samples'),
-    'deviation of a weight': _up_to(1e16, 'of the weight', 'the largest full scale'),
+    'deviation of a weight': _between(0.0, 1e16, 'of the weight', 'the largest full scale'),
     # Bounds of the settings of thermometers and of the regime detector.
     'reading noise': _positive(1e-6, 1e2, 'K', 'an sd above 100 K is no measurement'),
-    'quantum': _up_to(1e2, 'K', 'no sensor has coarser steps'),
+    'quantum': _between(0.0, 1e2, 'K', 'no sensor has coarser steps'),
     'ramp': _positive(1e-6, 1e5, 'K/min', 'from 1 K in two years to 100 K in 60 ms'),
     'false alarms': _positive(1e-12, 1e4, '1/h', 'from one alarm in 1e8 years to three a second'),
-    'ripple': _up_to(1e3, 'K', 'the ripple of any chamber is smaller'),
-    'dwell': _up_to(1e7, 's', 'no soak lasts four months'),
+    'ripple': _between(0.0, 1e3, 'K', 'the ripple of any chamber is smaller'),
+    'dwell': _between(0.0, 1e7, 's', 'no soak lasts four months'),
     # Bounds of the lengths of lists in a calibration file.
     'coefficients': Bounds(shortest=1, longest=12, why='powers up to t^11 follow any curve'),
     'knots': Bounds(longest=100, why='one knot per kelvin over 100 K'),
@@ -144,7 +142,7 @@ def refuse_impossible(value: Any) -> None:
     cls: type = type(value)
     for name, bounds in _bounds_of(cls).items():
         given = getattr(value, name)
-        is_optional = getattr(cls, name, 0) is None  # the default
+        is_optional = getattr(cls, name, 0) is None  # None is the default
         for bound in () if given is None and is_optional else bounds:
             if fault := bound.fault(given):
                 raise ValueError(f'`{name}` {fault}, got {given}')

@@ -6,8 +6,7 @@ Owns the offline run of the node: the correction of a whole bag into another bag
 The correction is the node's code, applied to blocks of samples instead of single samples. A
 temperature reading applies from the first sample that follows the reading in the bag and whose
 stamp is equal or later. The output equals, bit for bit, that of a node that receives the messages
-in the bag's order.
-Only one block of the bag is in memory at a time.
+in the bag's order. Only one block of the bag is in memory at a time.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -38,15 +37,16 @@ from .topics import FLAGS, IMU_OUT, OUTPUTS, TEMPERATURE, thermometer
 from .typing import Ints
 from .unit.calibration import Calibration
 
-# Quantiles of the board readings that are compared with the calibrated range, because single
-# readings may be wrong; largest excess over the range [K] that counts as thermometer noise.
-_BULK, _NOISE_K = (0.01, 0.99), 0.1
+# Quantiles of the board readings that are compared with the calibrated range: extreme readings may
+# be wrong.
+_BULK = 0.01, 0.99
+_NOISE_K = 0.1  # largest excess of a quantile over the range that counts as reading noise [K]
 _REGIMES = np.array(['unknown', 'static', 'dynamic'])
 
 
 @dataclass(frozen=True)
 class ReplayResult:
-    """Summary of a replay: its input and output, and the numbers of dropped messages."""
+    """Summary of a replay: input, output, numbers of samples and flags, changes of regime."""
 
     info: RecordingInfo
     output: Path
@@ -54,8 +54,7 @@ class ReplayResult:
     n_flags: int
     #: Stamp [ns] and value of the first regime flag, and of each flag unlike the flag before it.
     switches: list[tuple[int, bool]]
-    #: Warnings that the node would give: exchanged thermometers, temperatures outside the
-    #: calibrated range.
+    #: Warnings of exchanged thermometers, and of temperatures outside the calibrated range.
     notes: list[str]
 
 
@@ -148,8 +147,7 @@ def replay(
                 if progress is not None:
                     progress(compensator.counters.n_in / max(total, 1))
         notes = [SWAPPED] if is_swapped else []
-        if beyond:
-            notes.append(f'board temperature {beyond:+.2f} K {CONTINUED}')
+        notes += [f'board temperature {beyond:+.2f} K {CONTINUED}'] if beyond else []
         counters, changes = compensator.counters, switches(flags)
         return ReplayResult(reader.info, Path(output), counters, len(flags), changes, notes)
 
@@ -207,7 +205,7 @@ def _messages_of(
                 for topic, pack in FLAGS.items():
                     packed = [pack(*flag, serial) for flag in new]
                     writer.write_raw(topic.name, topic.type, times, packed)
-            # The log time of a copied input message is its stamp, as for the output messages.
+            # The log time of a copied input message is its stamp, as that of an output message.
             for role, messages in block.raw.items():
                 name = thermometer(role) if role in reader.fields else reader.topics[role]
                 kind = TEMPERATURE if role in reader.fields else reader.info.topics[name][0]
@@ -248,7 +246,7 @@ def _rows_of(table: AbstractContextManager[WriteRows]) -> Iterator[WriteBlock]:
 
 
 def _imu_of(block: Block, corrected: CompensatedBlock) -> ImuColumns | None:
-    """Return the Imu fields except force; a rate with the covariance[0] -1 stays uncorrected."""
+    """Return the Imu fields but the force; a rate with the covariance[0] -1 is not corrected."""
     if block.imu is None:
         return None
     imu = block.imu.take(corrected.index)

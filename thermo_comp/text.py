@@ -34,10 +34,9 @@ def hold_standard_streams() -> None:
 
 def keep_standard_output() -> None:
     """
-    Give `sys.stdout` a descriptor of its own; let descriptor 1 lead to standard error.
+    Give `sys.stdout` a descriptor of its own; redirect descriptor 1 to standard error.
 
-    Fast DDS prints its errors to descriptor 1, so that a line of it could stand before the JSON of
-    a command.
+    Fast DDS prints its errors to descriptor 1, where they would precede the JSON of a command.
     """
     sys.stdout.flush()
     results = os.dup(1)
@@ -48,7 +47,7 @@ def keep_standard_output() -> None:
 
 
 def valid_serial(serial: str) -> str:
-    """Return a serial that may go into files and onto screens, or raise ValueError."""
+    """Return a serial if it is one printable line of limited length, else raise ValueError."""
     if not serial or len(serial) > LONGEST_SERIAL or not serial.isprintable():
         shown = one_line(serial[:LONGEST_SERIAL])
         raise ValueError(

@@ -3,8 +3,8 @@
 """
 Owns the table of the node's ROS topics: name, type, QoS, serialization of the regime flags.
 
-Node, replay, recorders, player, bag writer and docs/ros_interface.md use the topics' table. A
-message is packed in little-endian CDR: 4 bytes of encapsulation, then the fields.
+Node, replay, recorders, player, bag writer and docs/ros_interface.md use this table. A message is
+serialized in little-endian CDR: 4 bytes of encapsulation, then the fields.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,8 @@ N_NUMBERS = {VECTOR3_STAMPED: 3, IMU: 37, TEMPERATURE: 2}
 
 _ENCAPSULATION = b'\0\1\0\0'
 
-#: Serializes a regime flag: stamp of the deciding reading [ns], whether dynamic, unit's serial.
+#: Serializes the regime, given the stamp [ns] of the reading that decided it, whether it is
+#: dynamic, and the serial of the unit.
 PackFlag = Callable[[int, bool, str], bytes]
 
 
@@ -98,9 +99,7 @@ STAMPED = NodeTopic(
 )
 STATUS = NodeTopic('/diagnostics', DIAGNOSTICS, '1 Hz; hardware_id = serial of the unit', 10)
 
-#: Sample topics by the value of the parameter `input`; all input topics by their keys in `Topics`.
-SAMPLES = {'counts': COUNTS, 'imu': IMU_IN}
-INPUTS = {**SAMPLES, 'board': BOARD, 'case': CASE}
-#: Topics of the regime flags with their serializers; all topics that `replay` writes.
+SAMPLES = {'counts': COUNTS, 'imu': IMU_IN}  # sample topics by the parameter `input`
+INPUTS = {**SAMPLES, 'board': BOARD, 'case': CASE}  # all input topics by their keys in `Topics`
 FLAGS: dict[NodeTopic, PackFlag] = {REGIME: _bool_flag, STAMPED: _stamped_flag}
-OUTPUTS = (IMU_OUT, *FLAGS)
+OUTPUTS = (IMU_OUT, *FLAGS)  # the topics that `replay` writes

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -30,29 +31,24 @@ from ..unit.calibration import Calibration
 from ..unit.gravity import MICRO_G
 from .series import RestSeries
 
-#: Prior medians relative to the prior median of the turn-on offset's sd: sd of the random walks of
-#: bias and of scale times g, per root day; sd of the scatter of rests. Prior sd of the natural
-#: logarithm of each sd in `Ageing` (1 sd is a factor of 5).
-_WALK_SHARE, _SCATTER_SHARE, _LOG_SD = 0.5, 0.3, 1.6
-#: Smallest prior median of the turn-on offset's sd [m/s^2].
-_LEAST_TURN_ON = 5.0 * MICRO_G
+_LEAST_TURN_ON = 5.0 * MICRO_G  # smallest prior median of the sd of the turn-on offset [m/s^2]
+_WALK_SHARE = 0.5  # sd of a random walk per root day / sd of the turn-on offset, prior medians
+_SCATTER_SHARE = 0.3  # sd of the scatter of rests / sd of the turn-on offset, prior medians
+_LOG_SD = 1.6  # prior sd of the natural logarithm of each sd in `Ageing`: a factor of 5
 #: Prior sds tried for a jump of biases and scales (times g), or of gravity [m/s^2].
 _JUMPS = (50.0 * MICRO_G, 500.0 * MICRO_G, 5000.0 * MICRO_G)
 #: Prior sd of a jump in the three biases, and in the three scales times g, relative to `_JUMPS`: a
 #: shock changes a scale times g less than a bias.
 _JUMP_SHARES = np.repeat([1.0, 0.1], 3)
-#: Smallest log Bayes factor at which a change is added to the model (odds 150:1), and smallest log
-#: Bayes factor of a jump of gravity against any other change (odds 20:1).
-_LEAST_GAIN, _LEAST_LEAD = 5.0, 3.0
-#: Prior standard deviations tried for a change of a curve's slope [m/s^2 per K].
-_BENDS = (1.0 * MICRO_G, 10.0 * MICRO_G)
+_LEAST_GAIN = 5.0  # smallest log Bayes factor of a change that is added (odds 150:1)
+_LEAST_LEAD = 3.0  # smallest log Bayes factor of a jump of gravity against other changes (20:1)
+_BENDS = (1.0 * MICRO_G, 10.0 * MICRO_G)  # prior sds tried for a change of slopes [m/s^2 per K]
 #: Random walk of the slopes of the bias curves [m/s^2 per K per root day]: after one year, its sd
 #: is the smallest of `_BENDS`.
 _SLOPE_WALK = _BENDS[0] / np.sqrt(365.25)
-#: Largest number of rows (equations) per start of the node, in the solution and in the search for
-#: the variances; largest number of rows of all starts in the search, whose computing time grows
-#: with the cube of this number.
-_ROWS, _SEARCH_ROWS, _MOST_ROWS = 6, 3, 600
+_ROWS = 6  # largest number of rows (equations) per start of the node, in the solution
+_SEARCH_ROWS = 3  # largest number of rows per start in the search for the variances
+_MOST_ROWS = 600  # largest number of rows in the search; computing time grows with their cube
 
 _Kind: TypeAlias = Literal['levels', 'gravity', 'curve']
 
@@ -60,7 +56,7 @@ _Kind: TypeAlias = Literal['levels', 'gravity', 'curve']
 @dataclass(frozen=True)
 class Ageing:
     """
-    Standard deviations of the ageing model [m/s^2], except for the ratio `lags`.
+    Standard deviations of the ageing model [m/s^2], and the ratio `lags`.
 
     bias, scale: sd of the random walk of the bias, and of the scale times g, per root day
     turn_on: sd of the bias offset of a start of the node
@@ -83,7 +79,7 @@ class Change:
 
     time: time of a jump; None for a change of the slopes, which holds for all rests
     sd: prior sd of the change of a level or of gravity [m/s^2], or of a slope [m/s^2 per K]
-    may_be_gravity: whether a jump of gravity explains the rests about as well as a jump of levels
+    may_be_gravity: whether a gravity jump explains the rests about as well as this jump of levels
     """
 
     kind: _Kind
@@ -107,9 +103,9 @@ class Rows:
     of the rests of a start, with all information of the rests about bias and scale.
 
     y, `by_...`, lack: combinations of ``|f| - g`` [m/s^2] and of the fields of `RestSeries`
-    noise, scatter: variance of the noise of a row, and factor of the scatter variance in a row
+    noise, scatter: variance of a row by noise; by scatter, relative to the variance for one rest
     rank: number of the row among the rows of its start, from 0
-    warmth: mean board temperature at the rests of a start less the reference temperature [K]
+    above_reference: mean board temperature of a start's rests less the reference temperature [K]
     """
 
     time: Floats
@@ -120,7 +116,7 @@ class Rows:
     by_gravity: Floats
     by_start: Floats
     lack: Floats
-    warmth: Floats
+    above_reference: Floats
     noise: Floats
     scatter: Floats
     rank: Ints
@@ -128,11 +124,11 @@ class Rows:
     @property
     def by_slope(self) -> Floats:
         """Derivatives of `y` by the slopes of the bias over temperature, (n, 3)."""
-        return np.asarray(self.by_level[:, :3] * self.warmth[:, np.newaxis])
+        return np.asarray(self.by_level[:, :3] * self.above_reference[:, np.newaxis])
 
     @property
     def by_jump(self) -> Floats:
-        """Derivatives of `y` by jumps: levels (times `_JUMP_SHARES`) and gravity, (n, 7)."""
+        """Derivatives of `y` by levels, times `_JUMP_SHARES`, and by gravity, (n, 7)."""
         return np.column_stack((self.by_level * _JUMP_SHARES, self.by_gravity))
 
     def at(self, chosen: Bools) -> Rows:
@@ -141,7 +137,7 @@ class Rows:
 
 
 def rows_of(series: RestSeries, scatter: float) -> Rows:
-    """Return the equations of rests, weighted by noise and by the sd `scatter` [m/s^2]."""
+    """Combine the rests of each start to `Rows`; `scatter`: sd of the scatter of rests [m/s^2]."""
     parts: list[list[Floats]] = []
     variance = series.noise + (series.by_start**2).sum(axis=1) + scatter**2
     for start in np.unique(series.start):
@@ -152,12 +148,12 @@ def rows_of(series: RestSeries, scatter: float) -> Rows:
             Q = np.linalg.svd(series.by_level[at] * weight[:, np.newaxis], full_matrices=False)[0]
         # Orthonormal columns of Q turn n equal rests into the equation of one rest times sqrt(n).
         Q = Q * weight[:, np.newaxis]
-        n, warmth = Q.shape[1], series.temperature[at].mean() - series.reference_temperature
+        n, t = Q.shape[1], series.temperature[at].mean() - series.reference_temperature
         # A change of gravity changes |f| by the same value in all attitudes.
-        levels = (series.by_parameter, series.by_level, np.ones(len(series)))
-        summed = (series.residual, *levels, series.by_start, series.lack)
+        derivatives = (series.by_parameter, series.by_level, np.ones(len(series)), series.by_start)
+        summed = (series.residual, *derivatives, series.lack)
         part = [np.full(n, series.time[at].mean()), np.full(n, start)]
-        part += [*(Q.T @ column[at] for column in summed), np.full(n, warmth)]
+        part += [*(Q.T @ column[at] for column in summed), np.full(n, t)]
         parts.append([*part, (Q**2).T @ series.noise[at], (Q**2).sum(axis=0), np.arange(n)])
     rows = Rows(*[np.concatenate(part) for part in zip(*parts, strict=True)])
     searched = rows.start[rows.rank < _SEARCH_ROWS]
@@ -191,9 +187,10 @@ class Model:
         ]
         # The correlation of the lack of fit at two temperatures is a Gaussian function of their
         # difference, with an sd of 10 K.
-        near = np.exp(-0.5 * (np.subtract.outer(rows.warmth, rows.warmth) / 10.0) ** 2)
+        t = rows.above_reference
+        correlation = np.exp(-0.5 * (np.subtract.outer(t, t) / 10.0) ** 2)
         self.base = rows.by_parameter @ self.prior @ rows.by_parameter.T
-        self.base += near * (rows.lack @ rows.lack.T) + np.diag(rows.noise)
+        self.base += correlation * (rows.lack @ rows.lack.T) + np.diag(rows.noise)
         self.base += _SLOPE_WALK**2 * elapsed * (rows.by_slope @ rows.by_slope.T)
         for change in changes:
             columns = change.columns(rows)
@@ -207,7 +204,7 @@ class Model:
         return result
 
     def fitted(self, centre: Ageing) -> tuple[Ageing, Floats]:
-        """Return the sds of largest posterior density, and the inverse covariance of `rows.y`."""
+        """Return the most probable sds, and the inverse covariance of `rows.y` for these sds."""
         middle = np.log(list(vars(centre).values()))
 
         def loss(logs: Floats) -> tuple[float, Floats]:
@@ -221,7 +218,7 @@ class Model:
             return float(value), np.array(slope) + shift / _LOG_SD
 
         # The gradient of the evidence is almost 0 where a variance is small, so the search begins
-        # at two points: with most of the scatter due to the turn-ons, or due to the random walks.
+        # at two points: most of the steps between starts are due to turn-ons, or to random walks.
         steps = np.abs(np.diff(self.rows.y[self.rows.rank == 0]))
         step = max(float(np.median(steps)), centre.rest)
         bounds = middle - 5.0 * _LOG_SD, middle + 5.0 * _LOG_SD
@@ -253,7 +250,7 @@ class Model:
 
 
 def usual(calibration: Calibration) -> Ageing:
-    """Return prior medians of `Ageing` from the fit's residual sd, else from the noise."""
+    """Return the prior medians of `Ageing` by the fit's residual sd or, without it, the noise."""
     residual = max(axis.residual_sd_m_s2 for axis in calibration.static.axes())
     turn_on = max(residual or max(calibration.noise_density_m_s2_sqrt_hz), _LEAST_TURN_ON)
     walk = _WALK_SHARE * turn_on
@@ -275,26 +272,24 @@ def learn(
     for _ in range(2):
         used = series.at(is_used)
         rows = rows_of(used, centre.rest)
-        few = rows.at(rows.rank < _SEARCH_ROWS)
+        searched = rows.at(rows.rank < _SEARCH_ROWS)
         changes: tuple[Change, ...] = ()
         while True:
-            model = Model(few, calibration, since, changes)
+            model = Model(searched, calibration, since, changes)
             ageing, inverse = model.fitted(centre)
             best = _best(_candidates(model, inverse), is_gravity_certain)
             if best is None or len(changes) == 4:
                 break
             changes += (best,)
-        everything = Model(rows, calibration, since, changes)
-        inverse = everything.inverse(ageing)
-        left_out = (inverse @ rows.y) / np.sqrt(np.diag(inverse))
-        bad = rows.start[np.abs(left_out) > 5.0]
-        at = np.flatnonzero(is_used)
-        is_bad = np.isin(used.start, bad)
+        model = Model(rows, calibration, since, changes)
+        inverse = model.inverse(ageing)
+        deviation = (inverse @ rows.y) / np.sqrt(np.diag(inverse))  # from the prediction, in sd
+        is_outlier = np.isin(used.start, rows.start[np.abs(deviation) > 5.0])
         # If more than 10 % of the rests would be left out, the model is wrong: keep all rests.
-        if not len(bad) or is_bad.sum() > 0.1 * len(used):
+        if not 0 < is_outlier.sum() <= 0.1 * len(used):
             break
-        is_used[at[is_bad]] = False
-    return ageing, everything, used
+        is_used[np.flatnonzero(is_used)[is_outlier]] = False
+    return ageing, model, used
 
 
 def _best(candidates: Iterable[Change], is_gravity_certain: bool) -> Change | None:
@@ -302,20 +297,18 @@ def _best(candidates: Iterable[Change], is_gravity_certain: bool) -> Change | No
     Return the most probable `Change`, or None if no log Bayes factor reaches `_LEAST_GAIN`. The
     log Bayes factor of a gravity jump must exceed that of any other change by `_LEAST_LEAD`.
     """
-    every = list(candidates)
-    of_gravity = [change for change in every if change.kind == 'gravity']
-    gravity = None if is_gravity_certain else max(of_gravity, key=_gain, default=None)
-    other = max((change for change in every if change.kind != 'gravity'), key=_gain, default=None)
-    lead = _gain(gravity) - max(_gain(other), 0.0)
-    if gravity is not None and lead >= _LEAST_LEAD and _gain(gravity) >= _LEAST_GAIN:
+    gravity = other = Change('levels', None, 0.0, log_bayes_factor=-np.inf)
+    for change in candidates:
+        if change.kind != 'gravity':
+            other = max(other, change, key=attrgetter('log_bayes_factor'))
+        elif not is_gravity_certain:
+            gravity = max(gravity, change, key=attrgetter('log_bayes_factor'))
+    lead = gravity.log_bayes_factor - max(other.log_bayes_factor, 0.0)
+    if lead >= _LEAST_LEAD and gravity.log_bayes_factor >= _LEAST_GAIN:
         return gravity
-    if other is None or _gain(other) < _LEAST_GAIN:
+    if other.log_bayes_factor < _LEAST_GAIN:
         return None
     return replace(other, may_be_gravity=other.kind == 'levels' and lead > -_LEAST_LEAD)
-
-
-def _gain(change: Change | None) -> float:
-    return -np.inf if change is None else change.log_bayes_factor
 
 
 def _candidates(model: Model, inverse: Floats) -> Iterator[Change]:
@@ -384,7 +377,7 @@ def solve(model: Model, ageing: Ageing, to_file: Floats, bend: Floats, ahead: fl
     Condition the parameters of the calibration on the rests.
 
     `to_file`, `bend`: derivatives of the n file parameters by the six levels of `Change`, (n, 6),
-    and by the bias slope of each axis, (n, 3); `ahead`: days of use after the last rest
+    and by the bias slope of each axis, (n, 3); `ahead`: days of use after the last rest.
     """
     rows = model.rows
     age = np.maximum(rows.time - model.since, 0.0)[:, np.newaxis]

@@ -20,8 +20,7 @@ from ..online.checks import LARGEST_CHANGE, SCATTER_FACTOR, SMALLEST_WINDOW
 from ..typing import Floats, Stamps
 from .rest import Rest
 
-#: Shortest length of a window of a rest [s].
-SECONDS = 10
+SECONDS = 10  # shortest length of a window of a rest [s]
 #: Largest step from one second with samples to the next within a window [s]: at 1 Hz, jitter of
 #: the stamps leaves some seconds without a sample.
 _LARGEST_STEP = 2
@@ -29,8 +28,7 @@ _SECOND_NS = 1_000_000_000
 #: Pairs (k, n): from the window number k of a rest on, every n-th window is kept.
 _SPACING = ((360, 30), (60, 6), (0, 1))
 
-
-#: Thermal state, and remaining fractions of the unknown initial lag states.
+#: Thermal state, and the fraction of each lag's unknown initial state that has not yet decayed.
 _State = tuple[Sequence[float], Sequence[float]]
 #: Returns the present thermal state, or None while the samples cannot be corrected.
 StateNow = Callable[[], _State | None]
@@ -38,7 +36,7 @@ StateNow = Callable[[], _State | None]
 
 @dataclass
 class _Cell:
-    """Sums over the samples of seconds `begin` to `last`, each less the first one, `origin`."""
+    """Sums, over the seconds `begin` to `last`, of each sample less the first sample, `origin`."""
 
     begin: int
     last: int
@@ -104,7 +102,7 @@ class RestFinder:
             if self._n_windows % spacing == 0:
                 rests.append(self._window())
             self._n_windows += 1
-            # The next window's first cell is compared with the finished window's last cell.
+            # Keep the window's last cell, with which the next window's first cell is compared.
             self._run, self._last = [], [cell]
         if not is_followed:
             self._forget()

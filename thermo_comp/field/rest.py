@@ -20,7 +20,6 @@ from ..thermal.state import StateLayout
 
 #: Suffix of the files of a rest log; the name of a file is the day, as in 2026-11-25.rests.
 SUFFIX = '.rests'
-
 #: First two bytes after the checksum, in the line of a node start and in the line of a rest.
 _OF_START, _OF_REST = b' {', b' ['
 
@@ -28,9 +27,9 @@ _OF_START, _OF_REST = b' {', b' ['
 @dataclass(frozen=True)
 class Start:
     """
-    A start of the node; a new calibration or gravity makes another `Start` of equal `start_ns`.
-
-    `start_ns` identifies a start of the node; it is no date, as the clock may be set later.
+    A start of the node, with unit, gravity, thermal state and the calibration's SHA-256. After a
+    change of calibration or gravity the log has another `Start` with the same `start_ns`, which
+    identifies the start of the node and is no date, because the clock may be set later.
     """
 
     start_ns: int
@@ -46,8 +45,8 @@ class Rest:
     """
     A window of samples at rest. `stamp_ns`: stamp of the window's middle; `n`: number of samples;
     `mean`, `sd`: of the samples [input units]; `state`: mean thermal state, in the order of the
-    `StateLayout` of `Start.memory`; `shares`: fraction of the unknown initial state of
-    each lag that has not yet decayed; `rate`: mean angular rate [rad/s], empty if unknown.
+    `StateLayout` of `Start.memory`; `shares`: fraction of the unknown initial state of each lag
+    that has not yet decayed; `rate`: mean angular rate [rad/s], empty if unknown.
     """
 
     stamp_ns: int
@@ -67,8 +66,8 @@ def encode(record: Start | Rest) -> bytes:
         sensors, lags, plays, *newer = vars(record.memory).values()
         while newer and not newer[-1]:
             newer.pop()
-        memory = [sensors, *([_shortened(each) for each in all_] for all_ in (lags, plays))]
-        data: Any = {**vars(record), 'memory': [*memory, *newer]}
+        memory = [sensors, list(map(_shortened, lags)), list(map(_shortened, plays)), *newer]
+        data: Any = {**vars(record), 'memory': memory}
     else:
         # Nine digits resolve 0.01 counts of a 24-bit converter.
         data = [
@@ -141,8 +140,7 @@ def _quantity(cls: type[Any], values: Sequence[Any]) -> Any:
 
 
 def _number(value: float) -> float:
-    # Numbers of 1e12 or more, far above any sample, are invalid.
-    if not abs(value) < 1e12:
+    if not abs(value) < 1e12:  # a larger number is invalid: it is far above any sample
         raise ValueError(value)
     return float(value)
 
@@ -161,7 +159,7 @@ def counted_rests(content: bytes) -> int:
 
 def thinned(content: bytes) -> bytes:
     """
-    Keep the node starts of a log and the first, third, fifth ... rest after each start; drop all
+    Keep the lines of node starts, and of the first, third, fifth ... rest after each; drop all
     other lines. Checksums are not verified.
     """
     kept: list[bytes] = []
@@ -179,10 +177,9 @@ def rests_of(
     contents: Iterable[bytes], is_wanted: Callable[[Start], bool]
 ) -> tuple[list[tuple[Start, Rest]], int]:
     """
-    Decode several files into rests without duplicates, sorted by start, then by stamp.
-
-    The node's starts are sorted by the stamp of their last rest: `start_ns` and the first stamps
-    of a start may be from the time before the computer set its clock.
+    Decode files into rests without duplicates, and the number of damaged lines. The rests are
+    sorted by start, then by stamp; starts are sorted by the stamp of their last rest, because
+    `start_ns` and the first stamps may be from the time before the computer set its clock.
     """
     everything: dict[tuple[int, int], tuple[Start, Rest]] = {}
     n_damaged = 0

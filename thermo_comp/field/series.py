@@ -4,11 +4,10 @@
 Owns rests as measurements of the error of a calibration: ``|f| - g`` and its derivatives.
 
 A rest at an unknown attitude measures one number, |f|. Let x be the forces along the axes, f = M
-x and u = f / |f|. A bias of axis i that is too large by d_bias [input units], and a scale too
-large by d_scale [of K_i], change |f| by ``-(M^T u)_i (d_bias + K_i x_i d_scale) / scale_i``,
-x_i: force along axis i, scale_i: scale factor at the rest. To first order ``|f| - g`` is noise
-plus H times the errors of all parameters (true less calibrated); H: derivatives of |f| by these
-errors.
+x, u = f / |f| and v = M^T u. A bias of axis i that is too large by d_bias [input units], and a
+scale too large by d_scale [of K_i], change |f| by ``-v_i (d_bias + K_i x_i d_scale) / scale_i``;
+scale_i: scale factor of axis i at the rest. To first order ``|f| - g`` is noise plus H times the
+errors of all parameters (true less calibrated); H: derivatives of |f| by these errors.
 """
 
 from __future__ import annotations
@@ -38,9 +37,9 @@ from ..unit.provenance import Source
 from .rest import SUFFIX, Rest, Start, rests_of
 
 _DAY_NS = 86_400e9
-#: Texts in the name of an update's source: before the time of the last rest, and before the number
-#: of days of ageing by which the covariance was increased.
-_UNTIL, _AGED = 'rests until ', ', claim aged '
+# Texts in the name of an update's source.
+_UNTIL = 'rests until '  # before the time of the last rest
+_AGED = ', claim aged '  # before the number of days of ageing that the covariance includes
 
 
 @dataclass(frozen=True)
@@ -48,13 +47,17 @@ class RestSeries:
     """
     n rests in the order of the node's starts; accelerations and their sd in m/s^2.
 
-    `time`: days since 1970; `start`: number of the node's start, from 0; `direction`, `force`,
-    `by_parameter`: v, x and H, see this module's docstring; `gravity`: stated g; `residual`: ``|f|
-    - g``; `by_level`: derivatives of |f| w.r.t. the bias, and the scale times g, of each axis, (n,
-    6); `noise`: variance of |f| due to noise of samples, thermometers, regime; `by_start`:
-    derivatives of |f| w.r.t. unknown lag states at the start, scaled to unit variance; `lack`: sd
-    of the lack of fit of each axis times `direction`; `claim`: claimed sd of `residual`;
-    `n_windows`: number of windows averaged to a rest
+    time: days since 1970
+    start: number of the node's start, from 0
+    temperature, state: board temperature [degC]; mean thermal state, in the order of `StateLayout`
+    direction, force, by_parameter: v, x and H of this module's docstring
+    gravity, residual: stated g; ``|f| - g``
+    by_level: derivatives of |f| by the bias, and by the scale times g, of each axis, (n, 6)
+    noise: variance of |f| due to noise of samples, errors of thermometers and of the regime
+    by_start: derivatives of |f| by unknown lag states at the start, scaled to unit variance
+    lack: sd of the lack of fit of each axis times `direction`
+    claim: claimed sd of `residual`
+    n_windows: number of windows averaged to a rest
     """
 
     time: Floats
@@ -108,8 +111,8 @@ def read_rests(
 
     Returns the rests, a `Source` for the provenance of an update by these rests, and notes.
     `ahead`: number of days of ageing that the covariance of the update will include. Rests before
-    the date of the calibration are left out, unless all are before this date. Rests of an earlier
-    update are left out if `is_for_update`. Raises RecordingError if no rest remains.
+    the date of the calibration are left out, unless all are before this date. Rests that an
+    earlier update used are left out only if `is_for_update`. Raises RecordingError if none remain.
     """
     files: list[Path] = []
     for path in paths:
@@ -148,8 +151,9 @@ def read_rests(
     # An update states the time of its last rest in whole seconds, rounded down.
     first_ns = begin * _DAY_NS + 1e9 * is_update
     later = [(start, rest) for start, rest in rests if rest.stamp_ns > first_ns]
+    earlier = counted(len(rests) - len(later), 'window')
     if is_update and not is_for_update:
-        notes.append(f'{counted(len(rests) - len(later), "window")} were used by the last update')
+        notes.append(f'{earlier} were used by the last update')
     elif is_update and not later:
         raise RecordingError(
             'the calibration has been updated with all of these rests: update it again once the '
@@ -158,10 +162,7 @@ def read_rests(
         )
     elif later and len(later) < len(rests):
         day = np.datetime64(int(begin * 86400.0), 's')
-        notes.append(
-            f'{counted(len(rests) - len(later), "window")} before {day}, the date of the '
-            'calibration: left out'
-        )
+        notes.append(f'{earlier} before {day}, the date of the calibration: left out')
         rests = later
     digest = hashlib.sha256(b''.join(contents)).hexdigest()
     return rests, source_of(rests, digest, ahead), notes
@@ -279,8 +280,8 @@ def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
 
 def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
     """
-    Return the number of the group of each window; up to 60 consecutive windows form a group, and
-    are averaged to one rest.
+    Return the group of each window, a number from 0; up to 60 consecutive windows form a group,
+    and are averaged to one rest.
 
     The windows of a group belong to one start of the node and differ from the group's first window
     by less than 1e-3 in each component of the force's unit vector, and by less than 1 K on the
@@ -299,7 +300,7 @@ def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
 
 
 class _Geometry(NamedTuple):
-    """Thermal states, remaining shares of initial lag states, u = f / |f|, v = M^T u, forces x."""
+    """Thermal states, `Rest.shares`, and u, v and x of this module's docstring, for each rest."""
 
     states: Floats
     shares: Floats
@@ -322,8 +323,8 @@ def _uncertainty(
     weight, unknown = at.states[:, WEIGHT], at.states[:, UNKNOWN]
     regimes = np.array([1.0 - weight, weight])
     unexplained = correction.curves.unexplained(at.states[:, BOARD])
-    # The ageing model has terms for the residual sd and the lack of fit: subtract the variances of
-    # both from `slow`, for the set of the present regime or, in an unknown regime, for both sets.
+    # The ageing model has terms for the residual sd and the lack of fit: subtract their variances
+    # from `slow`, for the set of the present regime or, in an unknown regime, for both sets.
     of_sets = regimes + unknown * regimes[::-1]
     slow -= (at.v.T**2 * (of_sets[:, np.newaxis] * unexplained).sum(axis=0)).sum(axis=0)
     residual = [[a.residual_sd_m_s2**2 for a in part.axes()] for part in calibration.regime_sets()]

@@ -5,7 +5,8 @@ Owns the update of a calibration from rests in the field, and its score on left-
 
 A rest determines the error along gravity alone, so rests in few attitudes leave axes undetermined.
 An axis is updated only if the rests reduce the sd of a combination of its bias and scale by 40 %
-or more (from the sd that includes ageing). Undetermined axes keep their values, with larger sds.
+or more, compared with the sd after ageing without rests. Undetermined axes keep their values, and
+their sds include ageing.
 """
 
 from collections.abc import Sequence
@@ -29,10 +30,10 @@ from .series import RestSeries, last_rest, valid_since
 
 #: Conclusions that `--allow` excludes: gravity is not as stated; the rests are of another unit.
 OVERRIDES = ('gravity', 'unit')
-#: The rests of a node start are taken for those of another unit if their RMS of |f| - g exceeds
-#: this fraction of gravity (1 mg, as after a shock) and this number of claimed sds (some milli-g
-#: for a poor sensor).
-_LARGEST_PART, _LARGEST_SIGMAS = 1e-3, 30.0
+# The rests of a node start are taken for those of another unit if the RMS of |f| - g exceeds both
+# limits.
+_LARGEST_PART = 1e-3  # relative to gravity: 1 mg, as after a shock
+_LARGEST_SIGMAS = 30.0  # relative to the claimed sd: some milli-g for a poor sensor
 
 
 @dataclass(frozen=True)
@@ -41,12 +42,12 @@ class AxisChange:
     Changes of the bias and scale of an axis by an update, each with its posterior sd; for an axis
     that the rests do not determine, the changes are 0, and the sds include ageing but no rests.
 
-    bias: change of the bias at the mean temperature of the rests [m/s^2]
+    bias: change of the bias at the mean thermal state of the rests
     scale: relative change of the scale
     curve: change of the bias at the 90 % quantile of temperature less that at the 10 % quantile
     reading: change of the specific force by bias and scale, at the mean force of the rests
     claimed_sd: sd of the specific force that the old calibration claims
-    present_sd: sd of the specific force with the old calibration at the last rest, with ageing
+    present_sd: sd of the specific force with the old calibration, aged until the last rest
     All values but `scale` and `scale_sd` are in m/s^2.
     """
 
@@ -148,12 +149,12 @@ def update(
     shift, kept = solution.shift * determined, solution.shift * ~determined
     # The shift of a parameter that is not updated remains as an error: add its square.
     covariance = solution.posterior + solution.future + np.outer(kept, kept)
-    turn_on = float(np.hypot(ageing.turn_on, ageing.rest))
+    scatter = float(np.hypot(ageing.turn_on, ageing.rest))
     new = _shifted(calibration, shift, covariance)
     new = replace(
         new,
-        static=_with_residual(new.static, turn_on, by_axis),
-        dynamic=_with_residual(new.dynamic, turn_on, by_axis),
+        static=_with_residual(new.static, scatter, by_axis),
+        dynamic=_with_residual(new.dynamic, scatter, by_axis),
         provenance=_with_update(new.provenance, series, judged, source, created),
     )
     n_outliers = len(series) - len(used)
@@ -183,8 +184,8 @@ def _with_update(
 
 def _derivatives(calibration: Calibration) -> tuple[Floats, Floats]:
     """
-    Return the parameters' derivatives by bias and by scale times g of each axis, (n, 6), and by a
-    slope of each axis' bias [m/s^2 per K], (n, 3).
+    Return derivatives of the n parameters: by the bias and the scale times g of each axis, (n, 6),
+    and by the slope over temperature of the bias of each axis [m/s^2 per K], (n, 3).
     """
     layout, reference_c = parameter_layout(calibration), calibration.reference_temperature_c
     levels, slopes = np.zeros((layout.n_parameters, 6)), np.zeros((layout.n_parameters, 3))
@@ -242,7 +243,7 @@ def _axis_changes(
 
 
 def _judged(series: RestSeries, model: Model, solution: Solution, determined: Bools) -> Judged:
-    """Score, on each day (under 5 days: start), an update by the rests of earlier starts."""
+    """Score updates by earlier rests on the rests of each day or, below 5 days, of each start."""
     over, labels = 'days', series.day
     if len(np.unique(labels)) < 5:
         over, labels = 'starts', series.start
@@ -303,17 +304,17 @@ def _shifted(calibration: Calibration, shift: Floats, covariance: Floats) -> Cal
     return with_parameters(calibration, K, parameters, covariance)
 
 
-def _with_residual(part: RegimeSet, turn_on: float, changes: Sequence[AxisChange]) -> RegimeSet:
-    """Set each axis' residual sd to `turn_on`; an undetermined axis keeps a larger old sd."""
+def _with_residual(part: RegimeSet, scatter: float, changes: Sequence[AxisChange]) -> RegimeSet:
+    """Set the residual sd of each axis to `scatter`; an undetermined axis keeps a larger sd."""
     axes: dict[str, Any] = {}
     for axis, change in zip(part.axes(), changes, strict=True):
-        sd = turn_on if change.is_determined else max(turn_on, axis.residual_sd_m_s2)
+        sd = scatter if change.is_determined else max(scatter, axis.residual_sd_m_s2)
         axes[change.axis] = replace(axis, residual_sd_m_s2=sd)
     return replace(part, **axes)
 
 
 def change_texts(result: Update) -> list[str]:
-    """Return messages on the ageing, the jumps, and axes that the rests do not determine."""
+    """Return messages on ageing, jumps, undetermined axes and rests left out."""
     ageing = result.ageing
     lines = [
         f'random walk of the bias {ug_text(ageing.bias)}, of the scale '

@@ -22,17 +22,16 @@ from .ageing import Ageing
 from .series import RestSeries
 from .update import Update, update
 
-#: Largest RMS error that agrees with the claim, in claimed standard deviations.
-LIMIT = 2.0
+LIMIT = 2.0  # largest RMS error / claimed sd of a unit that is within its claim
 #: Number of days whose RMS of |f| - g decides the verdict: enough to average the turn-on bias
 #: offsets, and far less than the time in which a unit drifts to the limit.
 _WINDOW_DAYS = 7
-#: Smallest number of starts of the node whose attitudes the forecast uses.
-_LEAST_STARTS = 10
-#: Probabilities of the forecast, its horizon [days], and number of simulated random walks.
-_QUANTILES, _HORIZON, _WALKS = (0.1, 0.5, 0.9), 3650.0, 2000
-#: Width of a temperature class [K], and largest number of periods, in the tables of `Watch`.
-_CLASS_K, _PERIODS = 10.0, 30
+_LEAST_STARTS = 10  # smallest number of starts of the node whose attitudes the forecast uses
+_QUANTILES = 0.1, 0.5, 0.9  # probabilities of the forecast
+_HORIZON = 3650.0  # longest time that is forecast [days]
+_WALKS = 2000  # number of simulated random walks
+_CLASS_K = 10.0  # width of a temperature class in the table of `Watch` [K]
+_PERIODS = 30  # largest number of periods in the table of `Watch`
 
 
 @dataclass(frozen=True)
@@ -61,10 +60,10 @@ class Watch:
     days, periods, temperatures: rows by day, by period (at most 30), by class of temperature
     last: the last day with rests
     week: rows of the days with rests in the last week
-    recent: RMS over the last week divided by the limit, robust against one disturbed day
-    outside_since: first day of the present time outside the claim; None if the unit is within it
-    inside_since: first day after the last time outside the claim; None if there was no such time,
-        or if the unit is outside its claim
+    recent: RMS of |f| - g over the last week / the limit, robust against one disturbed day
+    outside_since: day since which the unit is outside its claim; None if it is within its claim
+    inside_since: day on which the unit was again within its claim; None if it was never outside,
+        or is outside
     forecast: quantiles (10, 50, 90 %) of the time from the last rest until the unit's error
         exceeds its claim [days]; infinite if later than ten years; () if unknown or exceeded
     interval: the same quantiles if the calibration is updated at the last rest
@@ -103,8 +102,8 @@ class Watch:
             how = f'again within its claim since {since}' if since else 'within its claim'
             text = f'the unit is {how} up to {self.last} ({week}); '
             if self.forecast:
-                when = 'on any day' if self.forecast[1] < 1.0 else self._date(1, 'about ')
-                text += f'forecast: it will leave its claim {when}'
+                when = 'on any day' if self.forecast[1] < 1.0 else self._date(1, 'on about ')
+                text += f'forecast: its error will exceed its claim {when}'
                 text += f' (10 to 90 %: {self._date(0)} .. {self._date(2)})'
             else:
                 text += 'a forecast needs rests of 3 starts of the node'
@@ -156,7 +155,7 @@ def watch(series: RestSeries, calibration: Calibration, tolerance: float | None 
         outside_since = next((row.name for row in window if not row.is_within), window[-1].name)
         forecast = ()
     elif (recent > 1.0).any():
-        # The index exists: a later week, or each of the last two days, is within the limit.
+        # A later row exists: a later week, or each of the last two days, is within the limit.
         until = int(np.flatnonzero(recent > 1.0)[-1])
         inside_since = days[int(np.flatnonzero(is_row_out[: until + 1])[-1]) + 1].name
     periods = _rows(series, firsts, ordered[::together].tolist(), tolerance)
@@ -171,8 +170,8 @@ def _smoothed(day: Ints, ratio: Floats) -> tuple[Ints, Floats]:
     """
     Return, for the week that ends on each day, the index of its first day and its RMS of `ratio`.
 
-    If a week has only one day with rests, the preceding day with rests is added. The largest daily
-    RMS of a week, perhaps of a disturbed day, is replaced by the second largest.
+    If a week has only one day with rests, the preceding day with rests is added. The largest
+    `ratio` of a week, perhaps of a disturbed day, is replaced by the second largest.
     """
     n = np.arange(len(day))
     first = np.searchsorted(day, day - _WINDOW_DAYS, side='right')
@@ -195,7 +194,7 @@ def _forecasts(
     is_recent = used.time > used.time[-1] - _WINDOW_DAYS
     recent = used.at(is_recent | (used.start > used.start[-1] - _LEAST_STARTS))
     share = recent.n_windows / recent.n_windows.sum()
-    # With e the errors of parameters, biases and scales, |root @ e| is the RMS of |f| - g.
+    # |root @ e| is the RMS of |f| - g due to the errors e of parameters, biases and scales.
     joined = np.hstack((recent.by_parameter, recent.by_level)) * np.sqrt(share)[:, np.newaxis]
     root = np.linalg.qr(joined, mode='r')
     of_parameters, of_levels = np.split(root, [recent.by_parameter.shape[1]], axis=1)

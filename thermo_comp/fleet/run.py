@@ -29,20 +29,17 @@ from .units import FoundUnit, Storage, find_units, folders_of_tables
 from .work import FleetOptions, UnitOutcome, connected, run, sha256
 
 PAGE, PRIOR = 'fleet.html', 'prior.yaml'
+CALIBRATION, CERTIFICATE, RESULT = 'calibration.yaml', 'certificate.html', 'result.json'
 _FORMAT = 3  # version of the format of `RESULT`
 _LONGEST_NAME = 100  # longest name of a folder of results [characters]
-# Largest number of units listed on the page of the fleet; fleet.csv lists all units.
-_MOST_ROWS = 60
+_MOST_ROWS = 60  # largest number of units listed on the fleet's page; fleet.csv lists all units
 # Verdicts on tests whose bags contradict the fit; a new fit with a prior would hide the fault.
-_CONTRADICTIONS = tuple(
-    kind.value for kind in (Verdict.RECALIBRATE, Verdict.NO_BETTER, Verdict.SWAPPED)
-)
-CALIBRATION, CERTIFICATE, RESULT = 'calibration.yaml', 'certificate.html', 'result.json'
+_CONTRADICTIONS = Verdict.RECALIBRATE.value, Verdict.NO_BETTER.value, Verdict.SWAPPED.value
 
 
 @dataclass(frozen=True)
 class FleetResult:
-    """The result of a run over a fleet: rows of the units sorted by name, statistics, files."""
+    """The result of a run over a fleet: rows of the table sorted by name, statistics, files."""
 
     rows: tuple[Row, ...]
     summary: Summary
@@ -80,8 +77,8 @@ def fit_fleet(
     Fit all units without a stored result. Raises ThermoCompError if the folder has no bag, a
     package is missing or the Dask cluster cannot be used, OutputError if a file cannot be written.
 
-    `progress` gets the numbers of finished and of all tests, first for the fits without a prior,
-    then for the fits with the prior.
+    `progress` is called with the numbers of finished and of all tests, first for the fits without
+    a prior, then for the fits with the prior. `earlier`: rows of tables of earlier runs.
     """
     _require_packages()
     storage = Storage(url)
@@ -116,15 +113,13 @@ def fit_fleet(
                 rows[name] = row if is_fitted(row) else {**rows[name], **kept}
     ordered = tuple(rows[unit.name] for unit in units)
     summary = summarise(ordered, earlier)
-    parquet, csv = write_tables(ordered, results.folder)
+    tables = write_tables(ordered, results.folder)
     page = results.folder / PAGE
     content = render_fleet(ordered, summary, results.certificate_of).encode()
     files.write_atomically(page, content, files.PAGE)
     prior_path = None if prior is None else results.folder / PRIOR
     skipped = folders_of_tables(storage)
-    return FleetResult(
-        ordered, summary, len(done), parquet, csv, page, prior_path, no_prior, skipped
-    )
+    return FleetResult(ordered, summary, len(done), *tables, page, prior_path, no_prior, skipped)
 
 
 def _require_packages() -> None:
@@ -137,8 +132,8 @@ def _require_packages() -> None:
 
 def lacks_data(row: Row) -> bool:
     """
-    Whether a unit's data are incomplete, so that the unit is fitted again with the prior of its
-    type. False for data that contradict themselves or the fit: a prior would hide the fault.
+    Whether a unit's data are incomplete, so that the unit is fitted again with the prior of the
+    fleet. False for data that contradict themselves or the fit: a prior would hide the fault.
     """
     return row['is_whole'] == 0 and row['verdict'] not in _CONTRADICTIONS
 
@@ -180,7 +175,7 @@ def render_fleet(
     }
     # A fleet of fewer than eight units is not searched for outliers: all limits are infinite.
     limits = [spread.limit for spread in summary.spreads]
-    is_comparable = any(map(np.isfinite, limits))
+    is_comparable = bool(np.isfinite(limits).any())
     figures = [report_figure(draw_shares, curves)] if fitted else []
     if is_comparable:
         labels = [spread.quantity.label for spread in summary.spreads]
@@ -202,7 +197,7 @@ def render_fleet(
 
 
 class Results:
-    """The folder of results, which is created; ThermoCompError if it cannot be created."""
+    """The folder of results, created if missing; ThermoCompError if this fails."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -212,7 +207,7 @@ class Results:
             raise ThermoCompError(f'{folder}: cannot be created: {error.strerror}') from error
 
     def folder_of(self, name: str, with_prior: object = False) -> Path:
-        """Return the folder of a unit's files, inside the folder of results for any name."""
+        """Return the folder of a unit's files; for any name it is inside the folder of results."""
         kind = 'with_prior' if with_prior else 'units'
         return self.folder.joinpath(kind, *map(_safe, name.split('/')))
 
@@ -222,7 +217,7 @@ class Results:
         return path.relative_to(self.folder).as_posix() if path.is_file() else ''
 
     def look_up(self, unit: FoundUnit, options: FleetOptions) -> Row | None:
-        """Return the stored row of a unit; None if bags, options or stored files differ."""
+        """Return the stored row of a unit; None if bags, options or stored files have changed."""
         folder = self.folder_of(unit.name, options.fit.prior)
         try:
             record = json.loads((folder / RESULT).read_bytes())
@@ -246,8 +241,8 @@ class Results:
             texts = (row['problem'], f'{folder / CALIBRATION} of an earlier run stays')
             return row_of(**{**row, 'problem': '; '.join(map(str, filter(None, texts)))})
         if outcome.calibration:
-            # The record is written last: until then the hash in the old record differs from that
-            # of the new calibration, so the unit counts as not fitted.
+            # The record is written last. Until then the old record has another hash than the new
+            # calibration, so the unit counts as not fitted.
             content = outcome.calibration.encode()
             files.write_atomically(folder / CALIBRATION, content, files.CALIBRATION)
             (folder / CERTIFICATE).unlink(missing_ok=True)

@@ -19,8 +19,7 @@ from .table import COLUMNS, Row, TableColumn, is_fitted
 
 # Probability of one or more false outliers, and of one or more false drifts, in a fleet.
 _FALSE_ALARMS = 0.05
-# Smallest number of units of a fleet that is searched for outliers.
-_UNITS_NEEDED = 8
+_UNITS_NEEDED = 8  # smallest number of units of a fleet that is searched for outliers
 # Efficiency of the median absolute deviation relative to the sample sd, for a normal distribution.
 _MAD_EFFICIENCY = 0.37
 # The data determine a unit's value if its sd by the fit is at most this multiple of the spread
@@ -36,11 +35,11 @@ _CONSTANTS = tuple(column for column in QUANTITIES if column.sd and '_slope_' no
 
 class Spread(NamedTuple):
     """
-    Spread of a quantity over the units about its median, and the distance `z` of each unit.
+    Spread of a quantity over the units about the median `middle`, and distance `z` of each unit.
 
     Only units whose data determine the quantity (`is_counted`) are used for `middle`, `sd` and
-    `limit`. A distance `z` is the deviation from the median divided by ``sqrt(sd^2 + s^2)``, s the
-    sd of the value by the unit's fit.
+    `limit`. A distance `z` is the deviation from the median divided by ``sqrt(sd^2 + s^2)``; s: sd
+    of the value by the unit's fit.
     """
 
     quantity: TableColumn
@@ -109,17 +108,13 @@ def summarise(rows: Sequence[Row], earlier: Sequence[Row] = ()) -> Summary:
         for spread in measured
     )
     serials = {str(row['name']): str(row['serial']) for row in fitted}
-    outliers = [
-        Outlier(
-            name, serials[name], column.label, value, spread.middle, z, column.unit, spread.limit
-        )
-        for spread in spreads
-        for column in [spread.quantity]
-        for name, value, z in zip(
-            spread.names, spread.values.tolist(), spread.z.tolist(), strict=True
-        )
-        if abs(z) > spread.limit
-    ]
+    outliers = []
+    for spread in spreads:
+        label, unit, middle = spread.quantity.label, spread.quantity.unit, spread.middle
+        for k in np.flatnonzero(np.abs(spread.z) > spread.limit):
+            name, value, z = spread.names[k], float(spread.values[k]), float(spread.z[k])
+            about = label, value, middle, z, unit, spread.limit
+            outliers.append(Outlier(name, serials[name], *about))
     wide = Verdict.WIDE.value
     # The verdict WIDE contains a number, which is replaced to count all such units together.
     texts = (str(row['verdict']) for row in rows)
@@ -161,8 +156,7 @@ def _determined(quantity: TableColumn, values: Floats, own_sd: Floats) -> Bools:
     """
     order = np.argsort(own_sd, kind='stable')
     n = len(values)
-    # Begin with the units of smallest sd: eight of them, or n // 2 + 1 if this is less.
-    first = min(_UNITS_NEEDED, n // 2 + 1)
+    first = min(_UNITS_NEEDED, n // 2 + 1)  # number of units whose spread is computed first
     n_counted = 0
     for k in range(first, n + 1):
         best = values[order[:k]]
@@ -176,7 +170,7 @@ def _determined(quantity: TableColumn, values: Floats, own_sd: Floats) -> Bools:
 
 
 def _deviations(quantity: TableColumn, values: Floats, middle: float) -> Floats:
-    """Return deviations from the median: of values, in ppm, or of logarithms (`quantity.by`)."""
+    """Return deviations from the median by `quantity.by`: of values, in ppm, or of logarithms."""
     if quantity.by == 'ppm':
         return (values / middle - 1.0) * 1e6
     if quantity.by == 'logarithm':

@@ -32,8 +32,7 @@ Row = Mapping[str, Cell]
 
 #: Values of the column `verdict` for tests that `evaluate` has not judged.
 REFUSED, FAILED, NOT_JUDGED = 'refused', 'failed', 'not judged'
-# Characters with which a formula in a spreadsheet begins.
-_FORMULA = ('=', '+', '-', '@')
+_FORMULA = ('=', '+', '-', '@')  # characters with which a formula in a spreadsheet begins
 # Findings of a fit that show incomplete data, so that the prior determines some parameters.
 _LACKS = {'temperature', 'ramps', 'directions', 'misfit'}
 
@@ -44,13 +43,14 @@ class TableColumn(NamedTuple):
     name: str
     kind: str  # text, whole, number
     meaning: str
-    label: str = ''  # name of a quantity compared between units, else ''; see `_COMPARED`
+    # The next fields are those of a quantity that is compared between units; see `_COMPARED`.
+    label: str = ''
     unit: str = ''
-    by: str = 'value'  # comparison of units: value, ppm or logarithm
-    sd: str = ''  # name of the column with the standard deviation of a compared quantity
+    by: str = 'value'  # comparison by values, by deviations in ppm, or by logarithms
+    sd: str = ''  # name of the column with the standard deviation
 
 
-_BELOW = ((1, 0), (2, 0), (2, 1))
+_BELOW = ((1, 0), (2, 0), (2, 1))  # elements of the misalignment matrix below the diagonal
 _TABLE = (
     ('name', 'text', 'folder of the bags, or serial; also the name of the folder of results'),
     ('serial', 'text', "serial in the bags' metadata, else the name of the folder"),
@@ -106,8 +106,7 @@ _TABLE = (
     ('tool_version', 'text', 'version of thermo_comp that fitted the unit'),
     ('calibration_sha256', 'text', 'SHA-256 of calibration.yaml'),
 )
-# Quantities compared between units: label, unit, scale of the comparison (values, ppm of the
-# median, logarithms), column of the sd.
+# Quantities compared between units: fields `label`, `unit`, `by`, `sd` of `TableColumn`.
 _COMPARED = {
     'scale_{0}': ('scale factor {1}', 'ppm', 'ppm', 'scale_sd_{0}_ppm'),
     'scale_slope_{0}_ppm_k': ('slope of scale {1}', 'ppm/K', 'value', 'scale_slope_sd_{0}_ppm_k'),
@@ -164,7 +163,7 @@ def is_valid(row: Row) -> bool:
 def fitted_cells(
     result: FitResult, judgement: Judgement | None, *, has_prior: bool = False
 ) -> dict[str, Any]:
-    """Return the table cells with a unit's fit and the verdict on its bags."""
+    """Return the cells of the table that a unit's fit, and the verdict on its bags, determine."""
     calibration, bags = result.calibration, result.bags
     start = datetime.fromtimestamp(min(bag.start_ns for bag in bags) // 10**9, timezone.utc)
     sets = calibration.regime_sets()
@@ -181,7 +180,7 @@ def fitted_cells(
         'm_sd_{0}_urad': np.array(calibration.misalignment_sd) * 1e6,
         'noise_{0}_ug_sqrt_hz': np.array(calibration.noise_density_m_s2_sqrt_hz) / MICRO_G,
     }
-    # Without a prior, few positions do not separate the slopes of bias and scale: omit their sds.
+    # Without a prior, few positions do not separate the slopes of bias and of scale: omit the sds.
     is_separable = has_prior or len(distinct_directions(up)) >= POSITIONS_NEEDED
     for quantity, unit, slope, sd in _slopes(calibration):
         parts[f'{quantity}_slope_{{0}}_{unit}'] = slope
@@ -225,7 +224,7 @@ def fitted_cells(
 
 def _slopes(calibration: Calibration) -> Iterator[tuple[str, str, Floats, Floats]]:
     """
-    Yield, for bias and for scale: name, unit, slopes of the static curves at T_ref and their sd,
+    Yield, for bias and for scale: name, unit, slopes of the static curves at T_ref and their sds,
     (3,). The sd of an axis is NaN if the calibration has no covariance or no curve of this axis.
     """
     layout, posterior = parameter_layout(calibration), calibration.posterior
@@ -278,15 +277,12 @@ def read_parquet(path: Path) -> list[Row]:
     """Read the known columns of an earlier run's table; ThermoCompError for another file."""
     from pyarrow import ArrowException, parquet
 
+    no_table = f'{path}: not a fleet table'
     try:
         rows = parquet.read_table(path).to_pylist()
     except (ArrowException, OSError) as error:
-        raise ThermoCompError(
-            f'{path}: not a fleet table: {" ".join(str(error).split())}'
-        ) from error
+        raise ThermoCompError(f'{no_table}: {" ".join(str(error).split())}') from error
     names = {column.name for column in COLUMNS}
     if not all('serial' in row and 'verdict' in row for row in rows):
-        raise ThermoCompError(
-            f'{path}: not a fleet table: it lacks the columns serial and verdict'
-        )
+        raise ThermoCompError(f'{no_table}: it lacks the columns serial and verdict')
     return [row_of(**{k: v for k, v in row.items() if k in names}) for row in rows]

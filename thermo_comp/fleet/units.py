@@ -16,7 +16,7 @@ from ..errors import RecordingError, ThermoCompError
 from ..recording.reader import open_recording
 from ..text import one_line
 
-# Attributes of a file in a listing that change with its content, the most reliable first.
+# Keys of a file in a listing whose values change with the file's content, most reliable first.
 _STAMPS = (
     *('ETag', 'etag', 'md5Hash', 'content_md5', 'generation', 'version_id'),
     *('mtime', 'LastModified', 'last_modified', 'updated', 'created'),
@@ -31,13 +31,13 @@ class StoredFile(NamedTuple):
     stamp: str
 
 
-#: Files of each bag (a rosbag2 bag has several), by the path of the bag in the fleet's folder.
+#: Files of each bag (a rosbag2 folder has several), by the bag's path in the fleet's folder.
 Bags = dict[str, list[StoredFile]]
 
 
 @dataclass(frozen=True)
 class FoundUnit:
-    """The bags of one thermal test; `name`: folder or serial; `lot`: top folder, or ''."""
+    """The bags of one thermal test; `name`: their folder, or serial; `lot`: top folder, or ''."""
 
     name: str
     lot: str
@@ -104,7 +104,7 @@ def _scan(root: str) -> Iterator[str]:
         if error.errno not in (errno.ENOENT, errno.ENOTDIR):
             raise OSError(error.errno, f'{error.strerror} in {one_line(error.filename)}')
 
-    # A folder that cannot be read may be a unit, which must not be missing without a word.
+    # A folder that cannot be read raises OSError, because it may be the folder of a unit.
     for folder, folders, names in os.walk(root, onerror=refuse, followlinks=True):
         here = Path(folder).resolve()
         # Skip hidden folders and the file system's `lost+found`; and links to a folder that
@@ -126,7 +126,7 @@ def words(error: Exception) -> str:
 
 
 def find_units(storage: Storage) -> list[FoundUnit]:
-    """Find the units of a fleet; ThermoCompError if the folder cannot be listed or has no bag."""
+    """Find the units of a fleet; ThermoCompError if its folder cannot be listed or has no bag."""
     bags = group_files(storage.files())
     if not bags:
         raise ThermoCompError(
@@ -146,7 +146,7 @@ def find_units(storage: Storage) -> list[FoundUnit]:
 
 
 def folders_of_tables(storage: Storage) -> tuple[str, ...]:
-    """Return the folders that have tables, which `convert` can make bags of, but no bag."""
+    """Return the folders with tables, which `convert` can convert to bags, but without a bag."""
     stored = storage.files()
     with_bags = tuple(f'{_folder(name)}/' for name in group_files(stored))
     # fleet.csv is the result of an earlier run, not a table of samples.
@@ -192,5 +192,5 @@ def _serial(storage: Storage, name: str, files: Sequence[StoredFile]) -> str:
         with storage.here(name, files) as path, open_recording(path, require=()) as reader:
             return reader.info.metadata.get('serial') or storage.name
     except (RecordingError, OSError):
-        # A bag that cannot be read is listed as a separate unit, whose row states the problem.
+        # A bag that cannot be read is a separate unit in the table, whose row states the problem.
         return name

@@ -34,7 +34,7 @@ def sha256(content: str | bytes) -> str:
 
 @dataclass(frozen=True)
 class FleetOptions:
-    """Options of the fits of all units, except serial and input, which are read from the bags."""
+    """Options of the fits of all units; the bags determine `serial` and `input` of `fit`."""
 
     fit: FitOptions
     topics: Topics | None = None
@@ -46,7 +46,7 @@ class FleetOptions:
         return '' if self.fit.prior is None else sha256(dump_calibration(self.fit.prior))
 
     def digest(self) -> str:
-        """Return the SHA-256 of the version, prior and options, on which a result depends."""
+        """Return the SHA-256 of version, prior and options, on which a unit's result depends."""
         plain = replace(self, fit=replace(self.fit, prior=None))
         content = {'version': __version__, 'prior': self.prior_sha256, **asdict(plain)}
         return sha256(json.dumps(content, sort_keys=True, default=repr))
@@ -54,7 +54,7 @@ class FleetOptions:
 
 @dataclass(frozen=True)
 class UnitOutcome:
-    """The result of reading and fitting a unit, in a size suitable for messages of Dask."""
+    """The result of reading and fitting a unit, small enough for messages of Dask."""
 
     row: dict[str, Cell]
     hashes: dict[str, str]  # SHA-256 of each bag
@@ -93,7 +93,7 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
                 how = replace(options.fit, input=_UNIT_OF[info.input])
                 bags[name] = reduce_bag(replace(source, sha256=hashes[name]), how)
         except RecordingError as error:  # noqa: PERF203 - the other bags are still read
-            # Name the bag by its path in the fleet, not by the path of a temporary copy.
+            # Name the bag by its path in the fleet: its own path may be that of a temporary copy.
             problems.append(': '.join(part for part in (name, error.key, error.message) if part))
             is_final = is_final and not isinstance(error.__cause__, OSError)
         except OSError as error:
@@ -127,7 +127,7 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
         how = replace(options.fit, input=next(iter(kinds)), serial=serial)
         row, calibration, page = _fitted(row, list(bags.values()), how, options.certificates)
     except FitError as refusal:
-        # A fit with a prior is useful for incomplete data, but not for contradictory data.
+        # A fit with a prior is useful for incomplete data, and would hide contradictory data.
         is_whole = 0 if isinstance(refusal, UndeterminedError) else None
         row.update(verdict=REFUSED, problem=one_line(str(refusal)), is_whole=is_whole)
     except ThermoCompError as failure:
@@ -166,17 +166,17 @@ def dask_setup(_worker: object) -> None:
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Make workers started in the `with` block ignore Ctrl-C; raise a Ctrl-C after the block."""
-    heard: list[int] = []
+    """Let workers started in the `with` block ignore Ctrl-C, which is raised after the block."""
+    received: list[int] = []
     # Workers inherit the ignored SIGINT (Ctrl-C) from the fork server.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     forkserver.ensure_running()
-    signal.signal(signal.SIGINT, lambda number, _: heard.append(number))
+    signal.signal(signal.SIGINT, lambda number, _: received.append(number))
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
-    if heard:
+    if received:
         raise KeyboardInterrupt
 
 
@@ -195,15 +195,13 @@ def connected(scheduler: str | None = None, n_workers: int | None = None) -> Ite
         'distributed.worker.multiprocessing-method': 'forkserver',
     }
     local = {'host': '127.0.0.1', 'dashboard_address': '127.0.0.1:0', 'preload': [__name__]}
+    how = {'n_workers': n_workers, 'threads_per_worker': 1, 'processes': True, **local}
     with dask.config.set(quiet), ExitStack() as stack:
         if scheduler is None:
             get_mp_context().set_forkserver_preload(['distributed', __name__])
             with _uninterrupted():
-                local_client = Client(
-                    n_workers=n_workers, threads_per_worker=1, processes=True, **local
-                )
-                stack.enter_context(local_client)
-            yield local_client
+                client = stack.enter_context(Client(**how))
+            yield client
             return
         versions = {}
         try:

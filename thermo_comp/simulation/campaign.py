@@ -42,7 +42,7 @@ _PROGRAMS = {
     'three-soaks': '20 60min, 35@1 60min, 5@1 60min',
 }
 _FACES = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
-# Midpoints of a cube's edges: three vectors of sum 0, their three opposites, then the other six.
+# Midpoints of a cube's edges: three vectors of sum 0, their opposites, then the other six.
 _EDGES = [
     *[(1, 1, 0), (0, -1, 1), (-1, 0, -1), (-1, -1, 0), (0, 1, -1), (1, 0, 1)],
     *[(1, -1, 0), (0, 1, 1), (-1, 0, 1), (-1, 1, 0), (0, -1, -1), (1, 0, -1)],
@@ -52,19 +52,18 @@ _CORNERS = [
     *[(1, 1, 1), (-1, -1, -1), (1, -1, -1), (-1, 1, 1), (-1, 1, -1), (1, -1, 1)],
     *[(-1, -1, 1), (1, 1, -1)],
 ]
-# Sd of the random tilt of an attitude about each of two perpendicular axes [deg].
-_SPREAD_DEG = 3.0
+_SPREAD_DEG = 3.0  # sd of an attitude's random tilt about each of two perpendicular axes [deg]
 # Attitudes of 'tumble-3' in the chamber: gravity has both signs on each axis.
 _THREE = np.array([(1.0, 1.0, -1.0), (-1.0, 1.0, 1.0), (1.0, -1.0, 1.0)])
 PLAN_NAMES = (
     *('chamber-18', 'chamber-9', 'tumble-3', 'tumble-1', 'tumble', 'held-out'),
     *('centrifuge', 'rate-table'),
 )
-# A run through several rotation rates begins `_LEAD_S` before each of `_SOAK_ENDS_S`; each rate
-# lasts `_DWELL_S`, each change of the rate `_RAMP_S` [s].
-_SOAK_ENDS_S, _LEAD_S, _DWELL_S, _RAMP_S = (3600.0, 8100.0, 13500.0), 1800.0, 300.0, 60.0
-# Radius [m] and rotation rates [rad/s] of the simulated centrifuge (1 m, 2 to 10 g horizontally)
-# and of the simulated rate table (0.25 m, up to 1000 deg/s).
+# Times [s] at which a run through all rotation rates begins: half an hour before each soak ends.
+_BEGINS_S = tuple(end - 1800.0 for end in (3600.0, 8100.0, 13500.0))
+_DWELL_S, _RAMP_S = 300.0, 60.0  # duration of each rotation rate, and of each change of the rate
+# Radius [m] and rotation rates [rad/s] of the simulated centrifuge (2 to 10 g horizontally) and of
+# the simulated rate table (up to 1000 deg/s).
 _CENTRIFUGE = 1.0, tuple(math.sqrt(g * STANDARD_GRAVITY) for g in (2.0, 4.0, 7.0, 10.0))
 _RATE_TABLE = 0.25, tuple(math.radians(rate) for rate in (400.0, 600.0, 800.0, 1000.0))
 
@@ -125,9 +124,9 @@ def positions(n: int, seed: int = 0) -> Floats:
 
     Six attitudes are the faces of a cube, nine the corners of a three-capped prism, twelve the
     corners of an icosahedron: the best sets of 6, 9 and 12 attitudes to determine bias, scale and
-    misalignment. Up to 26 attitudes, except 9 and 12, take the faces of a cube, then its edges,
-    then its corners; more than 26 attitudes follow a uniform spiral on the sphere. Sets of 6, 9,
-    12, 18, 24 and 26 vectors sum to about 0. `seed` tilts each attitude by a small random angle.
+    misalignment. Other sets of up to 26 attitudes consist of the faces of a cube, then its edges,
+    then its corners; larger sets follow a uniform spiral on the sphere. Sets of 6, 9, 12, 18, 24
+    and 26 vectors sum to about 0. `seed` tilts each attitude by a small random angle.
     """
     if n == 9:
         # The prism has three corners on the equator and, at azimuths between them, three corners
@@ -188,7 +187,7 @@ class Spin:
 
 @dataclass(frozen=True, eq=False)
 class Position:
-    """A position of a test: chamber program, direction of the force at rest, and a rotation."""
+    """A position of a test: chamber program, direction of the force without rotation, rotation."""
 
     program: Cyclogram
     up: Floats
@@ -207,7 +206,7 @@ def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
         raise ValueError(f'`name` must be one of {", ".join(PLAN_NAMES)}, got {name!r}')
     rng = generator(seed, Stream.CYCLOGRAM, PLAN_NAMES.index(name))
     if name == 'held-out':
-        # No axis is near the vertical or the horizontal: an attitude that no other plan has.
+        # No axis is near the vertical or the horizontal, unlike the attitudes of other plans.
         ups = rng.uniform(0.3, 1.0, (3, 3)) * rng.choice((-1.0, 1.0), (3, 3))
         return _positions(parse_cyclogram('held-out'), ups)
     if name in ('centrifuge', 'rate-table'):
@@ -244,12 +243,13 @@ def steps(
 
 def _spinning(radius: float, rates: tuple[float, ...], seed: int) -> tuple[Position, ...]:
     program = parse_cyclogram('three-soaks')
-    begins = tuple(end - _LEAD_S for end in _SOAK_ENDS_S)
-    time, rate = steps(begins, rates, _DWELL_S, _RAMP_S)
+    time, rate = steps(_BEGINS_S, rates, _DWELL_S, _RAMP_S)
     inward = positions(12, seed)
     ups = np.cross(inward, np.roll(inward, 1, axis=1))
-    pairs = zip(ups, (Spin(time, rate, radius, direction) for direction in inward), strict=True)
-    return tuple(Position(program, up / np.linalg.norm(up), spin) for up, spin in pairs)
+    return tuple(
+        Position(program, up / np.linalg.norm(up), Spin(time, rate, radius, direction))
+        for up, direction in zip(ups, inward, strict=True)
+    )
 
 
 def _positions(program: Cyclogram, ups: Floats) -> tuple[Position, ...]:

@@ -47,7 +47,7 @@ class Effect(ABC):
     Base class of the causes of thermal errors. Two signals, `first` and `second`, change the bias
     of each axis by ``bias * first + bias_curvature * second``, and the scale likewise.
 
-    Coefficients of the bias are in ug, those of the scale in ppm, per unit of the signal.
+    The coefficients of the bias are in ug, those of the scale in ppm, per unit of the signal.
     """
 
     scale: Triple = ZERO
@@ -69,8 +69,9 @@ class Effect(ABC):
 @dataclass(frozen=True)
 class PartEffect(Effect):
     """
-    Tempco of a part, or stress or thermo-EMF between two parts. The two signals are the deviation
-    d of `part` from the reference state [K] and d^2, each less that of the part `cold` if given.
+    Temperature coefficient of a part, or stress or thermo-EMF between two parts. The two signals
+    are the temperature d of `part` less that in the reference state [K], and d^2; if a part `cold`
+    is given, each less the signal of `cold`.
     """
 
     part: str
@@ -89,11 +90,11 @@ class FlowEffect(Effect):
     """
     Effect of the size of a heat flow between two parts, less its effect in the reference state.
 
-    With ``x = |T_hot - T_cold| / knee`` the first signal is ``x ** exponent * d ** power``, where
-    d is the deviation of `cold` from the reference state [K]. The exponent is 1.25 for convection
-    in a gap, 1 for the load of a heat pump, 2 for the losses of a heat pump. If `is_limited`, like
-    the supply of a heat pump, ``x ** exponent / (1 + x ** exponent)`` replaces ``x ** exponent``.
-    The second signal is the first signal times d.
+    With ``x = |T_hot - T_cold| / knee`` and ``flow = x ** exponent`` the first signal is ``flow``,
+    less that in the reference state, times ``d ** power``; d is the temperature of `cold` less
+    that in the reference state [K]. The second signal is the first signal times d. The exponent is
+    1.25 for convection in a gap, 1 for the load of a heat pump, 2 for the losses of a heat pump.
+    If `is_limited`, like the supply of a heat pump, ``flow / (1 + flow)`` replaces ``flow``.
     """
 
     hot: str
@@ -125,7 +126,7 @@ class CreepEffect(Effect):
 
     def _signals(self, history: PartHistory) -> tuple[Floats, float]:
         d = history.of(self.part)
-        # First-order lag, steady at the start, of an input that is linear between grid points.
+        # A first-order lag, settled at the start; the input is linear between grid points.
         kept = np.exp(-history.step / self.time_constant)
         new = 1.0 - self.time_constant / history.step * (1.0 - kept)
         lagged = lfilter([new, 1.0 - kept - new], [1.0, -kept], d - d[0]) + d[0]

@@ -4,9 +4,9 @@
 Owns the thermal network of a unit (lumped parts, heat paths, thermostat) and its solution.
 
 The state of the network obeys ``dx/dt = A x + b u(t) + p``: `x` holds the temperatures of the
-parts, then the integral of the thermostat's controller; `u` is the air temperature; `p` is
-constant. Between the knots of the air temperature the solution is linear plus decaying modes. The
-part of a convective heat flow that is nonlinear in temperature is constant in each step of 1 s.
+parts, then the integral of the thermostat's controller [W]; `u` is the air temperature; `p` is
+constant. Between the knots of the air temperature the solution is linear in time plus decaying
+modes. The nonlinear part of a convective heat flow is constant in each step of 1 s.
 """
 
 from collections.abc import Mapping
@@ -83,20 +83,20 @@ class ThermalNetwork:
             p[index[name]] += watts
         heat = self.thermostat
         if heat is not None:
-            i, integral = index[heat.node], n
-            # Heater power = proportional * (set point - T) + integral state.
+            i = index[heat.node]
+            # Heater power = proportional * (set point - T) + integral, which is state n.
             A[i, i] -= heat.proportional
-            A[i, integral] += 1.0
-            A[integral, i] -= heat.integral
-            p[[i, integral]] += np.array([heat.proportional, heat.integral]) * heat.set_point
-        rows = np.array(list(self.capacity.values()))
-        A[:n] /= rows[:, None]
-        b[:n] /= rows
-        p[:n] /= rows
+            A[i, n] += 1.0
+            A[n, i] -= heat.integral
+            p[[i, n]] += np.array([heat.proportional, heat.integral]) * heat.set_point
+        capacities = np.array(list(self.capacity.values()))
+        A[:n] /= capacities[:, None]
+        b[:n] /= capacities
+        p[:n] /= capacities
         return A, b, p
 
     def convection(self, state: Floats, air: float) -> Floats:
-        """Return the part of ``dx/dt`` due to exponents of heat paths other than 1, shape (k,)."""
+        """Return the part of ``dx/dt`` by which heat paths are nonlinear, shape (k,)."""
         index, at = self._places, np.append(state, air)
         flow = np.zeros(len(at))
         for link in self.links:
@@ -138,7 +138,7 @@ class ThermalResponse:
     """
     Temperatures of a thermal network at any time of a chamber program.
 
-    `air` are the chamber's temperatures at the knots `time` [s], shape (m,); `power` is the
+    `air` holds the chamber's temperatures at the knots `time` [s], shape (m,); `power` is the
     dissipation between the knots in addition to the constant powers [W], shape (m - 1, n_parts).
     At the start all temperatures are in equilibrium with the air and the powers at that time.
     """
@@ -178,7 +178,7 @@ class ThermalResponse:
         state = network.settled(air[0], drive[0])
         before = network.convection(state, air[0])
         for k, lasts in enumerate(length):
-            # Extrapolate the mean convection of this interval from two values (Adams-Bashforth).
+            # Extrapolate the mean convection of this interval from the last two (Adams-Bashforth).
             now = network.convection(state, air[k])
             self._alpha[k] -= inverse @ (1.5 * now - 0.5 * before)
             self._amplitude[k] = unmix @ (state - self._alpha[k])

@@ -32,7 +32,7 @@ class Specimen:
         return float(self._rng.uniform(low, high))
 
     def axes(self, value: float, spread: float) -> Triple:
-        """Draw a number for each axis, uniformly within a relative spread around a value."""
+        """Draw a number for each axis, uniform from (1 - `spread`) to (1 + `spread`) `value`."""
         return triple(value * (1.0 + spread * self._rng.uniform(-1.0, 1.0, 3)))
 
     def signed(self, low: float, high: float) -> Triple:
@@ -131,8 +131,8 @@ def _bare_quartz(draw: Specimen) -> UnitModel:
         PartEffect('magnet', scale=draw.axes(48.0, 0.01), scale_curvature=draw.axes(0.31, 0.02)),
         PartEffect('reference', scale=draw.axes(29.5, 0.01)),
         PartEffect('pendulum', bias=draw.signed(0.3, 5.0), bias_curvature=draw.normal(0.005)),
-        # In a ramp the coil on the pendulum and the shunt that compensates the magnet's tempco
-        # have different temperatures: their effects, which cancel in a soak, do not cancel.
+        # The effects of the coil on the pendulum and of the shunt, which compensates the magnet's
+        # tempco, cancel only in a soak: in a ramp coil and shunt have different temperatures.
         PartEffect('head', 'pendulum', scale=draw.axes(-115.0, 0.2), bias=draw.normal(15.0)),
         # Stress acts through the joint to the mounting ring, which is heavy, slow and bolted to
         # the case.
@@ -177,12 +177,11 @@ def _demo(draw: Specimen) -> UnitModel:
     """Draw the unit of the sample bags: tempcos, heat loads, and a head that lags the board."""
     # The thermal time constants are short, so that the unit settles in the soaks of the bags.
     board_tau, tau = 0.25 * draw.between(400.0, 900.0), draw.between(500.0, 1500.0)
-    capacity = {'case': draw.between(900.0, 1800.0), 'board': 0.4 * board_tau}
-    links = [*draw.links((AIR, 'case', 4.0)), Link('case', 'board', 0.4)]
     # The sensor head has a small heat capacity, so that it hardly affects the board.
-    capacity['head'] = 0.02 * tau
-    links.append(Link('board', 'head', 0.02))
-    network = ThermalNetwork(capacity, tuple(links), power={'board': draw.between(0.05, 0.15)})
+    capacity = {'case': draw.between(900.0, 1800.0), 'board': 0.4 * board_tau, 'head': 0.02 * tau}
+    ends = Link('case', 'board', 0.4), Link('board', 'head', 0.02)
+    links = (*draw.links((AIR, 'case', 4.0)), *ends)
+    network = ThermalNetwork(capacity, links, power={'board': draw.between(0.05, 0.15)})
     drift = PartEffect('board', **tempcos(draw))
     # `stress` follows the temperature difference board - head, `load` the heat flow case to board.
     stress = PartEffect('board', 'head', bias=draw.signed(0.5, 1.0), scale=draw.normal(1.0))
@@ -202,8 +201,8 @@ def tempcos(draw: Specimen) -> dict[str, Any]:
 
 def loads(draw: Specimen) -> list[Effect]:
     """
-    Draw constants of the effect in Golovach's paper: in a ramp offset, slope and curvature of bias
-    and scale differ from those in a soak, as with a heat pump at its limit.
+    Draw the effect of Golovach's paper: offset, slope and curvature over temperature of bias and
+    scale differ between ramp and soak, as with a heat pump at its limit.
     """
     knee, exponent = draw.between(0.4, 0.9), draw.between(1.5, 2.5)
     sizes = ((10.0, 40.0, 20.0), (1.0, 4.0, 5.0), (0.03, 0.1, 0.1))
@@ -220,7 +219,7 @@ _KINDS = {
     'thermostatted': (0, _thermostatted),
     'bare-quartz': (1, _bare_quartz),
     'mems': (2, _mems),
-    # The random streams of the kinds 3 to 12 belong to the units of benchmarks/triads.py.
+    # The units of benchmarks/triads.py use the random streams of the kinds 3 to 12.
     'demo': (13, _demo),
 }
 UNIT_NAMES = tuple(_KINDS)

@@ -31,9 +31,9 @@ class Truth:
     The true bias, scale and force of a run, on the thermal grid (m points) and in the n conversion
     cycles of the accelerometer.
 
-    Bias is in counts per conversion (`rate_bias`: rad/s), scale is relative; `bias_grid` is
-    `thermal_bias` plus a random walk. `cycle_s` are the middles of the cycles [s].
-    `specific_force` is constant, (3,), or in a rotation the force in each cycle, (n, 3).
+    Bias is in counts per conversion (`rate_bias`: rad/s), scale is relative to `scale_factor`;
+    `bias_grid` is `thermal_bias` plus a random walk. `cycle_s` holds the middles of the cycles
+    [s]. `specific_force` is constant, (3,), or in a rotation the force in each cycle, (n, 3).
     """
 
     unit: UnitModel
@@ -70,9 +70,9 @@ class Truth:
 @dataclass(frozen=True, eq=False)
 class SimulatedRun:
     """
-    The data that a recorder would store, and the truth. The data are the ends and counts of the
-    conversion cycles, readings of the thermometers [degC], and the angular rate in each cycle
-    [rad/s] of a unit with a gyroscope.
+    The data that a recorder would store, and the truth. The data are stamps (ends) and counts of
+    the conversion cycles, readings of the thermometers [degC] and, of a unit with a gyroscope, the
+    angular rate in each cycle [rad/s].
     """
 
     accel_stamp_ns: Ints
@@ -86,14 +86,14 @@ class SimulatedRun:
 
 
 def simulate(unit: UnitModel, cyclogram: Cyclogram, up: ArrayLike, **options: Any) -> SimulatedRun:
-    """Simulate a unit in a chamber program as one block; `options`: of `simulate_blocks`."""
+    """Simulate a unit in a chamber program as one block, with options of `simulate_blocks`."""
     return next(simulate_blocks(unit, cyclogram, up, block_size=sys.maxsize, **options))
 
 
 def arrays(
     unit: UnitModel, stations: Sequence[Position], seed: int = 0, *, rate_hz: float = 4.0
 ) -> list[SimulatedRun]:
-    """Simulate all positions of a test in memory, each with another seed, stamps from 0."""
+    """Simulate all positions of a test in memory, each with a separate seed and stamps from 0."""
     runs = []
     for number, station in enumerate(stations, 1000 * seed):
         options: dict[str, Any] = {'seed': number, 'spin': station.spin, 'start_ns': 0}
@@ -141,9 +141,8 @@ def simulate_blocks(
         bias_grid=truth.thermal_bias + _random_walk(unit, truth.grid_s, seed),
         specific_force=gravity * (direction / np.linalg.norm(direction)),
     )
-    read = unit
-    if temperature_rate_hz is not None:
-        read = unit.with_thermometers(rate_hz=temperature_rate_hz)
+    changed = {} if temperature_rate_hz is None else {'rate_hz': temperature_rate_hz}
+    read = unit.with_thermometers(**changed)
     sensors = (read.board, Stream.BOARD_NOISE), (read.case, Stream.CASE_NOISE)
     readings = [each.read(truth.response, duration, seed, noise) for each, noise in sensors]
     return _blocks(truth, readings, spin, (n_cycles, block_size, rate_hz), seed, start_ns)
@@ -199,7 +198,7 @@ def _blocks(
 
 
 def _along_axes(part: Truth, to_axes: Floats) -> Floats:
-    """Return the force along the sensitivity axes plus the nonlinear terms of the axes."""
+    """Return the force along the sensitivity axes, with the nonlinear terms [m/s^2], (n, 3)."""
     s: Floats = np.zeros(3)
     for j in range(3):
         s = s + part.specific_force[..., j, None] * to_axes[:, j]
@@ -233,7 +232,7 @@ def _thermal_truth(unit: UnitModel, cyclogram: Cyclogram, seed: int) -> Truth:
 
 
 def _switched(load: SwitchedLoad, knots: Floats, seed: int) -> tuple[Floats, Bools]:
-    """Merge knots and switching times of a load; return also in which intervals the load is on."""
+    """Merge knots and a load's switching times [s]; return also the intervals with the load on."""
     n = 2 + int(knots[-1] // load.spell[0])
     flips = np.cumsum(generator(seed, Stream.LOAD).uniform(*load.spell, size=n))
     fine = np.unique(np.concatenate([knots, flips[flips <= knots[-1]]]))

@@ -22,7 +22,7 @@ from .network import ThermalNetwork, ThermalResponse
 _NS = 1_000_000_000
 REFERENCE_C = 20.0  # board temperature, in a soak, at which K and bias are stated [degC]
 _RANGE = -(1 << 15), (1 << 15) - 1  # range of the converter's output [counts]
-_FRACTION_BITS = 40
+_FRACTION_BITS = 40  # a charge is an integer multiple of 2^-40 counts
 _ONE = 1 << _FRACTION_BITS
 # Rows summed at a time: the sum of 2^20 fractions below 2^40 does not overflow 64 bits.
 _ROWS = 1 << 20
@@ -31,8 +31,8 @@ _ROWS = 1 << 20
 class Stream(IntEnum):
     """
     Sources of random numbers, such as the noise of the accelerometer. Each source has a separate
-    stream, so that numbers drawn from one source do not change those of another. The values of the
-    sources must never change or be reused, because they determine the random numbers of a seed.
+    stream, so that numbers drawn from one source do not change those of another. The value of a
+    source must never change or be reused, because it determines the random numbers of a seed.
     """
 
     ACCEL_NOISE = 0
@@ -51,12 +51,12 @@ class Stream(IntEnum):
 
 
 def generator(seed: int, stream: Stream, axis: int = 0) -> np.random.Generator:
-    """Return a random generator; each source and axis (or other index) has its stream."""
+    """Return the random generator of a source and an axis (or another index)."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(int(stream), axis)))
 
 
 def white(seed: int, stream: Stream) -> Callable[[int], Floats]:
-    """Return a function that draws the next n normal numbers of each axis, shape (n, 3)."""
+    """Return a function that draws the next n standard normal numbers of each axis, (n, 3)."""
     axes = [generator(seed, stream, axis) for axis in range(3)]
     return lambda n: np.stack([axis.standard_normal(n) for axis in axes], axis=1)
 
@@ -78,8 +78,7 @@ def balanced(charge: Floats, remainder: Ints) -> tuple[NDArray[np.int32], Ints]:
     counts = np.empty(charge.shape, dtype=np.int32)
     for first in range(0, len(charge), _ROWS):
         rows = charge[first : first + _ROWS]
-        # Eq. (1) of Golovach's paper: the output is whole counts, and the fraction is added to the
-        # next cycle.
+        # Eq. (1) of Golovach's paper.
         whole = np.floor(rows)
         fraction = np.rint((rows - whole) * _ONE).astype(np.int64)
         total = np.cumsum(fraction, axis=0) + remainder
@@ -126,8 +125,8 @@ class ThermometerModel:
 @dataclass(frozen=True)
 class GyroModel:
     """
-    The gyroscope of a unit, with a scale of 1. `drift` is in mdeg/s where an accelerometer's is in
-    ug; `turn_on` is the standard deviation of the bias from run to run [mdeg/s].
+    The gyroscope of a unit, with a scale of 1. All values are in mdeg/s (`drift` where that of an
+    accelerometer is in ug; `noise_density`: per root Hz); `turn_on`: sd of the bias between runs.
     """
 
     drift: tuple[Effect, ...]
@@ -168,7 +167,7 @@ class Bend:
 
 @dataclass(frozen=True)
 class SwitchedLoad:
-    """Electronics that heat a part with `power` [W], off and on for times within `spell` [s]."""
+    """Electronics that heat a part with `power` [W]; `spell`: range of times off and on [s]."""
 
     part: str
     power: float

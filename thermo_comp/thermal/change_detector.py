@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the detection of departures: a temperature's rate leaves the baseline, its rate in a soak.
+Owns the detection of departures of a temperature's rate from the baseline, the rate in a soak.
 
 Two Kalman filters of temperature and rate, one with a long and one with a short memory, have white
 noise as second derivative. A rate has departed if it exceeds the baseline, away from 0, by more
 than swing plus error of the baseline plus k times the sd of the rate's noise; k follows from the
 permitted number of false alarms per hour (Rice's formula [1]_, docs/regime.md). If noise cannot
-move the readings of a quantized sensor across a cell of one quantum, the filters are not used: two
-edges of cells crossed in the same direction give the mean rate.
+change the reading of a quantized sensor, the filters are not used: the mean rate follows from two
+successive crossings of edges between cells of one quantum.
 
 References
 ----------
@@ -23,12 +23,12 @@ from typing import Final
 from .settings import ThermometerSettings
 from .thermometer import Thermometer
 
-# Second derivative for which a filter is tuned / second derivative at the slowest ramp's onset.
+# d2T/dt2 that each of the two filters detects best / d2T/dt2 at the onset of the slowest ramp.
 BEND_SHARES = (1.0, 10.0)
 TUNING: Final = 1.45  # best memory of a filter [s] / (noise sd / d2T/dt2)^0.4, readings at 1 Hz
-# Noise variance of the rate / the filter's rate variance, if most noise is that of quantization.
+# Noise variance of a filter's rate / rate variance by the filter, if noise is mostly quantization.
 CELL_NOISE_SHARE: Final = 0.4
-SETTLING_MEMORIES: Final = 5.0  # age / memory of a filter at which the noise is stationary
+SETTLING_MEMORIES: Final = 5.0  # age / memory of a filter from which its noise is stationary
 LONGEST_HALF_SWING_S: Final = 600.0  # longest half period of a temperature ripple [s]
 LARGEST_BASELINE_SHARE: Final = 0.25  # largest baseline rate of a soak / smallest ramp's rate
 SWING_MARGIN: Final = 1.25  # assumed swing / observed swing of the rate about its trend
@@ -53,17 +53,15 @@ class ChangeDetector:
         self._ripple_rate = min(ripple / sensor.lag_s, self._largest_swing)
         self._baseline_s = 0.5 * sensor.lag_s
         self._swing_memory_s = SWING_MEMORY_LAGS * sensor.lag_s
-        # Memory (1 / tracking frequency) of each filter [s]: the best memory to detect the second
-        # derivative ``share * onset`` [K/s^2] in readings at 1 Hz. The memory determines the
-        # spectral density of the filter's process noise for any interval of readings.
+        # The best memory (1 / tracking frequency) [s] of a filter to detect a second derivative of
+        # ``share * onset`` [K/s^2] in readings at 1 Hz determines the spectral density of the
+        # filter's process noise for any interval of readings.
         self._noise = sensor.noise_sd_c**2 + sensor.quantum_c**2 / 12.0
-        onset = smallest_rate / sensor.lag_s
-        memories = [
-            TUNING * math.pow(sqrt(self._noise) / (share * onset), 0.4) for share in BEND_SHARES
-        ]
+        noise_sd, onset = sqrt(self._noise), smallest_rate / sensor.lag_s
+        memories = [TUNING * math.pow(noise_sd / (share * onset), 0.4) for share in BEND_SHARES]
         self._powers = [self._noise / memory**4 for memory in memories]
-        # False alarms per second of each filter and sign at a threshold of h sd: acos(rho) / (2 pi
-        # dt) exp(-h^2 / 2), with rho the correlation of the noise of two rates at times dt apart.
+        # A filter has ``acos(rho) / (2 pi dt) exp(-h^2 / 2)`` false alarms of each sign per second
+        # at a threshold of h sd; rho: correlation of the noise of two rates at times dt apart.
         self._log_crossings = -log(2.0 * pi * false_alarms / (2.0 * len(self._powers)))
         self._by_edges = sensor.has_wide_cells
         self._stamp_ns: int | None = None
@@ -71,12 +69,12 @@ class ChangeDetector:
         self.rate = 0.0
         self.swing = self._ripple_rate
         self._baseline = 0.0
-        # Largest error of the rate in a soak [K/s]: the first rate may be at a crest of a ripple.
+        # Largest error of the baseline [K/s]: at first the rate may be at a crest of a ripple.
         self._baseline_error = self.swing
         self._trend = 0.0
         self._is_above = False
-        self._turned_s = 0.0
-        self._peak = self._peak_before = 0.0
+        self._turned_s = 0.0  # age at which the rate last crossed its trend [s]
+        self._peak = self._peak_before = 0.0  # largest distances of the rate from its trend [K/s]
 
     def settle(self, sensor: Thermometer, least_error: float = 0.0) -> None:
         """Begin a soak: the rate becomes the baseline, with at least the error `least_error`."""
@@ -100,12 +98,8 @@ class ChangeDetector:
         """
         stamp = self._stamp_ns
         dt = 0.0 if stamp is None else (stamp_ns - stamp) * 1e-9
-        if (
-            stamp is None
-            or dt > self._baseline_s
-            or sensor.n_restarts != self._n_restarts
-            or not sensor.is_ready
-        ):
+        is_lost = stamp is None or dt > self._baseline_s or not sensor.is_ready
+        if is_lost or sensor.n_restarts != self._n_restarts:
             self._start(stamp_ns, sensor)
             return 0
         if dt <= 0.0:
@@ -143,14 +137,15 @@ class ChangeDetector:
         self._reading = sensor.reading
 
     def _tune(self, dt: float) -> None:
-        """Compute each filter's threshold for (rate beyond its limit)^2 / variance of the rate."""
+        """Compute each filter's threshold of (excess of the rate)^2 / variance of the rate."""
         self._dt = dt
         self._thresholds: list[float] = []
         for power in self._powers[::-1]:
-            pace = dt * math.pow(power / (self._noise * dt), 0.25)
-            correlation = max(1.0 - sqrt(2.0) * pace, -1.0)
+            per_memory = dt * math.pow(power / (self._noise * dt), 0.25)  # dt / memory
+            correlation = max(1.0 - sqrt(2.0) * per_memory, -1.0)
             squared = max(2.0 * (self._log_crossings + log(acos(correlation) / dt)), 1.0)
-            share = CELL_NOISE_SHARE if self._settings.has_cells else 0.25 + 0.08 * min(pace, 1.0)
+            share = 0.25 + 0.08 * min(per_memory, 1.0)
+            share = CELL_NOISE_SHARE if self._settings.has_cells else share
             self._thresholds.insert(0, squared * share)
             self._noise_share = share
         self._edge_margin = sqrt(squared) * (self._settings.noise_sd_c * sqrt(2.0))
@@ -189,8 +184,8 @@ class ChangeDetector:
         reading, before = sensor.reading, self._reading
         apart = (stamp_ns - self._edge_ns) * 1e-9
         if reading == before:
-            # As no edge of a cell was crossed, the rate is at most a quantum divided by the time
-            # since the last crossing.
+            # Without a crossing the rate is at most a quantum divided by the time since the last
+            # crossing of an edge between cells.
             bound = self._settings.quantum_c / apart
             if bound < self._baseline_error + abs(self._baseline):
                 self._baseline_error = max(min(self._baseline_error, bound), self.swing)

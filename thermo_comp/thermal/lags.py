@@ -26,11 +26,10 @@ BOARD_INPUT: Final = 'board'
 #: Relative jitter on the diagonal of the start covariance: lags of similar time constants are
 #: almost collinear, and their covariance would not be invertible.
 START_JITTER: Final = 3e-4
-#: Prior sd [K] of the initial state of a lag with the time constant `START_TAU_S` [s]: for a lag
-#: of the board temperature, and for a lag of a gradient.
+#: Prior sd [K] of the initial state of a lag with the time constant `START_TAU_S` [s].
+BOARD_START_SD: Final = 3.0  # for a lag of the board temperature
+GRADIENT_START_SD: Final = 1.0  # for a lag of a gradient
 START_TAU_S: Final = 3600.0
-BOARD_START_SD: Final = 3.0
-GRADIENT_START_SD: Final = 1.0
 
 
 class Quantity:
@@ -39,9 +38,9 @@ class Quantity:
     input: str
     #: Largest magnitude of the quantity that a calibration may contain.
     largest: ClassVar[float] = QUANTITIES['temperature span'].at_most or 0.0
-    #: Typical change of a quantity of this class per kelvin of temperature change.
+    #: Typical change of the quantity per kelvin of temperature change.
     per_kelvin: ClassVar[float] = 1.0
-    #: Whether the quantity depends on a part's lag behind the board (0 s for the board itself).
+    #: Whether the quantity depends on a lag behind the board, which is 0 s for the board itself.
     is_of_part: ClassVar[bool] = True
 
     @property
@@ -103,7 +102,7 @@ class Lag(_Lag, Quantity):
         return (tau - lead) / (tau - second), (lead - second) / (tau - second) if second else 0.0
 
     def remaining_share(self, age_s: Any, exp: Any = math.exp) -> Any:
-        """Return the share, 1 to 0, of the sd of a lag's initial state that is left at `age_s`."""
+        """Return the sd due to a lag's initial state after `age_s` [s] / this sd at age 0 s."""
         first = exp(-age_s / self.tau_s)
         if not self.second_tau_s:
             return first
@@ -187,8 +186,8 @@ def start_root(lags: Sequence[tuple[Any, ...]]) -> Floats:
 
     The input before the first reading is modelled as a random walk with ``D = 2 sd^2 /
     START_TAU_S`` [K^2/s]: lags k, l of one input have the covariance ``P_kl = D tau_k tau_l /
-    (tau_k + tau_l)``, lags of different inputs 0. The covariance P_kl of lags k and l falls in s
-    seconds by a factor ``exp(-s/tau_k - s/tau_l)``.
+    (tau_k + tau_l)``, lags of different inputs 0. In s seconds P_kl changes by the factor
+    ``exp(-s/tau_k - s/tau_l)``.
     """
     all_lags = [Lag(*lag) for lag in lags]
     terms = first_order_lags(all_lags)

@@ -11,7 +11,7 @@ input u is linear between two readings (first-order hold), the state m becomes, 
 
 import math
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import accumulate
 from typing import Final
 
@@ -23,14 +23,14 @@ from .lags import BOARD_INPUT, Lag, MemorySpec, first_order_lags
 #: Interval between readings / time constant of a lag above which variance is added, because the
 #: time at which the input changed between the readings is unknown.
 SPARSE_SHARE: Final = 0.1
-#: Smallest weight of an old input in `_recursion`: below it a term is lost in double precision.
+#: Smallest weight of an old input in `_recursion`; a smaller weight has no effect in float64.
 _LEAST_WEIGHT: Final = 1e-18
 
 
 class LagBank:
     """
-    First-order lags of one input with the time constants `taus` [s]; `start_ns` is the first stamp
-    since the last `forget`.
+    First-order lags of one input with the time constants `taus` [s]. `stamp_ns`, `start_ns`: last
+    and first stamp of the input since the last `forget`.
     """
 
     def __init__(self, taus: tuple[float, ...]) -> None:
@@ -47,7 +47,7 @@ class LagBank:
         self.lagging = self.extra = [0.0] * len(self.taus)
 
     def step(self, stamp_ns: int, value: float, sd: float = 0.0) -> None:
-        """Use the next input value [K], of error sd `sd`; the input is linear between values."""
+        """Use the next input value, with an error of the sd `sd` [K]; it is linear in between."""
         if self.stamp_ns is None:
             self.stamp_ns = self.start_ns = stamp_ns
             self.input = value
@@ -82,7 +82,7 @@ class LagBank:
         self.extra = [variance + change * change for variance in self.extra]
 
     def at(self, stamp_ns: int, value: float) -> tuple[list[float], list[float]]:
-        """Return each ``u - L`` [K] at u = `value`, and its variance for a known initial state."""
+        """Return `lagging` and `extra` at a stamp at which the input is `value` [K]."""
         seen_ns = self.stamp_ns
         if seen_ns is None or stamp_ns <= seen_ns or not self.taus:
             return self.lagging, self.extra
@@ -99,9 +99,8 @@ def _coefficients(taus: tuple[float, ...], dt_ns: int) -> tuple[list[float], lis
     """Return ``e`` and ``(1 - e) tau / dt`` of each lag, ``e = exp(-dt / tau)``, dt in ns."""
     dt = dt_ns * 1e-9
     lost = [-math.expm1(-dt / tau) for tau in taus]
-    return [1.0 - part for part in lost], [
-        part * (tau / dt) for part, tau in zip(lost, taus, strict=True)
-    ]
+    gains = [part * (tau / dt) for part, tau in zip(lost, taus, strict=True)]
+    return [1.0 - part for part in lost], gains
 
 
 class ThermalMemory:
@@ -126,7 +125,7 @@ class ThermalMemory:
         }
         self.board = self.banks[BOARD_INPUT]
         self.is_empty = not spec.lags and not spec.plays
-        #: For each lag: index and weight of its first-order lags; [] if all lags have order 1.
+        #: For each lag: index and weight of its first-order lags; [] if all lags are first-order.
         self._sums = [weights(lag) for lag in spec.lags]
         if self._sums == [[(k, 1.0)] for k in range(len(terms))]:
             self._sums = []
@@ -136,16 +135,15 @@ class ThermalMemory:
         self._followed = [weights(play.lag) if play.lag else [] for play in spec.plays]
         self._needs_sensors = any(play.inputs != (BOARD_INPUT,) for play in spec.plays)
         self._widths = [play.width_k for play in spec.plays]
-        self._held: list[float] = []
-        #: Rate of a ramp in which the unit may have been switched on [K/s], by the board's rate
-        #: shortly after the start; lower bound of this rate: largest (rate less two sd) so far.
-        self.start_rate = self.sure_rate = 0.0
+        self.forget()
 
     def forget(self) -> None:
         """Forget all inputs; the next board temperature sets each play equal to its input."""
         for bank in self.banks.values():
             bank.forget()
-        self._held = []
+        self._held: list[float] = []  # output of each play; empty before the first temperature
+        #: Rate of a ramp in which the unit may have been switched on [K/s], estimated from the
+        #: board's rate shortly afterwards; lower bound of this rate by its sd.
         self.start_rate = self.sure_rate = 0.0
 
     def forget_input(self, name: str) -> None:
@@ -168,13 +166,10 @@ class ThermalMemory:
             board - sum([share * values[k] for k, share in lag]) if lag else board
             for lag in self._followed
         ]
-        self._held = [
-            v - r if p < v - r else v + r if p > v + r else p
-            for p, v, r in zip(self._held or inputs, inputs, self._widths, strict=True)
-        ]
+        self._held = list(map(_follow, self._held or inputs, inputs, self._widths))
 
     def note_jump(self, change: float) -> None:
-        """Add the square of a wrong step of a board reading [K] to the variance of each lag."""
+        """Add the square of a wrong step of the board readings [K] to the variance of each lag."""
         for bank in self.banks.values():
             bank.note_jump(change)
 
@@ -229,14 +224,12 @@ class ThermalMemory:
         return values, extra
 
     def remaining_shares(self, stamp_ns: int) -> list[float]:
-        """Return the share of each lag's initial state that remains at a stamp, 1 to 0."""
-        ages_s = {
+        """Return `Lag.remaining_share` of each lag at a stamp, 1 to 0."""
+        ages = {
             name: 0.0 if bank.start_ns is None else max(stamp_ns - bank.start_ns, 0) * 1e-9
             for name, bank in self.banks.items()
         }
-        return [
-            lag.remaining_share(min(ages_s[of] for of in lag.inputs)) for lag in self.spec.lags
-        ]
+        return [lag.remaining_share(min(ages[of] for of in lag.inputs)) for lag in self.spec.lags]
 
 
 def memory_on_grid(
@@ -262,7 +255,8 @@ def memory_on_grid(
     columns = [part for lag in behind.values() for part in (lag, np.zeros_like(lag))]
     for play in spec.plays:
         v = board - behind[play.lag] if play.lag else board
-        columns.append(_play(v, play.width_k) - v)
+        held = accumulate(v.tolist(), partial(_follow, width=play.width_k))
+        columns.append(np.array(list(held)) - v)
     return np.column_stack(columns) if columns else np.zeros((len(board), 0), dtype=np.float64)
 
 
@@ -276,8 +270,6 @@ def _recursion(decay: float, driven: Floats) -> Floats:
     return result
 
 
-def _play(v: Floats, width: float) -> Floats:
-    def step(p: float, v: float) -> float:
-        return v - width if p < v - width else v + width if p > v + width else p
-
-    return np.array(list(accumulate(v.tolist(), step)))
+def _follow(p: float, v: float, width: float) -> float:
+    """Return the output of a play of half-width `width` at the input `v`; `p`: output before."""
+    return v - width if p < v - width else v + width if p > v + width else p

@@ -17,47 +17,39 @@ from typing import Final
 from .settings import ThermometerSettings
 from .thermometer import Thermometer
 
-#: Largest possible change of a temperature in addition to quantization: at once [K], and per
-#: second [K/s].
-LARGEST_STEP: Final = 3.0
-LARGEST_RATE: Final = 0.2
+# Largest possible change of a temperature, in addition to a change by the quantum.
+LARGEST_STEP: Final = 3.0  # between readings, however close [K]
+LARGEST_RATE: Final = 0.2  # additional change per second [K/s]
 #: Number of used readings after which readings are checked for steps: a sensor's first readings
 #: may be wrong.
 SETTLED_READINGS: Final = 5
-
 #: A sensor's first reading is wrong if the second reading differs from it by an impossible step,
 #: and the third from the second by less than this share of the step, in K and in K/s.
 CONTINUED_SHARE: Final = 0.25
-
-#: A sensor counts as standing still after at least this number of equal readings and this time
-#: [s]. The number is larger if the declared noise makes that many equal readings more probable
-#: than `STILL_PROBABILITY`.
+#: A sensor stands still after `STILL_S` [s] and this number of equal readings, or after the larger
+#: number of equal readings that noise gives with the probability `STILL_PROBABILITY`.
 STILL_READINGS: Final = 20
 STILL_S: Final = 5.0
 STILL_PROBABILITY: Final = 1e-9
 #: Number of equal readings in a row that are doubtful if the quantum is not far above the noise.
 DOUBTFUL_READINGS: Final = 4
-#: Constant readings of a sensor count as frozen if the other sensor's temperature changes by more
-#: than noise, quanta and this margin [K]; the second margin is for a quantum far above the noise.
+# Constant readings of a sensor are frozen if the other sensor's temperature changes by more than
+# noise, quanta and this margin [K].
 OTHER_MOVED: Final = 0.3
-OTHER_MOVED_BEYOND_CELL: Final = 0.7
-#: Largest assumed error of a sensor with constant readings [K].
-LARGEST_ERROR: Final = 60.0
+OTHER_MOVED_BEYOND_CELL: Final = 0.7  # the margin for a quantum far above the noise
+LARGEST_ERROR: Final = 60.0  # largest assumed error of a sensor with constant readings [K]
 
-#: In a ramp the sensor with the larger temperature change leads if the changes of the two sensors
-#: differ by at least this: in K, and relative to the larger change.
-LEAD_K: Final = 0.5
-LEAD_SHARE: Final = 0.15
-#: A sensor leads after `LEAD_READINGS` readings in a row at which the ratio of the slower to the
-#: faster rate exceeds `LEAD_RATE_SHARE`. If the board leads and the ratio of the two rates exceeds
-#: `DOUBTFUL_RATE_SHARE`, the variance of the board temperature is increased.
+# In a ramp the sensor with the larger temperature change leads if the changes of the two sensors
+# differ by both limits, at `LEAD_READINGS` readings in a row.
+LEAD_K: Final = 0.5  # limit in K
+LEAD_SHARE: Final = 0.15  # limit relative to the larger change
 LEAD_READINGS: Final = 5
-LEAD_RATE_SHARE: Final = 0.3
+LEAD_RATE_SHARE: Final = 0.3  # least ratio of the slower to the faster rate at such a reading
+#: Ratio of the slower to the faster rate above which a leading board gets a larger variance.
 DOUBTFUL_RATE_SHARE: Final = 0.03
-#: Number of changed readings in a row that equal the board's after which a sensor counts as a copy
-#: of the board's, and the largest time between two readings that are compared [ns].
+#: A sensor copies the board if this number of its readings in a row change and equal the board's.
 COPIED_READINGS: Final = 10
-_TOGETHER_NS: Final = 10_000_000
+_TOGETHER_NS: Final = 10_000_000  # largest time between two readings that are compared [ns]
 _NOISE_SDS: Final = 6.0  # largest deviation of a temperature due to noise, in sd
 #: Time [ns] for which the rates of both sensors must be low before the temperatures count as
 #: constant: estimates of rates start at 0, also in a unit that heats itself after switch-on.
@@ -87,13 +79,14 @@ class Fault(Enum):
 
 class SensorCheck:
     """
-    Judges readings of `sensor` by its earlier readings and by those of `other`; `lag_s`: lag of
-    the board behind `other` [s], 0 if `other` is the board; `is_revived`: restart the estimator.
+    Judges readings of `sensor` by its earlier readings and by those of `other`. `lag_s`: lag of
+    the board behind `other` [s], 0 if `other` is the board; `is_revived`: whether the estimator of
+    `sensor` must restart.
     """
 
     def __init__(self, sensor: Thermometer, other: Thermometer, lag_s: float) -> None:
         self.sensor, self._other, self.lag_s = sensor, other, lag_s
-        #: Sum of the impossible jumps [K] after which the readings were used again.
+        #: Sum of the impossible jumps after which readings were used [K]; a jump back cancels one.
         self.shift = 0.0
         settings = sensor.settings
         self._quantum = settings.quantum_c
@@ -113,16 +106,17 @@ class SensorCheck:
         self._n_used = 0
         self._jumped = 0.0
         self._jumped_ns = 0
+        # Temperature of the other sensor at the last change of this sensor's reading. Since then:
+        # change expected of this sensor, largest change of the other sensor [K].
         self._other_then = nan
-        self._expected = 0.0
-        self._moved = 0.0
+        self._expected = self._moved = 0.0
         self._seen_ns: int | None = None
-        #: Stamps and values [degC] of the first two readings; None once the third has judged them.
+        #: Stamps and values [degC] of the first two readings; None from the third reading on.
         self._first: list[tuple[int, float]] | None = []
 
     @property
     def finding(self) -> tuple[Fault, float]:
-        """The present fault, and the size of its jump [K]."""
+        """The present fault, and the size of the jump [K] if the fault is one."""
         is_shifted = self.fault is Fault.NONE and abs(self.shift) > LARGEST_STEP
         return (Fault.SHIFTED, self.shift) if is_shifted else (self.fault, self.step)
 
@@ -167,13 +161,11 @@ class SensorCheck:
         self._other_then = nan
         age = (stamp_ns - last_ns) * 1e-9
         # Accept at once a reading within `LARGEST_STEP` of the temperature expected now.
-        if (
-            fault is Fault.NONE
-            and abs(celsius - sensor.temperature) + abs(sensor.rate) * age < LARGEST_STEP
-        ):
+        is_near = abs(celsius - sensor.temperature) + abs(sensor.rate) * age < LARGEST_STEP
+        if fault is Fault.NONE and is_near:
             self._n_used += 1
             return True
-        self.is_revived = fault is Fault.STILL or fault is Fault.FROZEN
+        self.is_revived = fault in (Fault.STILL, Fault.FROZEN)
         if self._n_used >= SETTLED_READINGS and not self.is_revived:
             expected, _, variance = sensor.at(stamp_ns)
             step = celsius - expected
@@ -227,7 +219,7 @@ class SensorCheck:
         return Fault.FROZEN if self._moved > OTHER_MOVED + margin else Fault.STILL
 
     def note_jump(self, stamp_ns: int, change: float) -> None:
-        """Note a jump of the sensor's readings [K]: those before or after the jump are wrong."""
+        """Note a jump of the readings [K]: the readings before or after the jump are wrong."""
         self._jumped = self._jump_at(stamp_ns) + change * change
         self._jumped_ns = stamp_ns
 
@@ -237,7 +229,7 @@ class SensorCheck:
         return self._jumped * exp(-max(stamp_ns - self._jumped_ns, 0) * self._decay)
 
     def extra_variance(self, stamp_ns: int) -> float:
-        """Return the variance of a temperature due to constant readings and jumps [K^2]."""
+        """Return the variance of the temperature due to constant readings and jumps [K^2]."""
         return max(self._jump_at(stamp_ns), self.shift**2) + self.still(stamp_ns)[0] ** 2
 
     def still(self, stamp_ns: int) -> tuple[float, float]:
@@ -295,9 +287,9 @@ class LeadCheck:
 
     While case and board temperature change in the same direction, their changes since both rates
     were last low are compared. Heat from outside changes the case temperature first. If the
-    board leads, the topics of case and board are swapped or the heat comes from inside; either
-    way the gradient terms are wrong. `extra_variance` [K^2]: if the board may lead, the square of
-    the difference between the changes of board and case temperature, else 0.
+    board leads, the topics of case and board are swapped or the heat comes from inside; in both
+    cases the gradient terms are wrong. `extra_variance` [K^2]: if the board may lead, the square
+    of the difference between the changes of board and case temperature, else 0.
     """
 
     def __init__(self, case: Thermometer, board: Thermometer, calm_k_min: float) -> None:

@@ -11,15 +11,13 @@ from .lags import BOARD_INPUT
 #: A waiting reading: stamp [ns], whether the thermometer is not the board's, name of the
 #: thermometer, order of arrival, temperature [degC].
 Entry = tuple[int, bool, str, int, float]
-
-#: Largest number of waiting readings; if more wait, readings and samples use different clocks, or
-#: no samples come: only the newest half of the readings is then kept.
+#: Number of waiting readings above which only the newest half is kept: readings and samples use
+#: different clocks, or no samples come.
 PENDING_LIMIT: Final = 4096
 #: Largest backward step between consecutive stamps of one sensor [ns]; after a larger step the
 #: earlier readings are taken to be from another clock.
 DISORDER_NS: Final = 5_000_000_000
-#: A stamp later than any real stamp [ns].
-NEVER_NS: Final = 1 << 62
+NEVER_NS: Final = 1 << 62  # a stamp later than any real stamp [ns]
 
 
 class ReadingQueue:
@@ -28,8 +26,7 @@ class ReadingQueue:
     def __init__(self) -> None:
         self._entries: list[Entry] = []
         self._n_pushed = 0
-        #: Stamp of the last received reading of each thermometer.
-        self._last_ns: dict[str, int] = {}
+        self._last_ns: dict[str, int] = {}  # stamp of the last received reading by thermometer
 
     @property
     def next_ns(self) -> int:
@@ -37,7 +34,7 @@ class ReadingQueue:
         return self._entries[0][0] if self._entries else NEVER_NS
 
     def push(self, name: str, stamp_ns: int, celsius: float) -> list[str]:
-        """Add a reading; return the names of readings dropped: queue full, or another clock."""
+        """Add a reading; return the thermometers of readings dropped: full queue or new clock."""
         dropped = []
         last_ns, self._last_ns[name] = self._last_ns.get(name, -NEVER_NS), stamp_ns
         if stamp_ns < last_ns - DISORDER_NS:
@@ -52,13 +49,13 @@ class ReadingQueue:
         return dropped
 
     def keep(self, is_kept: Callable[[Entry], bool]) -> list[str]:
-        """Drop the readings for which `is_kept` is False; return their thermometers."""
+        """Drop the readings for which `is_kept` is False; return the thermometer of each."""
         before, self._entries = self._entries, list(filter(is_kept, self._entries))
         heapq.heapify(self._entries)
         return [entry[2] for entry in before if not is_kept(entry)]
 
     def due(self, stamp_ns: int) -> Iterator[Entry]:
-        """Remove and return the readings up to a stamp, in order of stamps."""
+        """Remove and yield the readings up to a stamp, in order of stamps."""
         while self._entries and self._entries[0][0] <= stamp_ns:
             yield heapq.heappop(self._entries)
 

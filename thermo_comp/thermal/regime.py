@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the causal decision between static and dynamic regime; the only clock is the readings' stamps.
+Owns the causal decision [1]_ between static and dynamic regime, by the stamps of readings alone.
 
 The dynamic state *begins* when the rate of the leading sensor has left the baseline of the soak
-(`change_detector`), or when the rate of any sensor is clearly that of a ramp. The dynamic state is
-*held* while the rate of the case or of the board, at present or half a lag ahead, may exceed
-`relaxed_rate_k_min`: a ramp of constant rate stays dynamic. With `end_condition` = 'case' (the
-paper's rule) only the rate of the case is tested or, while the case gives no readings, the rate
-of the board (docs/regime.md).
+(`change_detector`), or when the rate of any sensor is clearly that of a ramp. The dynamic state
+is *held* while the rate of the case or of the board, at present or extrapolated by half a lag, may
+exceed `relaxed_rate_k_min`; so a ramp of constant rate stays dynamic. With `end_condition` =
+'case' (the paper's rule) only the rate of the case is tested or, while the case gives no readings,
+the rate of the board (docs/regime.md).
 
 References
 ----------
@@ -25,10 +25,10 @@ from .settings import OBVIOUS_SHARE, DetectorSettings, ThermometerSettings
 from .thermometer import Thermometer
 
 HOLD_LAGS: Final = 0.75  # shortest duration of the dynamic state / lag of the leading sensor
-# Margin for "the rate is below a limit", in sd of the rate: half a sd, because in a soak most of
+# Number of sds of a rate by which it must be below a limit: only 0.5, because in a soak most of
 # the variance of the rate is an allowance for a ramp that may begin at any time.
 SURE_SIGMAS: Final = 0.5
-OBVIOUS_SIGMAS: Final = 5.0  # margin for "the rate is above a limit", in sd of the rate
+OBVIOUS_SIGMAS: Final = 5.0  # number of sds of a rate by which it must exceed a limit
 FIRST_READINGS: Final = 20  # number of readings from which the noise estimate is reliable
 
 
@@ -80,7 +80,7 @@ class RegimeDetector:
         is_calm = self._board.is_calm(stamp_ns, board, change.swing) and is_calm
         if is_dynamic and not self._is_grown:
             # The onset of a ramp is detected while the rate is low. Until the rate exceeds 1.5
-            # times the relaxed rate, the dynamic state only ends at a rate near the baseline.
+            # times the relaxed rate, the dynamic state ends only at a rate near the baseline.
             self._is_grown = abs(lead.rate) > OBVIOUS_SHARE * self._relaxed_rate
             is_calm = is_calm and change.is_back()
         if not is_calm:
@@ -90,11 +90,10 @@ class RegimeDetector:
 
         if not is_dynamic:
             speed = OBVIOUS_SHARE * self._relaxed_rate
-            # If noise never changes a reading, two successive changes in one direction prove a
-            # ramp, even if the regime is unknown.
-            if departure and (
-                is_static or (lead.settings.has_wide_cells and departure * lead.rate > speed)
-            ):
+            # If noise alone never changes a reading, two successive changes in one direction prove
+            # a ramp, even in an unknown regime.
+            is_sure = lead.settings.has_wide_cells and departure * lead.rate > speed
+            if departure and (is_static or is_sure):
                 self._open(stamp_ns, departure, lead)
             elif not is_calm and (is_static or lead.n_in_row > FIRST_READINGS):
                 direction = _obvious(lead, speed)
@@ -104,11 +103,11 @@ class RegimeDetector:
                     self._open(stamp_ns, direction, lead)
         else:
             self._turn(stamp_ns, _obvious(lead, change.swing))
+        dwell_ns = self._dwell_ns * (1.0 + 2.0 * change.swing / self._relaxed_rate)
         if (
             self._calm_ns is not None
             and self.regime is not Regime.STATIC
-            and stamp_ns - self._calm_ns
-            >= self._dwell_ns * (1.0 + 2.0 * change.swing / self._relaxed_rate)
+            and stamp_ns - self._calm_ns >= dwell_ns
             and (self._held_until_ns is None or stamp_ns >= self._held_until_ns)
         ):
             # Before the first soak the rate's swing is unknown: allow a larger baseline error.
@@ -135,9 +134,9 @@ class RegimeDetector:
         self.direction = direction
         self._turning_ns = None
         self._is_grown = False
-        # A ramp is detected before its rate is large: hold the dynamic state for `hold_ns`.
-        hold_ns = max(self._dwell_ns, round(HOLD_LAGS * 1e9 * lead.settings.lag_s))
-        self._held_until_ns = stamp_ns + hold_ns
+        # A ramp is detected before its rate is large, so the dynamic state has a minimum length.
+        hold_ns = round(HOLD_LAGS * 1e9 * lead.settings.lag_s)
+        self._held_until_ns = stamp_ns + max(self._dwell_ns, hold_ns)
 
 
 class _Watch:
@@ -162,7 +161,7 @@ class _Watch:
         self._mean = 0.0
 
     def is_calm(self, stamp_ns: int, sensor: Thermometer | None, lead_swing: float) -> bool:
-        """Update a sensor's mean rate; return True if the rate is low or no reading is recent."""
+        """Update a sensor's mean rate; return whether the rate is low, or no reading is recent."""
         seen_ns = None if sensor is None else sensor.stamp_ns
         if sensor is None or seen_ns is None or stamp_ns - seen_ns > self._stale_ns:
             return True
@@ -170,8 +169,8 @@ class _Watch:
             self._stamp_ns = None
             return False
         change = self.change
-        # When the temperature ripples, the rate from the third-order filter of `Thermometer`
-        # overshoots, but the rate from the detector's filters does not.
+        # In a ripple of the temperature the rate by the third-order filter of `Thermometer`
+        # overshoots, but the rate by the detector's filters does not.
         rate = change.rate if change.is_following(stamp_ns) else sensor.rate
         sd, relaxed = sqrt(sensor.var_rate), self._relaxed
         stamp, self._stamp_ns = self._stamp_ns, stamp_ns
@@ -192,9 +191,9 @@ class _Watch:
         return -limit < ahead < limit
 
 
-def _obvious(sensor: Thermometer, rate: float) -> int:
-    """Sign of the sensor's rate if above `rate` in magnitude by `OBVIOUS_SIGMAS` sd, else 0."""
-    margin = abs(sensor.rate) - rate
+def _obvious(sensor: Thermometer, limit: float) -> int:
+    """Return the sign of a rate that exceeds a limit by `OBVIOUS_SIGMAS` sd, 0 for other rates."""
+    margin = abs(sensor.rate) - limit
     if margin > 0.0 and margin * margin > OBVIOUS_SIGMAS**2 * sensor.var_rate:
         return 1 if sensor.rate > 0.0 else -1
     return 0

@@ -3,7 +3,7 @@
 """
 Owns the settings of thermometers, detector and tracker.
 
-A calibration file states the settings of thermometers and detector. The user sets the tracker.
+A calibration file states the settings of thermometers and detector, the user those of the tracker.
 """
 
 from dataclasses import dataclass, field
@@ -12,8 +12,8 @@ from typing import Annotated, Final, Literal, get_args
 from ..quantities import QUANTITIES, NotNegative, Positive, refuse_impossible
 
 CELL_SIGMAS: Final = 2.5  # quantum / noise sd above which a reading counts as an interval (cell)
-# Quantum / noise sd above which noise never changes a reading: 6 sd of the difference of the noise
-# of two readings.
+# Quantum / noise sd above which noise alone never changes a reading: 6 sd of the difference of two
+# readings.
 WIDE_CELL_SIGMAS: Final = 8.5
 # Hysteresis of the dynamic state: rate that begins the state / rate below which the state ends.
 OBVIOUS_SHARE: Final = 1.5
@@ -122,9 +122,9 @@ class ThermalConfig:
     """Times of the tracker that the user sets; ValueError if a value is out of its range."""
 
     #: Time over which the two sets of coefficients are blended after a change of regime [s], up to
-    #: ten times longer if the force would change faster than 1 ug/s; 0 = step, as in the paper.
+    #: ten times longer if the force would change faster than 1 ug/s; 0: a step, as in the paper.
     transition_time_s: NotNegative = 30.0
-    #: Age of the board temperature after which nothing is published, unless the correction is
+    #: Age of the board temperature after which nothing is published [s], unless the correction is
     #: constant; also the time for which board readings after an impossible step are refused.
     temperature_timeout_s: Positive = 60.0
     #: Age of the case temperature after which the board temperature decides the regime [s]; also

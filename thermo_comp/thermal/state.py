@@ -14,9 +14,9 @@ MEMORY_SETTLED_SD: Final = 0.05
 #: housing of a few hundred grams in a chamber.
 USUAL_BOARD_LAG_S: Final = 900.0
 
-#: First numbers of a thermal state: board temperature and its variance, rate of the board
-#: temperature, weight of the dynamic set, flag (1.0 while the regime is unknown), gradient of the
-#: first sensor and its variance.
+#: Indices of the first numbers of a thermal state: board temperature and its variance, rate of the
+#: board temperature, weight of the dynamic set, flag (1.0 while the regime is unknown), gradient
+#: of the first sensor and its variance.
 (BOARD, VAR_BOARD, RATE, WEIGHT, UNKNOWN, GRADIENT, VAR_GRADIENT) = range(7)
 
 
@@ -51,10 +51,10 @@ class StateLayout:
     """
     Order of the numbers of a thermal state: BOARD to UNKNOWN, (value, variance) pairs, plays.
 
-    pairs: index of each quantity's (value, variance) pair; `lag_pairs` is the slice of the lags
+    pairs: index of each quantity among the pairs; `lag_pairs`: slice of the lags among the pairs
     lags: index of each lag in `MemorySpec.lags`
-    variances: indices of the quantities' variances in the state
-    numbers: name of each number of the state
+    variances: indices in the state of the variances of the pairs
+    numbers: meaning of each number: a quantity, (quantity, 'variance'), VAR_BOARD, WEIGHT, UNKNOWN
     places: index of each quantity in the state
     """
 
@@ -65,11 +65,7 @@ class StateLayout:
         self.pairs = {quantity: k for k, quantity in enumerate(quantities)}
         self.lag_pairs = slice(len(sensors), len(self.pairs))
         self.variances = slice(VAR_GRADIENT, GRADIENT + 2 * len(self.pairs), 2)
-        numbers = [
-            number for quantity in quantities for number in (quantity, (quantity, 'variance'))
-        ]
+        numbers = [number for each in quantities for number in (each, (each, 'variance'))]
         self.numbers = (Board(), VAR_BOARD, Rate(), WEIGHT, UNKNOWN, *numbers, *spec.plays)
         self.width = len(self.numbers)
-        self.places = {
-            number: k for k, number in enumerate(self.numbers) if isinstance(number, Quantity)
-        }
+        self.places = {key: k for k, key in enumerate(self.numbers) if isinstance(key, Quantity)}

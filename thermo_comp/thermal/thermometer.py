@@ -26,27 +26,26 @@ from typing import Final
 
 from .settings import ThermometerSettings
 
-OUTLIER_SIGMAS: Final = 6.0  # innovation in sd beyond which a reading is down-weighted
-OUTLIER_LIMITS: Final = 5.0  # innovation / outlier limit, beyond which a reading is rejected
-RESTART_READINGS: Final = 4  # number of consecutive outliers of equal sign for a restart
+OUTLIER_SIGMAS: Final = 6.0  # innovation / its sd above which a reading is down-weighted
+OUTLIER_LIMITS: Final = 5.0  # innovation / limit of an outlier above which a reading is rejected
+RESTART_READINGS: Final = 4  # consecutive outliers of equal sign after which the filter restarts
 # Mean time in the quiet mode [s]; the mean time in the bending mode is the lag of the sensor.
 SOAK_S: Final = 900.0
-# Sd of the noise that drives the temperature's second derivative: quiet filter / bending filter;
-# `CELL_SHARE` is this ratio for a sensor whose readings never change by noise alone.
+# Sd of the noise that drives the temperature's second derivative: quiet filter / bending filter.
 QUIET_SHARE: Final = 5e-3
-CELL_SHARE: Final = 0.2
+CELL_SHARE: Final = 0.2  # this ratio for a sensor whose readings never change by noise alone
 _ROOT_HALF: Final = 0.7071067811865476  # 1 / sqrt(2)
 _DENSITY_AT_0: Final = 0.3989422804014327  # 1 / sqrt(2 pi)
 #: Range of readings accepted as temperatures [degC]; the lower end is absolute zero.
 COLDEST: Final = -273.15
 HOTTEST: Final = 1000.0
 HORIZON_INTERVALS: Final = 5.0  # longest linear extrapolation [reading intervals]
-LONGEST_STEP_SHARE: Final = 0.125  # longest step of a prediction / lag of the sensor
+LONGEST_STEP_SHARE: Final = 0.125  # longest time step of `predict` / lag of the sensor
 NOISE_MEMORY: Final = 200.0  # number of innovations over which the noise factor is averaged
 
-# The filters of the two modes are written out in floats: matrix operations would be slower.
+#: Temperature, rate, acceleration; then elements 00, 01, 02, 11, 12, 22 of their covariance. The
+#: filters are written out in floats, because matrix operations would be slower.
 State = tuple[float, float, float, float, float, float, float, float, float]
-"""Temperature, rate, acceleration; then elements 00, 01, 02, 11, 12, 22 of their covariance."""
 
 _NOWHERE: State = (nan, nan, nan, inf, 0.0, 0.0, inf, 0.0, inf)  # state before the first reading
 
@@ -70,8 +69,8 @@ class Thermometer:
         noise, quantum = settings.noise_sd_c, settings.quantum_c
         self._noise = noise * noise
         self._flat = noise * noise + quantum * quantum / 12.0
-        self._noise_scale = 1.0  # actual / declared noise variance
-        self._n_turns = 8.0  # number of innovations in `_noise_scale`, with 8 for the prior
+        self._noise_scale = 1.0  # noise factor: actual / declared noise variance
+        self._n_turns = 8.0  # number of innovations in `_noise_scale`, 8 of which are its prior
         self._has_cells = settings.has_cells
         self._quantum = quantum
         self._lag = settings.lag_s
@@ -98,8 +97,8 @@ class Thermometer:
         self._covariance = 0.0  # covariance of temperature and rate
         self._quiet: State = _NOWHERE
         self._bent: State = _NOWHERE
-        self._surprise = 0.0
-        self._n_strange = 0
+        self._innovation = 0.0
+        self._n_outliers = 0
 
     def update(self, stamp_ns: int, reading_c: float) -> bool:
         """
@@ -141,48 +140,39 @@ class Thermometer:
         scale = self._noise_scale
         noise = self._flat * scale
         spread = variance + noise
-        surprise = reading_c - expected
-        is_turning = surprise * self._surprise < 0.0
-        self._surprise = surprise
+        innovation = reading_c - expected
+        is_turning = innovation * self._innovation < 0.0
+        self._innovation = innovation
         if is_turning and not self._has_cells:
             # Estimate the noise from innovations whose sign differs from that of the innovation
             # before: a change of the rate gives innovations of equal sign.
-            excess = min(surprise * surprise / spread - 1.0, 8.0)
+            excess = min(innovation * innovation / spread - 1.0, 8.0)
             if self._n_turns < NOISE_MEMORY:
                 self._n_turns += 1.0
             self._noise_scale = max(1.0, scale * (1.0 + excess / self._n_turns))
-        # The cheap test comes first: an outlier's innovation is at least OUTLIER_SIGMAS standard
-        # deviations.
-        if surprise * surprise > OUTLIER_SIGMAS**2 * spread and abs(surprise) > (
-            limit := OUTLIER_SIGMAS * sqrt(spread)
-            + 5.0 * self._bend * dt * dt
-            + 1.5 * self._quantum
-        ):
-            self._n_strange = 1 if is_turning else self._n_strange + 1
-            if self._n_strange >= RESTART_READINGS:
+        limit = OUTLIER_SIGMAS * sqrt(spread) + 5.0 * self._bend * dt * dt + 1.5 * self._quantum
+        if abs(innovation) > limit:
+            self._n_outliers = 1 if is_turning else self._n_outliers + 1
+            if self._n_outliers >= RESTART_READINGS:
                 self.n_restarts += 1
                 self._start(stamp_ns, reading_c)
                 return True
-            if abs(surprise) > OUTLIER_LIMITS * limit:
+            if abs(innovation) > OUTLIER_LIMITS * limit:
                 return False
-            noise = max(noise, surprise * surprise / OUTLIER_SIGMAS**2 - variance)
+            noise = max(noise, innovation * innovation / OUTLIER_SIGMAS**2 - variance)
         else:
-            self._n_strange = 0
+            self._n_outliers = 0
         measured = reading_c
         if self._has_cells:
-            rate = quiet[1] + prior_bending * (bent[1] - quiet[1])
-            measured, noise = self._cell(
-                reading_c, expected, variance, rate * dt, bent[6] * dt * dt
-            )
+            move = (quiet[1] + prior_bending * (bent[1] - quiet[1])) * dt
+            measured, noise = self._cell(reading_c, expected, variance, move, bent[6] * dt * dt)
 
-        # Update the filter of each mode, and the probability of the bending mode from the
-        # likelihoods of the innovations of both filters.
+        # Update the filters of both modes, and the probability of the bending mode by the
+        # likelihoods of their innovations.
         if noise < inf:
-            quiet, innovation, s = correct(quiet, measured, noise)
-            bent, bent_innovation, bent_s = correct(bent, measured, noise)
-            evidence = 0.5 * (
-                innovation * innovation / s - bent_innovation * bent_innovation / bent_s
-            )
+            quiet, of_quiet, s = correct(quiet, measured, noise)
+            bent, of_bent, bent_s = correct(bent, measured, noise)
+            evidence = 0.5 * (of_quiet * of_quiet / s - of_bent * of_bent / bent_s)
             if not -30.0 < evidence < 30.0:
                 evidence = 30.0 if evidence > 0.0 else -30.0
             odds = prior_bending * sqrt(s / bent_s) * exp(evidence)
@@ -225,7 +215,7 @@ class Thermometer:
         rate = self.rate
         unknown = 0.0
         if not -horizon <= ahead <= horizon:
-            # After the extrapolation horizon the temperature is held constant, with a variance
+            # Beyond the extrapolation horizon the temperature is held constant, with a variance
             # that grows by the square of the change that its rate or an unseen ramp would cause.
             dt = horizon if ahead > 0.0 else -horizon
             beyond = ahead - dt
@@ -269,7 +259,7 @@ class Thermometer:
         half = 0.5 * self._quantum
         noise = self._noise
         if variance < 4.0 * noise:
-            # The sd of the prediction is less than twice the noise: match the moments of the
+            # The sd of the prediction is below twice that of the noise: match the moments of the
             # prediction truncated to the reading's cell. Alternating readings show a cell's edge.
             spread = variance + noise
             sd = sqrt(spread)
@@ -295,8 +285,8 @@ class Thermometer:
         box = half * half / 3.0
         if variance > box:
             return reading, variance * box / (variance - box)
-        # A prediction outside the reading's cell (one quantum wide) is corrected to the edge; all
-        # readings taken while the prediction changes by its sd count as one measurement.
+        # A prediction outside the reading's cell is corrected to the edge; all readings taken
+        # while the prediction changes by its sd count together as one measurement.
         if abs(expected - reading) > half:
             edge = reading + (half if expected > reading else -half)
             return edge, variance * max(1.0, sqrt(variance) / (abs(move) + 1e-30))
@@ -311,16 +301,11 @@ def mix(state: State, other: State, share: float) -> State:
     apart = share * (1.0 - share)
     at, av = apart * dt, apart * dv
     return (
-        t + share * dt,
-        v + share * dv,
-        a + share * da,
-        p00 + share * (r00 - p00) + at * dt,
-        p01 + share * (r01 - p01) + at * dv,
-        p02 + share * (r02 - p02) + at * da,
-        p11 + share * (r11 - p11) + av * dv,
-        p12 + share * (r12 - p12) + av * da,
-        p22 + share * (r22 - p22) + apart * da * da,
-    )
+        t + share * dt, v + share * dv, a + share * da,
+        p00 + share * (r00 - p00) + at * dt, p01 + share * (r01 - p01) + at * dv,
+        p02 + share * (r02 - p02) + at * da, p11 + share * (r11 - p11) + av * dv,
+        p12 + share * (r12 - p12) + av * da, p22 + share * (r22 - p22) + apart * da * da,
+    )  # fmt: skip
 
 
 def predict(state: State, dt: float, lag: float, power: float) -> State:
@@ -359,18 +344,8 @@ def correct(state: State, measured: float, variance: float) -> tuple[State, floa
     k1 = p01 / spread
     k2 = p02 / spread
     left = variance / spread
-    return (
-        (
-            t + k0 * innovation,
-            v + k1 * innovation,
-            a + k2 * innovation,
-            left * p00,
-            left * p01,
-            left * p02,
-            p11 - k1 * p01,
-            p12 - k1 * p02,
-            p22 - k2 * p02,
-        ),
-        innovation,
-        spread,
-    )
+    corrected = (
+        t + k0 * innovation, v + k1 * innovation, a + k2 * innovation,
+        left * p00, left * p01, left * p02, p11 - k1 * p01, p12 - k1 * p02, p22 - k2 * p02,
+    )  # fmt: skip
+    return corrected, innovation, spread

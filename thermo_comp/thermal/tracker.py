@@ -4,9 +4,9 @@
 Owns the tracker of a unit's thermal state: thermometers, regime, memory, dynamic weight.
 
 The compensator, the fit and the report all run `ThermalTracker`, so a regressor has the same value
-in the fit and in the correction; where the fit averages readings, the same value within the noise
-of a reading. `ThermalTracker` is causal and reads no clock: each reading has a stamp, and the
-thermal state is requested for a stamp.
+in the fit and in the correction (within the noise of a reading where the fit averages readings).
+`ThermalTracker` is causal and reads no clock: each reading has a stamp, and the thermal state is
+requested for a stamp.
 """
 
 from copy import copy
@@ -25,11 +25,10 @@ from .thermometer import RESTART_READINGS, Thermometer
 LOST_GRADIENT_RELATIVE_SD: Final = 0.5
 #: Time without a regime decision after which the regime is unknown / lag of the case thermometer.
 UNWATCHED_SHARE: Final = 0.25
-#: Largest change of the self-heating gradient since the fit that does not count as an error of the
-#: board temperature, because the air flow may have changed: in K, and relative to the gradient in
-#: the fit.
-SELF_HEATING_CHANGE_K: Final = 1.0
-SELF_HEATING_CHANGE: Final = 0.5
+# Largest change of the self-heating gradient since the fit that is not taken as an error of the
+# board temperature, because the air flow may have changed: the larger of these two.
+SELF_HEATING_CHANGE_K: Final = 1.0  # in K
+SELF_HEATING_CHANGE: Final = 0.5  # relative to the gradient in the fit
 ANY_RANGE: Final = (-inf, inf)
 
 
@@ -49,16 +48,14 @@ class ThermalTracker:
         self.board = Thermometer(detector.board)
         others = {name: Thermometer(detector.case) for name in self.spec.sensors}
         self.thermometers = {BOARD_INPUT: self.board, **others}
-        #: The leading sensor: the first thermometer other than the board's.
-        self.case = others[self.spec.sensors[0]]
+        self.case = others[self.spec.sensors[0]]  # the leading sensor
         self.checks = {
             BOARD_INPUT: SensorCheck(self.board, self.case, board_lag_s),
             **{name: SensorCheck(sensor, self.board, 0.0) for name, sensor in others.items()},
         }
         self.copies = {name: CopyCheck() for name in others}
         self.memory = ThermalMemory(self.spec)
-        #: Stamp of the newest reading that was used, or None before the first reading.
-        self.updated_ns: int | None = None
+        self.updated_ns: int | None = None  # newest stamp of a used reading
         self._decided_ns: int | None = None
         self._weight = 0.0
         self._weight_ns = 0
@@ -91,12 +88,12 @@ class ThermalTracker:
         usual_s = max(UNWATCHED_SHARE * lag_s, config.case_timeout_s)
         #: Time without a decision after which the regime is unknown [s].
         self._unwatched_s = min(usual_s, max(lag_s, self.settings.board.lag_s))
-        # Set the lag in a copy of the board's plausibility check: other trackers may share it.
+        # Set the lag in a copy of the board's plausibility check, which other trackers may share.
         self.checks = {**self.checks, BOARD_INPUT: copy(self.checks[BOARD_INPUT])}
         self.checks[BOARD_INPUT].lag_s = board_lag_s
 
     def is_live(self, stamp_ns: int, sensor: Thermometer) -> bool:
-        """Whether the age of a sensor's last reading at a stamp is at most the case time-out."""
+        """Whether a sensor's last reading is at most `case_timeout_s` older than a stamp."""
         seen_ns = sensor.stamp_ns
         return seen_ns is not None and (stamp_ns - seen_ns) * 1e-9 <= self.config.case_timeout_s
 
@@ -137,7 +134,7 @@ class ThermalTracker:
             memory.board_step(stamp_ns, board.temperature, error)
             age_s = (stamp_ns - (memory.board.start_ns or 0)) * 1e-9
             if age_s <= max(self._board_lag_s, board.settings.lag_s):
-                # A ramp that began before the start is visible in the board's rate within its lag.
+                # A ramp that began before the start shows in the board's rate within this time.
                 rate = abs(board.rate)
                 memory.sure_rate = max(memory.sure_rate, rate - 2.0 * sqrt(board.var_rate))
                 memory.start_rate = max(memory.sure_rate, rate)
@@ -160,21 +157,21 @@ class ThermalTracker:
     def _use(
         self, name: str, sensor: Thermometer, check: SensorCheck, stamp_ns: int, celsius: float
     ) -> bool:
-        """Update a thermometer and, after a jump or gap, the lags; False: reading not used."""
+        """Use a reading, if plausible; after a jump or gap adjust the lags. False: not used."""
         if check.has_wrong_start(stamp_ns, celsius):
             self._begin_again(name, sensor)
         before_ns, before, n_restarts = sensor.stamp_ns, sensor.temperature, sensor.n_restarts
         n_before, has_jumped = sensor.n_in_row, check.fault is Fault.STEP
-        is_anew = not check.admits(stamp_ns, celsius)
-        if is_anew:
-            # Restart the estimate if all readings within the time-out were rejected as steps.
+        is_rejected = not check.admits(stamp_ns, celsius)
+        if is_rejected:
+            # Restart the estimate if all readings during the time-out were rejected as steps.
             age_s = 0.0 if before_ns is None else (stamp_ns - before_ns) * 1e-9
             config, is_board = self.config, sensor is self.board
-            patience_s = config.temperature_timeout_s if is_board else config.case_timeout_s
-            if check.fault != Fault.STEP or age_s <= patience_s:
+            timeout_s = config.temperature_timeout_s if is_board else config.case_timeout_s
+            if check.fault != Fault.STEP or age_s <= timeout_s:
                 return False
             check.reset()
-        is_new = is_anew or check.is_revived
+        is_new = is_rejected or check.is_revived
         if is_new:
             sensor.reset()
         if not sensor.update(stamp_ns, celsius):
@@ -190,17 +187,17 @@ class ThermalTracker:
                 sensor.update(stamp_ns, celsius)
                 return True
             memory = self.memory if sensor is self.board else self.memory.banks[name]
-            if memory is self.memory and (is_anew or is_gap):
+            if memory is self.memory and (is_rejected or is_gap):
                 memory.forget()
             if is_new or not is_gap:
                 change = sensor.temperature - before
-                check.shift += change if is_anew or has_jumped else 0.0
+                check.shift += change if is_rejected or has_jumped else 0.0
                 check.note_jump(stamp_ns, change)
                 memory.note_jump(change)
         return True
 
     def _begin_again(self, name: str, sensor: Thermometer) -> None:
-        """Forget wrong readings of a sensor, and lags, gradients and regime computed from them."""
+        """Forget the readings of a sensor, and lags, gradients and regime computed from them."""
         sensor.reset()
         self.memory.forget_input(name)
         self._rest_gradients.clear()
@@ -222,7 +219,7 @@ class ThermalTracker:
             self._target = target
 
     def weight_at(self, stamp_ns: int) -> float:
-        """Weight of the dynamic set at a stamp, linear in time during a transition."""
+        """Return the weight of the dynamic set at a stamp, linear in time in a transition."""
         duration_s = self.config.transition_time_s
         if self._weight == self._target or not duration_s:
             return self._target
@@ -231,10 +228,9 @@ class ThermalTracker:
 
     def sample(self, stamp_ns: int) -> tuple[float, ...]:
         """
-        Thermal state at a stamp as a flat tuple, in the order of `StateLayout`; the board must
-        have at least one reading. The variance of a gradient is that of the sensor, without the
-        variance of the board temperature; the variance of a lag does not include the variance of
-        the lag's unknown initial state.
+        Return the thermal state at a stamp, in the order of `StateLayout`; the board must have a
+        reading. The variance of a gradient is that of the sensor, without the variance of the
+        board temperature; the variance of a lag is that for a known initial state.
         """
         board, rate, var_board = self.board.at(stamp_ns)
         decided_ns = self._decided_ns
@@ -268,18 +264,15 @@ class ThermalTracker:
 
     def _board_error(self, gradient: float) -> float:
         """
-        Return the variance of the error of the board temperature [K^2] that an impossible gradient
-        of the leading sensor indicates, as with a loose thermometer or with swapped topics.
+        Return the variance of the board temperature [K^2] due to an impossible gradient of the
+        leading sensor, as with a loose thermometer or with swapped topics.
         """
         loose, lead = self.loose_k(gradient), self.lead
         # If the board leads the case in a ramp, the topics of case and board may be swapped.
         return loose * loose + (gradient * gradient if lead.is_reversed else lead.extra_variance)
 
     def loose_k(self, gradient: float) -> float:
-        """
-        Return the part of a gradient of the leading sensor [K] that neither a ramp nor the unit's
-        self-heating explains, 0 for none.
-        """
+        """Return the part of the leading gradient [K] not explained by ramp and self-heating."""
         of_ramp = self._board_lag_s * self.board.rate
         lower, upper = self._rest_gradient_range
         excess = max(gradient - of_ramp - upper, lower - gradient + of_ramp)
@@ -311,22 +304,17 @@ class ThermalTracker:
         gradient = self._rest_gradients.get(name, usual) + lag * rate
         # Largest change of the case temperature since the board's extrapolation ended [K].
         unseen = self.settings.case.fastest_ramp_k_min / 60.0 * self.board.beyond(stamp_ns)
-        variance = (
-            (LOST_GRADIENT_RELATIVE_SD * gradient) ** 2
-            + lag * lag * self.board.var_rate
-            + unseen * unseen
-        )
-        return gradient, variance
+        of_rate = (LOST_GRADIENT_RELATIVE_SD * gradient) ** 2 + lag * lag * self.board.var_rate
+        return gradient, of_rate + unseen * unseen
 
     def is_settled(self, stamp_ns: int) -> bool:
-        """Whether the lags hardly depend on the temperatures before the first reading."""
+        """Whether the sd of each lag, initial state included, is below `MEMORY_SETTLED_SD`."""
         state = self.sample(stamp_ns)
         gradients = list(state[GRADIENT : GRADIENT + 2 * len(self.spec.sensors) : 2])
         lags = self.memory.at(stamp_ns, state[BOARD], gradients)[: 2 * len(self.spec.lags)]
-        extra = lags[1::2]
         start = start_covariance(self.spec.lags).diagonal().tolist()
         shares = self.memory.remaining_shares(stamp_ns)
         return all(
             variance * share * share + more < MEMORY_SETTLED_SD**2
-            for variance, share, more in zip(start, shares, extra, strict=True)
+            for variance, share, more in zip(start, shares, lags[1::2], strict=True)
         )
