@@ -16,6 +16,7 @@ from thermo_comp.convert.readers import read_log
 from thermo_comp.judging.evaluation import open_bags
 from thermo_comp.recording.reader import read_recording
 from thermo_comp.recording.topics import Topics
+from thermo_comp.recording.writer import BagWriter
 from thermo_comp.replay import replay
 
 
@@ -205,3 +206,19 @@ def test_arrays_that_cannot_be_fitted_and_doubled_bags_are_refused(root, tmp_pat
     for take in (lambda bags: tc.fit(bags, gravity=9.80665), open_bags):
         with pytest.raises(tc.ThermoCompError, match=r'copy\.mcap: has the same content'):
             take([bag, copy])
+
+
+def test_tc_read_keeps_the_known_force_of_a_bag_and_refuses_to_fit_a_rotation(root, tmp_path):
+    # WHY: `fit(read(bag))` took gravity as |f| in a bag whose metadata state another |f|.
+    source = read_recording(root / 'bags' / 'held_out.mcap').columns
+    for number, facts in enumerate(
+        (
+            {'specific_force_magnitude_m_s2': '29.4'},
+            {'rotation_topic': '/table', 'radius_m': '0.5'},
+        )
+    ):
+        with BagWriter(tmp_path / f'{number}.mcap', metadata=facts) as writer:
+            writer.write_counts('/accel/counts', source.accel_stamp_ns, source.accel, 'imu_link')
+    assert tc.read(tmp_path / '0.mcap').specific_force == '29.4'
+    with pytest.raises(ValueError, match='rotation_topic /table'):
+        tc.fit(tc.read(tmp_path / '1.mcap'), gravity=GRAVITY)

@@ -177,6 +177,7 @@ def read(path: str | Path, topics: Topics | None = None) -> Columns:
 
     """
     from .convert.readers import as_bags
+    from .fitting.sources import MAGNITUDE, ROTATION
     from .recording.reader import read_recording
 
     with as_bags([Path(path)]) as (bag,):
@@ -186,6 +187,9 @@ def read(path: str | Path, topics: Topics | None = None) -> Columns:
     stamps = [block.accel_stamp_ns, *(reading[0] for reading in readings.values())]
     first_ns = min((int(stamp.min()) for stamp in stamps if len(stamp)), default=0)
     start_ns = first_ns // _MINUTE_NS * _MINUTE_NS
+    metadata = recording.info.metadata
+    # `fit` refuses a |f| that is not a number: only a bag contains the rotation rate.
+    force = f'{ROTATION} {metadata[ROTATION]}' if ROTATION in metadata else ''
     return Columns(
         time_s=_seconds(block.accel_stamp_ns, start_ns),
         counts=block.accel,
@@ -194,8 +198,9 @@ def read(path: str | Path, topics: Topics | None = None) -> Columns:
             for name, (stamps, value, _) in readings.items()
         },
         start_ns=start_ns,
-        serial=recording.info.metadata.get('serial'),
+        serial=metadata.get('serial'),
         name=shown_name(path),
+        specific_force=force or metadata.get(MAGNITUDE, ''),
     )
 
 

@@ -133,12 +133,14 @@ def read_rests(
             others.add(f'{start.serial} ({start.input})')
         return is_own
 
-    try:
-        # The node writes at most 320 kB a day; larger files than 64 MB are refused.
-        contents = [read_bounded(file, 1 << 26) for file in files]
-    except (OSError, ValueError) as error:
-        reason = getattr(error, 'strerror', None) or str(error)
-        raise RecordingError(f'cannot be read: {reason}', str(paths[0])) from error
+    contents = []
+    for file in files:
+        try:
+            # The node writes at most 320 kB a day; larger files than 64 MB are refused.
+            contents.append(read_bounded(file, 1 << 26))
+        except (OSError, ValueError) as error:
+            reason = getattr(error, 'strerror', None) or str(error)
+            raise RecordingError(f'cannot be read: {reason}', str(file)) from error
     rests, n_damaged = rests_of(contents, is_wanted)
     notes = [f'{counted(n_damaged, "damaged line")} of the rest logs skipped'] if n_damaged else []
     if others:
