@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 Tool = Literal['px4', 'ardupilot', 'imu_tk', 'imu_calib', 'kalibr']
 
-#: Texts of the findings of a conversion, printed in front of the number of rows found.
+#: Texts of the findings of a conversion, printed in front of the number of rows concerned.
 _FINDINGS = {
     'short_rows': 'rows left out, with fewer cells than the column map needs',
     'non_numeric': 'rows left out, with a time or a sample that is not a finite number',
@@ -43,7 +43,7 @@ def convert(
     rate_hz: float | None = options.TABLE_RATE,
     imu: int | None = option('Number of the IMU in an autopilot log, counted from 0.'),
     baro: int | None = option(
-        'Number of the barometer in an autopilot log that gives the case temperature.'
+        'Number of the barometer of an autopilot log whose temperature is that of the case.'
     ),
     allow_compensated: bool = option(
         'Accept samples that the autopilot has corrected by INS_TCAL or TC_A parameters.', False
@@ -62,8 +62,8 @@ def convert(
     table with the columns t ax ay az wx wy wz, in this order, or without t or
     wx wy wz, needs no headings. The board temperature of a PX4 or ArduPilot log
     is the IMU's (if missing, the barometer's), the case temperature the
-    barometer's; in a bag the board thermometer is the one with most namespaces in
-    common with the Imu.
+    barometer's. In a bag, the thermometer whose topic has most namespaces in
+    common with the Imu is that of the board.
 
     Example:
       thermo_comp convert log.csv --columns map.yaml -o unit42
@@ -137,8 +137,8 @@ def _print_conversion(out: Output, report: 'ConversionReport', output: Path) -> 
 
 def print_guess(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:
     """
-    Print a guessed column map and the unused columns of a table, unless `shown` contains the same
-    map or list of columns from another table.
+    Print the guessed column map and the unused columns of a table. `shown`: table of each text
+    printed so far; a repeated map is replaced by the name of its first table.
     """
     from ..convert.column_map import column_map_text
     from ..convert.headings import map_lines

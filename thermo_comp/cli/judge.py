@@ -128,7 +128,7 @@ def _print_axes(out: Output, judged: 'Judgement') -> None:
 
 
 def _print_expectations(out: Output, judged: 'Judgement') -> None:
-    """Print the errors beside those on data left out of the fit, if the file has any of these."""
+    """Print the errors next to those on data left out of the fit, if the file states these."""
     names = {'norm': '|f| - g', 'drift': 'drift of an axis'}
     parts = {names[key]: part for key, part in judged.expectations.items()}
     if any(isfinite(part.expected_rms) for part in parts.values()):
@@ -280,10 +280,10 @@ def update(
     output: Path = options.NEW_CALIBRATION,
     where: tuple[float | None, float] = options.place,
     ahead: float = option(
-        'Days of ageing after the last rest that the claimed sd covers.', 1.0, min=0.0, max=3650.0
+        'Days after the last rest whose ageing the claimed sd covers.', 1.0, min=0.0, max=3650.0
     ),
     allow: list[str] | None = option(
-        'gravity: take local gravity as exact; unit: accept a |f| like that of another unit.'
+        'gravity: take local gravity as exact; unit: accept a |f| that suggests another unit.'
     ),
     force: bool = options.FORCE,
     out: Output = options.out,
@@ -295,8 +295,8 @@ def update(
     rests, which may be in any attitude. Old and new calibration are compared on
     days left out of the update. The new calibration is written only if the rests
     determine an axis and the mean decrease of (|f| - g)^2 on left-out days
-    exceeds its standard error; else the exit code is 3, and sds with ageing are
-    printed.
+    exceeds its standard error; else the exit code is 3, and the command prints
+    the sd of each axis with ageing.
 
     Example:
       thermo_comp update unit42.yaml rests -o unit42_new.yaml
@@ -319,7 +319,7 @@ def update(
     if 'unit' not in allowed:
         refuse_another_unit(result)
     out.points(notes)
-    _show_axis_changes(result, out)
+    _print_axis_changes(out, result)
     out.points(change_texts(result))
     out.line(str(result.judged))
     is_better = result.judged.is_better and any(axis.is_determined for axis in result.axis_changes)
@@ -344,7 +344,7 @@ def update(
     )
 
 
-def _show_axis_changes(result: 'Update', out: Output) -> None:
+def _print_axis_changes(out: Output, result: 'Update') -> None:
     out.table(
         ('axis', 'bias ug', '+-', 'scale ppm', '+-', 'curve ug', '+-', 'at rest ug', '+-', 'sds'),
         [

@@ -70,7 +70,7 @@ def record(
     bags = PositionBags(output, serial)
     over = threading.Event()
     problems: Callable[[], Sequence[str]] = tuple
-    collected: dict[str, str] = {}
+    printed: dict[str, str] = {}
     # A second SIGINT or SIGTERM ends the process at once.
     with SignalWatch() as signals, closing(bags), ExitStack() as stack:
         signals.on_signal(over.set)
@@ -87,7 +87,7 @@ def record(
         show = stack.enter_context(out.live())
         for account in _accounts(out, news, test, bags):
             if show is None:
-                _print_account(out, account, problems(), collected)
+                _print_account(out, account, problems(), printed)
             else:
                 lines = [*problems(), _now(account), *_lines(account)]
                 show(_COLUMNS, _rows(account.positions), lines)
@@ -122,7 +122,7 @@ def _read_earlier(
 def _accounts(
     out: Output, news: Iterable['News | None'], test: 'Acquisition', bags: 'PositionBags'
 ) -> Iterator['Account']:
-    """Write blocks until test or bag ends; each None in `news` yields the state of the test."""
+    """Write the blocks until test or bag ends; yield the state of the test at each None."""
     chosen: str | None = None
     for new in news:
         if new is not None:
@@ -197,19 +197,19 @@ def _duration(text: str) -> float:
 
 
 def _print_account(
-    out: Output, account: 'Account', problems: Sequence[str], last: dict[str, str]
+    out: Output, account: 'Account', problems: Sequence[str], printed: dict[str, str]
 ) -> None:
-    """Print those texts about the test that have changed; `last`: texts printed last, by name."""
+    """Print the texts about the test that differ from those in `printed`, by name."""
     news = {'problem': ', '.join(problems)} if problems else {}
     if not problems:
-        last.pop('problem', None)
+        printed.pop('problem', None)
     for number, position in enumerate(account.positions, 1):
         if position.n_rests:
             news[f'position {number}'] = f'{position.reason or "good"}; {_reading(position.up)}'
     # Noise changes the direction after the semicolon: compare the text before the semicolon.
-    new = {name: text for name, text in news.items() if last.get(name) != text.partition(';')[0]}
+    new = {name: x for name, x in news.items() if printed.get(name) != x.partition(';')[0]}
     for name, text in new.items():
-        last[name] = text.partition(';')[0]
+        printed[name] = text.partition(';')[0]
         out.note(f'{name}: {text}')
     if any(text.startswith('good') for text in new.values()):
         out.note(_accuracy(account))
@@ -246,8 +246,8 @@ def _now(account: 'Account') -> str:
 def _next(account: 'Account') -> str:
     from ..fitting.coverage import direction_text
 
-    by = '' if isnan(account.next_deg) else f', {account.next_deg:.0f} deg from the present one'
-    return f'next position: {direction_text(account.next_up)}{by}'
+    angle = '' if isnan(account.next_deg) else f', {account.next_deg:.0f} deg from the present one'
+    return f'next position: {direction_text(account.next_up)}{angle}'
 
 
 def _accuracy(account: 'Account') -> str:
