@@ -44,7 +44,7 @@ CHOSEN = 'calibration'
 LEFT_OUT = 'left out'
 # Rate from which the heating (cooling) in bags counts as a heating (cooling) ramp [K/min].
 _SLOWEST_RAMP_K_MIN = 0.05
-#: Key of a bag's metadata in which the simulator stores the truth.
+#: Key of a bag's metadata in which the simulator stores the true parameters.
 _SIMULATED = 'truth'
 # Largest number of points of a line; a figure has fewer pixels in a row.
 _MOST_POINTS = 4000
@@ -72,7 +72,10 @@ class Stretch(NamedTuple):
 
 @dataclass(frozen=True)
 class ShownBag:
-    """A bag's regimes; temperature rates [K/s], second derivative [K/s^2], NaN until settled."""
+    """
+    A bag with its regimes, the rates of its thermometers [K/s] and the second derivative of the
+    leading sensor's temperature [K/s^2]; an estimate is NaN until it has settled.
+    """
 
     index: int
     bag: ReducedBag
@@ -153,7 +156,7 @@ class Evidence:
 
     @property
     def level(self) -> Literal['good', 'reserved', 'poor', 'open']:
-        """Verdict as a word; 'reserved': valid, with reservations or a large claimed sd."""
+        """Class of the verdict; 'reserved': valid, but with reservations or a large claimed sd."""
         if self.judgement is None or self.judgement.kind in (Verdict.OUTSIDE, Verdict.NO_CLAIM):
             return 'open'
         if not self.judgement.is_valid:
@@ -163,7 +166,7 @@ class Evidence:
 
     @cached_property
     def shown(self) -> ShownBag | None:
-        """The bag that the figures over time show, with the node's thermal state."""
+        """The bag that the figures over time show, with its temperature rates and regimes."""
         if not self.bags:
             return None
         calibration, index = self.calibration, widest(self.bags)
@@ -197,7 +200,7 @@ class Evidence:
 
     @cached_property
     def positions(self) -> tuple[Position, ...]:
-        """The still positions, with attitudes from the best known correction in `forces`."""
+        """The still positions, with attitudes from the last, best correction in `forces`."""
         windows = self.windows
         if windows is None or not self.forces:
             return ()
@@ -243,7 +246,7 @@ class Evidence:
         )
 
     def axis_residuals(self) -> dict[str, Floats]:
-        """Return the force less the mean direction of the position times the known |f|, (n, 3)."""
+        """Return the force less the known |f| in the position's mean direction, shape (n, 3)."""
         windows = self.windows
         if windows is None or self.gravity is None or not self.positions:
             return {}
@@ -296,7 +299,7 @@ def evidence_of_bags(
         bags=tuple(bags),
         windows=judgement.windows if judgement else windows,
         judgement=judgement,
-        findings=_against(calibration) if calibration else (),
+        findings=_reservations(calibration) if calibration else (),
         history=history_of([calibration, *others]) if calibration and others else (),
     )
 
@@ -320,7 +323,7 @@ def _is_reservation(finding: Finding) -> bool:
     return finding.level == 'advice' and finding.name != 'positions'
 
 
-def _against(calibration: Calibration) -> tuple[str, ...]:
+def _reservations(calibration: Calibration) -> tuple[str, ...]:
     """Return the reservations about a calibration, except advice to record more positions."""
     lower, upper = calibration.dynamic.rate_range_k_min
     notes = [
@@ -384,8 +387,8 @@ def shown_bag(bag: ReducedBag, index: int, detector: DetectorSettings) -> ShownB
     )
     every = slice(None, None, len(time) // _MOST_POINTS + 1)
     columns = np.array(rows).reshape(-1, 3, 2)[every]
-    board, case, bend = (_settled(*columns[:, k].T) for k in range(3))
-    return ShownBag(index, bag, start_ns, end, time[every], board, case, bend, tuple(stretches))
+    estimates = (_settled(*columns[:, k].T) for k in range(3))
+    return ShownBag(index, bag, start_ns, end, time[every], *estimates, tuple(stretches))
 
 
 def _settled(value: Floats, variance: Floats) -> Floats:

@@ -31,7 +31,7 @@ _ZERO_S = 120.0
 _SHADE = '#E9E9E9'
 # Diameter of the ring of the position with the largest residual [pt].
 _RING = 22.0
-# Largest number of positions, and so of rows, in `draw_every_position`.
+# Largest number of rows, one for each position, in `draw_every_position`.
 _MOST = 24
 #: Two-sided 95 % of a normal distribution, in standard deviations.
 BAND_SDS = 1.96
@@ -135,7 +135,12 @@ def draw_gravity(evidence: Evidence) -> Figure:
 def _panels(
     evidence: Evidence, heights: Sequence[float], *, more: float = 0.0, is_flagged: bool = False
 ) -> tuple[Figure, list[Axes], ShownBag, float]:
-    """Return a figure, its panels over time, the bag that they show, unit of the time axis [s]."""
+    """
+    Return a figure, its panels over time, the bag that they show, and the unit of time [s].
+
+    `more`: height of the figure besides the panels [in]; `is_flagged`: the last panel, which shows
+    the regime itself, gets no shading.
+    """
     shown = required(evidence.shown)
     unit, name = style.time_unit(shown.duration_s)
     figure = style.new_figure(more + sum(heights))

@@ -34,9 +34,9 @@ NODE_NAME = 'thermo_comp'
 
 #: Pause after a wake-up [s], for best-effort samples at 7 kHz or more. The pause saves a third
 #: of the CPU time at 10 kHz; at 5 kHz it would delay a sample by more than the correction takes.
-REST_S = 0.2e-3
+PAUSE_S = 0.2e-3
 
-#: Time within which the process ends after a signal, even if a call hangs [s].
+#: Time after a signal at which a process that has not ended, as in a hanging call, is ended [s].
 ENDING_S = 1.8
 
 USAGE = f"""\
@@ -74,7 +74,7 @@ class CompensationNode:
         loaded = read_within(config.calibration_file, config.calibration_directory)
         compensator = Compensator(loaded.calibration, config.compensator_config())
         self._check(loaded, config, compensator.thermal.inputs)
-        self._loop = WaitLoop(self.node, REST_S)
+        self._loop = WaitLoop(self.node, PAUSE_S)
         self._relay = Relay(self._loop, loaded, compensator, config)
         self._reporter = Reporter(self._loop, self._relay)
         self._reader = Reader()

@@ -107,7 +107,7 @@ class NodeConfig:
     )
     stuck_timeout: float = _parameter(
         _DEFAULTS.stuck_timeout_s,
-        'Longest repetition of equal readings that is published [s], on all axes, or on one axis '
+        'Longest repetition of equal values that is published [s], on all axes, or on one axis '
         'while the others change or show noise; at least 50 repetitions are published. Samples of '
         'three zeros are dropped at once. 0: repetitions and zeros are published.',
         (0.0, 3600.0),
@@ -119,9 +119,9 @@ class NodeConfig:
     )
     gravity_tolerance: float = _parameter(
         _DEFAULTS.gravity_tolerance_m_s2,
-        'Error of |f| at rest [m/s^2], beyond 5 sd, at which publishing stops, as with the '
-        'calibration of another unit; 0: no error of |f| stops publishing. A reversed axis '
-        'changes |f| at rest by at most twice the bias of the axis.',
+        'Publishing stops if the error of |f| at rest exceeds this value plus 5 sd [m/s^2], as '
+        'with the calibration of another unit; 0: no error of |f| stops publishing. A reversed '
+        'axis changes |f| at rest by at most twice the bias of the axis.',
         (0.0, 100.0),
     )
     diagnostics_period: float = _parameter(1.0, 'Period of /diagnostics [s].', (0.01, 60.0))

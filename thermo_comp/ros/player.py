@@ -7,8 +7,8 @@ time or as fast as the subscribers acknowledge messages.
 Topics have the node's relative names. Messages keep the bag's order and their bytes; ROS 1
 messages are rewritten in CDR, and temperatures of other types as Temperature. After `WINDOW`
 messages of a topic the player waits until every reliable subscriber has acknowledged them. Fast
-DDS requests acknowledgements every 3 s, and with every message while a history is full: the
-histories are small, and transient-local durability keeps them full.
+DDS requests acknowledgements every 3 s, but with every message while a history is full; therefore
+the histories are small, and transient-local durability keeps them full.
 """
 
 from __future__ import annotations
