@@ -50,10 +50,10 @@ def evaluate(
 
     The verdict compares the RMS residual with --tolerance or, without
     --tolerance, with twice the uncertainty that the calibration claims for the
-    same windows; six positions or more show which axis has shifted. Exit code 0
-    only if the bags show that the calibration is valid. Rest logs of the node
-    instead of bags show the drift over the days, and the day from which the
-    drift exceeds the claimed uncertainty.
+    same windows; six positions or more show which axis has shifted. The exit
+    code is 0 only if the bags show that the calibration is valid. With rest logs
+    of the node instead of bags, the command prints the drift over the days, and
+    the day from which the drift exceeds the claimed uncertainty.
 
     Example:
       thermo_comp evaluate held_out.mcap -c unit42.yaml --tolerance 100ug
@@ -87,10 +87,10 @@ def evaluate(
         with table_writer(csv, {}, overwrite=force) as write:
             write(columns_of(judged.windows, [bag.source.name for bag in result.bags]))
     drifts = drifts_of(history_of([model for _, model in models]))
-    print_sections(out, result.judgements)
+    _print_sections(out, result.judgements)
     _print_axes(out, judged)
     _print_expectations(out, judged)
-    _print_levels(out, judged)
+    _print_by_force(out, judged)
     rates = {k: judged.rate for k, judged in result.judgements.items() if judged.rate is not None}
     if rows := _sections(rates, millidegrees):
         out.table(
@@ -142,7 +142,7 @@ def _print_expectations(out: Output, judged: 'Judgement') -> None:
         )
 
 
-def _print_levels(out: Output, judged: 'Judgement') -> None:
+def _print_by_force(out: Output, judged: 'Judgement') -> None:
     """Print the residuals for each value of |f|, if |f| differed from gravity in any window."""
     if judged.by_force:
         out.table(
@@ -173,7 +173,7 @@ def _print_drifts(out: Output, drifts: Sequence['Drift']) -> None:
         )
 
 
-def print_sections(out: Output, judgements: Mapping[str, Any]) -> None:
+def _print_sections(out: Output, judgements: Mapping[str, Any]) -> None:
     """Print the residuals of |f| of each calibration."""
     (window_s,) = {judgement.windows.window_s for judgement in judgements.values()}
     out.table(
@@ -224,9 +224,9 @@ def report(
     """
     Write the certificate of a unit: one HTML page without network access.
 
-    Shows temperatures, regime, |f| before and after the correction, the
-    functions of temperature with their uncertainty, and the verdict of
-    `evaluate`, with its exit code. `fit --report` writes a fit's certificate.
+    The page shows temperatures, regime, |f| before and after the correction, the
+    functions of temperature with their uncertainty, and the verdict. The exit
+    code is that of `evaluate`. `fit --report` writes the certificate of a fit.
 
     Example:
       thermo_comp report held_out.mcap -c unit42.yaml -o unit42.html

@@ -48,7 +48,7 @@ def record(
     out: Output = options.out,
 ) -> None:
     """
-    Record a test, a bag per position, and show the missing data.
+    Record a test, a bag per position, and show which data are missing.
 
     Reads the topics of the driver, or a growing bag. Shows the positions with
     their temperatures and ramps, the expected accuracy of bias, scale and
@@ -122,7 +122,7 @@ def _read_earlier(
 def _accounts(
     out: Output, news: Iterable['News | None'], test: 'Acquisition', bags: 'PositionBags'
 ) -> Iterator['Account']:
-    """Write the blocks until test or bag ends; yield the state of the test at each None."""
+    """Write blocks until test or bag ends; yield the state of the test at each None in `news`."""
     chosen: str | None = None
     for new in news:
         if new is not None:

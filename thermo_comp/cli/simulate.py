@@ -140,7 +140,7 @@ def simulate(
 def _metadata(
     unit: 'UnitModel', station: 'Position', truth: dict[str, Any], gravity: float, is_known: bool
 ) -> dict[str, str]:
-    """Return a bag's metadata: serial, true parameters; of a rotating unit also |f|."""
+    """Return a bag's metadata: serial, true parameters and, with rotation, |f| or its source."""
     from .. import __version__
     from ..fitting import sources
 
@@ -192,10 +192,9 @@ def _write(
     start_ns: int | None = None
     for run in runs:
         if start_ns is None:
-            first = [
-                stamps[0] for stamps in (run.board_stamp_ns, run.case_stamp_ns) if len(stamps)
-            ]
-            start_ns = max(first) if len(first) == 2 else 0
+            # With two thermometers the samples begin at the later one's first reading.
+            board_ns, case_ns = run.board_stamp_ns, run.case_stamp_ns
+            start_ns = max(board_ns[0], case_ns[0]) if len(board_ns) and len(case_ns) else 0
         keep = run.accel_stamp_ns >= start_ns
         # Write temperatures first, so that at equal stamps a temperature precedes the sample.
         writer.write_temperature(topics.board, run.board_stamp_ns, run.board)

@@ -99,9 +99,9 @@ class Evidence:
     The content of a report; missing parts are None or empty.
 
     `windows`: windows at rest of all bags; `judgement`: judgement of `windows`; `steps`: residuals
-    after each step of the model; `left_out`: for each position of `windows` its RMS of ``|f| - g``
-    by a fit to the other positions [m/s^2]; `findings`: reservations about calibration or bags;
-    `checks`: passed checks.
+    after each step of the model; `left_out`: error of each position of `windows` with a fit to the
+    other positions [m/s^2], see `left_out_text`; `findings`: reservations about calibration or
+    bags; `checks`: passed checks.
     """
 
     serial: str
@@ -200,7 +200,7 @@ class Evidence:
 
     @cached_property
     def positions(self) -> tuple[Position, ...]:
-        """The still positions, with attitudes from the last, best correction in `forces`."""
+        """The still positions; their attitudes are from corrected or else raw forces."""
         windows = self.windows
         if windows is None or not self.forces:
             return ()
@@ -387,8 +387,8 @@ def shown_bag(bag: ReducedBag, index: int, detector: DetectorSettings) -> ShownB
     )
     every = slice(None, None, len(time) // _MOST_POINTS + 1)
     columns = np.array(rows).reshape(-1, 3, 2)[every]
-    estimates = (_settled(*columns[:, k].T) for k in range(3))
-    return ShownBag(index, bag, start_ns, end, time[every], *estimates, tuple(stretches))
+    board, case, second = (_settled(*columns[:, k].T) for k in range(3))
+    return ShownBag(index, bag, start_ns, end, time[every], board, case, second, tuple(stretches))
 
 
 def _settled(value: Floats, variance: Floats) -> Floats:

@@ -43,6 +43,7 @@ _LOOKS: dict[str, tuple[style.Line, str, str]] = {
     'cooling': (style.AXIS_LINES[2], '....', 'v'),
 }
 _POINT: style.Line = {'color': style.BLACK, 'ms': 3.0, 'mfc': 'none', 'mew': 0.8}
+_LABEL: style.Line = {'textcoords': 'offset points', 'fontsize': 7.5}
 
 
 def draw_temperatures(evidence: Evidence) -> Figure:
@@ -242,7 +243,7 @@ def draw_every_position(evidence: Evidence) -> Figure:
 
 
 def draw_positions(evidence: Evidence) -> Figure:
-    """Draw the directions of the positions on the sphere, and the residual of each."""
+    """Draw the directions of the positions on the sphere, and the residual of each position."""
     figure = style.new_figure(3.0)
     up, down = figure.subplots(1, 2)
     axis = evidence.least_known
@@ -255,7 +256,7 @@ def draw_positions(evidence: Evidence) -> Figure:
             text = '±' + ug_text(axis.sd_m_s2).replace('ug', 'µg')
             # Shift the label towards the centre of the disc, as axis names are outside the disc.
             by = (0.0, 6.0 if place[1] < 0.0 else -12.0)
-            _note(axes, text, place, by, ha='center', color=style.RED)
+            axes.annotate(text, place, by, ha='center', color=style.RED, **_LABEL)
         axes.set_title(name, loc='center')
     return figure
 
@@ -267,22 +268,13 @@ def equal_area(up: tuple[float, ...], side: int) -> tuple[float, float]:
     return float(x * factor), float(y * factor)
 
 
-def _note(
-    axes: Axes, text: str, place: tuple[float, float], by: tuple[float, float], **look: Any
-) -> None:
-    axes.annotate(text, place, by, textcoords='offset points', fontsize=7.5, **look)
-
-
 def _draw_hemisphere(axes: Axes, positions: tuple[Position, ...], side: int, judged: str) -> None:
     angle = np.linspace(0.0, 2.0 * np.pi, 181)
     axes.plot(np.cos(angle), np.sin(angle), color='black', linewidth=0.8)
     # Radius of the circle at an elevation of 45 degrees, in the projection of `equal_area`.
     ring = np.sqrt(1.0 - np.sin(np.pi / 4.0))
-    for line in (
-        (ring * np.cos(angle), ring * np.sin(angle)),
-        ([-1, 1], [0, 0]),
-        ([0, 0], [-1, 1]),
-    ):
+    lines = (ring * np.cos(angle), ring * np.sin(angle)), ([-1, 1], [0, 0]), ([0, 0], [-1, 1])
+    for line in lines:
         axes.plot(*line, color='#BBBBBB', linewidth=0.6)
     for label, x, y in (('+x', 1.2, 0), ('−x', -1.2, 0), ('+y', 0, 1.2), ('−y', 0, -1.2)):
         axes.text(x, y, label, ha='center', va='center', color='#555555', fontsize=7.5)
@@ -294,7 +286,7 @@ def _draw_hemisphere(axes: Axes, positions: tuple[Position, ...], side: int, jud
             if largest > 0.0:
                 size = _RING * np.sqrt(position.residual_rms.get(judged, 0.0) / largest)
                 axes.plot(*place, 'o', markersize=size, mfc='none', mec=style.RED, mew=1.1)
-            _note(axes, str(position.number), place, (3.5, 2.5))
+            axes.annotate(str(position.number), place, (3.5, 2.5), **_LABEL)
     axes.set(xlim=(-1.32, 1.32), ylim=(-1.32, 1.32), aspect='equal')
     axes.set_axis_off()
 

@@ -19,9 +19,9 @@ from typing import Any
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu, Temperature
 
-#: Compensates a sample: from stamp [ns], x, y, z to force and covariance; None: sample dropped.
+#: Corrects a sample: takes stamp [ns], x, y, z; returns force and covariance, None if dropped.
 Process = Callable[[int, float, float, float], 'tuple[float, ...] | None']
-#: Corrects the angular rate of a sample: from stamp [ns], x, y, z to rate and its variances.
+#: Corrects the angular rate of a sample: takes stamp [ns], x, y, z; returns rate and variances.
 CorrectRate = Callable[[int, float, float, float], 'tuple[float, ...]']
 
 #: Longest message read [bytes]; an Imu with the longest frame name is shorter.
@@ -54,7 +54,7 @@ class Traffic:
 
 
 class SampleConverter:
-    """Converts serialized samples to serialized Imu; empty `frame_id`: the frame of the input."""
+    """Converts serialized samples to serialized Imu; `frame_id`: frame of the Imu ('': input)."""
 
     def __init__(self, kind: Any, frame_id: str = '', traffic: Traffic | None = None) -> None:
         self._kind, self._frame_id = kind, frame_id
@@ -64,7 +64,7 @@ class SampleConverter:
         self._name, self._passed, self._frame = b'', 0, b''
         self._unpack: Callable[[bytes], tuple[Any, ...]] = struct.Struct('').unpack
         self._pack: Callable[..., bytes] = struct.Struct('').pack
-        #: Last result of `process`, for reports.
+        #: Force and covariance that `process` returned last, for the diagnostics.
         self.last_result: tuple[float, ...] | None = None
 
     def convert(

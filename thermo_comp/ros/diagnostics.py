@@ -31,11 +31,11 @@ from .reader import LoadedCalibration
 from .relay import Relay
 from .waitloop import WaitLoop
 
-# Time without samples until waiting readings are used [s]; Fast DDS may deliver samples 3 s late.
+# Time without samples after which readings are used [s]; Fast DDS may deliver samples 3 s late.
 IDLE_S = 5.0
-#: A temperature reading stamped later than the samples by over this time [s] has another clock.
+#: Stamps of readings that are ahead of those of samples by more than this show another clock [s].
 AHEAD_S = 5.0
-#: Samples have stopped if none arrives for this number of conversion cycles and this time [s].
+#: The samples have stopped if none has arrived for this number of conversion cycles and time [s].
 SILENT_CYCLES, SILENT_S = 5.0, 0.5
 #: Time for which the level must stay lower until the lower level is logged [s], so that a fault
 #: that comes and goes does not fill the log.
@@ -114,11 +114,11 @@ class Reporter:
             if passed_s > 0.0 and new['n_in'] and self._before['n_in']:
                 rate = new['n_in'] / passed_s
         self._before, self._before_ns = counts, status.stamp_ns
-        topic = self._relay.samples.subscription.topic_name
+        topic = self._relay.running.samples.subscription.topic_name
         findings = list(self._findings())
         findings += findings_of(loaded, status, new, rate, silence_s, topic)
-        # Vehicle accelerations give no warning: without nonlinearity in the calibration, warnings
-        # begin at 2.01 g, where the unknown square term has an sd of 0.1 mg.
+        # Without nonlinearity in the calibration, warnings begin at 2.01 g, where the unknown
+        # square term has an sd of 0.1 mg, so that accelerations of a vehicle give no warning.
         allowance = 0.0 if loaded.calibration.nonlinearity else STANDARD_GRAVITY
         if (over := self._force_excess()) > allowance:
             text = f'|f| {over:.3g} m/s^2 above the largest |f| of the fit: the covariance grows'
@@ -163,7 +163,7 @@ class Reporter:
 
     def _count_lost(self) -> None:
         """Count samples missing in the sequence numbers, if the driver is the only publisher."""
-        samples = self._relay.samples
+        samples = self._relay.running.samples
         n_lost, samples.n_lost = samples.n_lost, 0
         before, self._n_publishers = self._n_publishers, samples.count_publishers()
         if before == self._n_publishers == 1:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the node `thermo_comp`: from samples and temperatures to force, regime flag and diagnostics.
+Owns the node `thermo_comp`: samples and temperatures in; force, regime flag, diagnostics out.
 
 The output equals that of the offline replay of the same messages in the same order bit for bit.
 Parameters are checked when they are set, and applied between two wake-ups of the node's loop.
@@ -36,7 +36,7 @@ NODE_NAME = 'thermo_comp'
 #: of the CPU time at 10 kHz; at 5 kHz it would delay a sample by more than the correction takes.
 PAUSE_S = 0.2e-3
 
-#: Time after a signal at which a process that has not ended, as in a hanging call, is ended [s].
+#: Time after a signal at which a process is ended even if a call hangs [s].
 ENDING_S = 1.8
 
 USAGE = f"""\
@@ -53,7 +53,7 @@ parameters:
 #: Prefix that the launch file puts before the name of a parameter whose argument is missing.
 NOT_GIVEN = 'not_given.'
 
-#: Errors caused by the user's files, values or environment, or the middleware (RuntimeError).
+#: Errors due to the user's files, values or environment, or to the middleware (RuntimeError).
 _USER_ERRORS = (ThermoCompError, OSError, RuntimeError, rclpy.exceptions.ParameterException)
 
 
