@@ -263,15 +263,13 @@ class Acquisition:
             (*findings, *thermal_findings(thermometers)),
         )
 
-    def _reason(
-        self, rest: _Rest, up: Floats, noise_ratio: float, before: Sequence[Position]
-    ) -> str:
-        """Return the reason why a position is not good; '' if the position is good."""
+    def _reason(self, rest: _Rest, up: Floats, ratio: float, before: Sequence[Position]) -> str:
+        """Return why a position is not good, else ''; `ratio`: its noise / median noise."""
         if not rest.n_rests:
             return 'not at rest yet'
         if np.isnan(up).any():
             return 'all axes read zero'
-        if noise_ratio > _RESTLESS:
+        if ratio > _RESTLESS:
             return 'restless'
         near = math.cos(math.radians(coverage.SAME_DIRECTION_DEG))
         for number, earlier in enumerate(before, 1):

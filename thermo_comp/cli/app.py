@@ -28,8 +28,7 @@ from .shared_options import expanded, option
 # Base class of all errors of a command line; typer does not export this class.
 _UsageMistake: Any = typer.BadParameter.__mro__[2]
 
-#: Matches typer's message for a value that is not a number; groups: the option's one or two names,
-#: the type of the number.
+#: Matches typer's message for a value that is not a number; groups: names of the option, type.
 _NO_NUMBER = re.compile(r"'(-[\w-]+)'(?: / '(-[\w-]+)')?: .*\b(?:a )?valid (number|float|integer)")
 
 # `--help` prints the range of an option's value on its own line, to leave room for the name.

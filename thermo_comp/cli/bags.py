@@ -148,7 +148,7 @@ def _print_calibration(out: Output, path: Path) -> None:
                 )
                 for n in provenance.residuals
             ],
-            title='|f| - g of the fit and on data left out, and left-out drift of an axis, in ug',
+            title='|f| - g in the fit and on data left out, and drift of an axis on these, in ug',
         )
     print_nonlinearity(out, calibration)
     out.points(provenance.notes)

@@ -49,7 +49,7 @@ def convert(
         'Accept samples that the autopilot has corrected by INS_TCAL or TC_A parameters.', False
     ),
     names: dict[str, str] = options.named_topics,
-    unit: Literal['m/s^2', 'g', 'mg'] = option('Unit of acceleration in the bag.', 'm/s^2'),
+    unit: Literal['m/s^2', 'g', 'mg'] = option('Unit of acceleration in an input bag.', 'm/s^2'),
     force: bool = options.FORCE,
     out: Output = options.out,
 ) -> None:

@@ -361,7 +361,7 @@ def _print_models(out: Output, trials: Sequence['Trial']) -> None:
         rows.append((mark, *(row[k] for k in kept), first))
         rows += [('', *[''] * len(kept), line) for line in more]
     out.table(
-        ('', *names, 'model'), rows, title='models compared on data left out of the fit, RMS in ug'
+        ('', *names, 'model'), rows, title='RMS error of each model on data left out of it, in ug'
     )
     for name in names:
         out.line(f'{name}: {columns[name]}')

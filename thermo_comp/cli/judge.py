@@ -96,7 +96,7 @@ def evaluate(
         out.table(
             ('section', 'model', 'windows', 'RMS', 'max', 'claimed', 'ratio'),
             rows,
-            title='angular rate at rest less the mean of each rest, of all axes in mdeg/s',
+            title='angular rate at rest less the mean of each rest, all axes together, in mdeg/s',
         )
     _print_drifts(out, drifts)
     out.points(result.notes)
@@ -174,7 +174,6 @@ def _print_drifts(out: Output, drifts: Sequence['Drift']) -> None:
 
 
 def _print_sections(out: Output, judgements: Mapping[str, Any]) -> None:
-    """Print the residuals of |f| of each calibration."""
     (window_s,) = {judgement.windows.window_s for judgement in judgements.values()}
     out.table(
         ('section', 'model', 'windows', 'RMS ug', 'max ug', 'claimed ug', 'ratio'),

@@ -158,7 +158,7 @@ def _end(
         command += f' --offset {offset:g}'
     out.line(f'{counted(len(written), "bag")} in {folder}')
     if written:
-        out.line('now fit the bags, with the local gravity in m/s^2:')
+        out.line('now fit the bags; replace G by the local gravity in m/s^2:')
         out.line(f'  {command}')
     bias, scale, misalignment = account.constants_sd.reshape(3, 3)
     out.end(

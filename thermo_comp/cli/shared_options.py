@@ -252,7 +252,7 @@ def site(
 def judging(
     where: tuple[float | None, float] = place,
     window_s: float = option(
-        'Averaging time at rest, in s.', 60.0, metavar='S', min=1e-3, max=86400.0
+        'Length of a window at rest, in s.', 60.0, metavar='S', min=1e-3, max=86400.0
     ),
     tolerance: str | None = option('Largest accepted RMS of |f| - g, e.g. 100ug, 1e-3m/s^2.'),
     serial: str | None = SERIAL,
@@ -301,7 +301,7 @@ def fitting(
     ),
     full_scale: float | None = option(
         'Magnitude of a saturated sample, in the unit of the input; default: 32767 counts, or the '
-        'smallest usual range above all samples, from 2 g.',
+        'smallest usual range (2 g or more) above all samples.',
         metavar='VALUE',
     ),
     reference_temperature: float = option(

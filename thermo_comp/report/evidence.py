@@ -72,19 +72,16 @@ class Stretch(NamedTuple):
 
 @dataclass(frozen=True)
 class ShownBag:
-    """
-    A bag with its regimes, the rates of its thermometers [K/s] and the second derivative of the
-    leading sensor's temperature [K/s^2]; an estimate is NaN until it has settled.
-    """
+    """A bag, its regimes, and estimated derivatives, which are NaN until they have settled."""
 
     index: int
     bag: ReducedBag
     start_ns: int
     duration_s: float
     time: Floats
-    board_rate: Floats
+    board_rate: Floats  # [K/s]
     case_rate: Floats
-    acceleration: Floats
+    acceleration: Floats  # second derivative of the temperature of the leading sensor [K/s^2]
     stretches: tuple[Stretch, ...]
 
     @property

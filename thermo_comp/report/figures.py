@@ -138,9 +138,7 @@ def _panels(
 ) -> tuple[Figure, list[Axes], ShownBag, float]:
     """
     Return a figure, its panels over time, the bag that they show, and the unit of time [s].
-
-    `more`: height of the figure besides the panels [in]; `is_flagged`: the last panel, which shows
-    the regime itself, gets no shading.
+    `more`: height besides the panels [in]; `is_flagged`: the last panel, the flag, is not shaded.
     """
     shown = required(evidence.shown)
     unit, name = style.time_unit(shown.duration_s)

@@ -79,7 +79,7 @@ class NodeConfig:
     input: str = _parameter(
         'counts',
         'Input to compensate: accel/counts (Vector3Stamped) or imu/uncompensated (Imu). If '
-        '`topics` names only one of counts and imu, the start sets `input` to it.',
+        '`topics` names only one of counts and imu, `input` is set to this one at the start.',
         choices=('counts', 'imu'),
     )
     frame_id: str = _parameter(

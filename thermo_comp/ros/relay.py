@@ -30,8 +30,7 @@ from .reader import LoadedCalibration
 from .rest_log import BLOCK, RestKeeper
 from .waitloop import RawSubscription, RCLError, WaitLoop
 
-#: Without samples, a reading is used when the stamp of a later reading exceeds its stamp by this
-#: time [ns].
+#: Without samples, a reading is used once it is this much older than the newest reading [ns].
 IDLE_NS = 1_000_000_000
 
 _SECOND = slice(4, 8)  # bytes of a CDR message that hold the seconds of its stamp
@@ -224,11 +223,9 @@ class Relay:
             end = bisect_left(received_ns, received, start)
             self._relay(messages[start:end])
             name, stamp_ns, celsius = reading
-            now_ns = self.running.compensator.now_ns
-            if stamp_ns != NO_STAMP_NS:
-                push(name, stamp_ns, celsius)
-            elif now_ns is not None:
-                push(name, now_ns, celsius)
+            at_ns = stamp_ns if stamp_ns != NO_STAMP_NS else self.running.compensator.now_ns
+            if at_ns is not None:
+                push(name, at_ns, celsius)
             start = end
         return messages[start:]
 

@@ -304,7 +304,7 @@ class WaitLoop:
             if now - self._logged_ns >= _LOG_PERIOD_NS:
                 self._logged_ns = now
                 lines = ''.join(traceback.format_exception(error)).splitlines()
-                text = '\n'.join(['a callback failed, the node goes on:', *map(one_line, lines)])
+                text = '\n'.join(['a callback failed, the node continues:', *map(one_line, lines)])
                 self.node.get_logger().error(text)
             return None
 
