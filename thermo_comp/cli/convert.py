@@ -135,9 +135,9 @@ def _print_conversion(out: Output, report: 'ConversionReport', output: Path) -> 
     out.sources([(log.path, log.chosen, log.missing)])
 
 
-def print_guess(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:
+def print_guess(out: Output, log: 'ForeignLog', printed: dict[str, str]) -> None:
     """
-    Print the guessed column map and the unused columns of a table. `shown`: table of each text
+    Print the guessed column map and the unused columns of a table. `printed`: table of each text
     printed so far; a repeated map is replaced by the name of its first table.
     """
     from ..convert.column_map import column_map_text
@@ -145,7 +145,7 @@ def print_guess(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:
 
     if log.guessed is not None and log.guessed.format is None:  # guessed from headings
         lines = map_lines(log.guessed)
-        first = shown.setdefault('\n'.join(lines), log.path)
+        first = printed.setdefault('\n'.join(lines), log.path)
         if first == log.path:
             out.line(f'{log.path}: guessed column map; if the map is wrong, edit it for --columns')
             for line in lines:
@@ -156,7 +156,7 @@ def print_guess(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:
         text = column_map_text(log.guessed)
         out.line(f'{log.path}: guessed {text}; if this guess is wrong, give --columns')
     not_used = f'columns not used: {", ".join(log.not_used)}'
-    if log.not_used and shown.setdefault(not_used, log.path) == log.path:
+    if log.not_used and printed.setdefault(not_used, log.path) == log.path:
         out.line(f'{log.path}: {not_used}')
 
 

@@ -113,10 +113,10 @@ def fit(
     if certificate_info is not None and report is None:
         raise options.usage('--certificate-info fills the page of --report: give both')
 
-    shown: dict[str, str] = {}
+    printed: dict[str, str] = {}
 
     def print_log(log: 'ForeignLog') -> None:
-        print_guess(out, log, shown)
+        print_guess(out, log, printed)
         out.sources([(log.path, log.chosen, None)])
 
     with options.usage_of():
@@ -129,7 +129,7 @@ def fit(
 
         info = load_certificate_info(certificate_info, serial or sources[0].serial)
     with options.usage_of():
-        wanted = FitOptions(
+        fit_options = FitOptions(
             **settings,
             static_curve=static_curve,
             dynamic_curve=dynamic_curve,
@@ -143,7 +143,7 @@ def fit(
             offset=offset,
         )
     with out.progress('fitting') as done:
-        result = run(sources, wanted, done)
+        result = run(sources, fit_options, done)
     out.recordings(result.bags)
     save_calibration(result.calibration, output, overwrite=force)
     if report is not None:

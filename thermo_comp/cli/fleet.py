@@ -57,7 +57,7 @@ def fleet_fit(
     from ..fleet.work import FleetOptions
 
     with options.usage_of():
-        wanted = FleetOptions(
+        fleet_options = FleetOptions(
             fit=FitOptions(**settings), topics=topics, certificates=not no_certificates
         )
     before = [row for path in earlier or () for row in read_parquet(path)]
@@ -73,7 +73,7 @@ def fleet_fit(
             result = fit_fleet(
                 folder,
                 output,
-                wanted,
+                fleet_options,
                 with_prior=with_prior,
                 scheduler=scheduler,
                 n_workers=workers,

@@ -240,24 +240,24 @@ def report(
     if not paths and not calibration:
         raise options.usage('give bags, a calibration, or both')
     check_output(output, PAGE, overwrite=force, others=[*paths, *(calibration or [])])
-    known = [load_calibration(path) for path in calibration or []]
-    loaded = known[0] if known else None
-    _require_one_unit(calibration or [], known)
+    calibrations = [load_calibration(path) for path in calibration or []]
+    first = calibrations[0] if calibrations else None
+    _require_one_unit(calibration or [], calibrations)
     info = None
     if certificate_info is not None:
-        info = load_certificate_info(certificate_info, loaded.unit.serial if loaded else None)
+        info = load_certificate_info(certificate_info, first.unit.serial if first else None)
     with out.progress('reading') as done:
         usual: dict[str, Any] = {'topics': topics, 'force': known_force, 'progress': done}
-        opened = open_bags(paths, known[:1], window_s=judging['window_s'], **usual)
+        opened = open_bags(paths, calibrations[:1], window_s=judging['window_s'], **usual)
     with options.usage_of():
-        evidence = evidence_of_bags(opened, loaded, **judging, others=known[1:])
+        evidence = evidence_of_bags(opened, first, **judging, others=calibrations[1:])
     out.recordings(opened)
     write_report(evidence, output, info=info, figures=figures, overwrite=force)
     out.points(evidence.findings)
     judgement = evidence.judgement
     out.line(f'{output}: {evidence.headline}')
     out.end(
-        judgement.exit_code if judgement else int(bool(opened and loaded)),
+        judgement.exit_code if judgement else int(bool(opened and first)),
         output=output,
         **picked(evidence, 'headline findings'),
         history=drifts_of(evidence.history),
@@ -377,9 +377,9 @@ def _evaluate_rests(
     from ..field.watch import LIMIT, watch
     from ..unit.calibration_file import load_calibration
 
-    known, tolerance = load_calibration(calibration), judging['tolerance']
-    logged, _, notes = read_rests(rests, known, is_for_update=False)
-    result = watch(series_of(logged, known, judging['gravity']), known, tolerance)
+    loaded, tolerance = load_calibration(calibration), judging['tolerance']
+    logged, _, notes = read_rests(rests, loaded, is_for_update=False)
+    result = watch(series_of(logged, loaded, judging['gravity']), loaded, tolerance)
     out.points(notes)
     limit = f'{LIMIT:g} times the claimed sd' if tolerance is None else ug_text(tolerance)
     for rows, name in ((result.periods, 'from'), (result.temperatures, 'board')):

@@ -65,23 +65,23 @@ def record(
 
     test = Acquisition(positions, _duration(soak), offset or 0.0)
     _print_leftovers(out, output, finish)
-    known = numbered_bags(output)
-    serial = _read_earlier(out, known, serial, test)
+    earlier = numbered_bags(output)
+    serial = _read_earlier(out, earlier, serial, test)
     bags = PositionBags(output, serial)
-    over = threading.Event()
+    stopped = threading.Event()
     problems: Callable[[], Sequence[str]] = tuple
     printed: dict[str, str] = {}
     # A second SIGINT or SIGTERM ends the process at once.
     with SignalWatch() as signals, closing(bags), ExitStack() as stack:
-        signals.on_signal(over.set)
+        signals.on_signal(stopped.set)
         if bag is not None:
-            news = growing_blocks(bag, topics=topics, wait=over.wait)
+            news = growing_blocks(bag, topics=topics, wait=stopped.wait)
         else:
             options.require_ros()
             from ..ros.listener import LiveTopics
 
             live = stack.enter_context(LiveTopics(topics=topics, ros_args=context.obj))
-            news, problems = live.blocks(over.wait), lambda: live.problems
+            news, problems = live.blocks(stopped.wait), lambda: live.problems
             out.line('listening; Ctrl-C ends the recording with complete bags')
             sys.stdout.flush()  # a program that reads the pipe waits for 'listening'
         show = stack.enter_context(out.live())
@@ -93,25 +93,25 @@ def record(
                 show(_COLUMNS, _rows(account.positions), lines)
     if bag is None and live.n_lost:
         out.note(f'lost messages of the drivers: {live.n_lost}')
-    _end(out, test.account(), output, [*known, *bags.written], offset, over.is_set())
+    _end(out, test.account(), output, [*earlier, *bags.written], offset, stopped.is_set())
 
 
 def _read_earlier(
-    out: Output, known: Sequence[Path], serial: str | None, test: 'Acquisition'
+    out: Output, earlier: Sequence[Path], serial: str | None, test: 'Acquisition'
 ) -> str | None:
     """Add the bags of earlier runs, one per position, to the test; return the unit's serial."""
     from ..recording.reader import open_recording
 
-    with out.progress('reading the existing bags', total=len(known)) as done:
-        for number, path in enumerate(known, 1):
+    with out.progress('reading the existing bags', total=len(earlier)) as done:
+        for number, path in enumerate(earlier, 1):
             with open_recording(path, require=()) as reader:
-                of_bag = reader.info.metadata.get('serial')
-                if serial is not None and of_bag not in (serial, None):
+                bag_serial = reader.info.metadata.get('serial')
+                if serial is not None and bag_serial not in (serial, None):
                     raise ThermoCompError(
-                        f'{path} is of unit {of_bag}, not {serial}: record each unit into a '
+                        f'{path} is of unit {bag_serial}, not {serial}: record each unit into a '
                         'separate folder'
                     )
-                serial = serial or of_bag
+                serial = serial or bag_serial
                 for block in reader.blocks():
                     test.add(block)
             test.begin()

@@ -113,8 +113,8 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
         claimed = _rms(windows.claimed_sd)
         lack = _rms(windows.lack_sd)
         # The claimed variance is the sum of these variances and of that of the other parameters.
-        known = noise**2 + attitude**2 + lack**2 + evidence.gravity_sd**2
-        model = float(np.sqrt(max(claimed**2 - known, 0.0)))
+        itemised = noise**2 + attitude**2 + lack**2 + evidence.gravity_sd**2
+        model = float(np.sqrt(max(claimed**2 - itemised, 0.0)))
     excess = float(np.sqrt(max(judgement.headline_rms**2 - claimed**2, 0.0)))
     drift_k, drift, slope = info.thermometers.standard_uncertainty_k, None, ''
     if drift_k is not None:
@@ -158,7 +158,7 @@ def results(
         return []
     unit = 'counts' if calibration.unit.input == 'counts' else 'm/s²'
     bias, bias_sd, scale, scale_sd = in_a_soak(calibration)
-    known = COVERAGE if calibration.has_uncertainty else np.nan
+    coverage = COVERAGE if calibration.has_uncertainty else np.nan
     scale_sd = np.hypot(scale_sd, _gravity_part(evidence, info)) * np.abs(scale)
     below = ((1, 0), (2, 0), (2, 1))
     constants = {
@@ -172,13 +172,13 @@ def results(
         ),
     }
     rows = [
-        Result(name.format(part), *rounded(float(value), float(known * sd)), of)
-        for name, (parts, values, sds, of) in constants.items()
+        Result(name.format(part), *rounded(float(value), float(coverage * sd)), in_unit)
+        for name, (parts, values, sds, in_unit) in constants.items()
         for part, value, sd in zip(parts, values, sds, strict=True)
     ]
     for term in nonlinear_coefficients(calibration):
         rows += [
-            Result(f'{term.name} {axis}', *rounded(value, known * sd), term.unit)
+            Result(f'{term.name} {axis}', *rounded(value, coverage * sd), term.unit)
             for axis, value, sd in zip(AXES, term.value.tolist(), term.sd.tolist(), strict=True)
         ]
     if contributions and evidence.judgement is not None:
@@ -186,7 +186,7 @@ def results(
         for name in ('static', 'dynamic'):
             section = evidence.judgement.sections[name]
             if section.n:
-                is_known = known > 0.0 and unclaimed_gravity_sd(evidence, info) is not None
+                is_known = coverage > 0.0 and unclaimed_gravity_sd(evidence, info) is not None
                 mean_ug = section.mean / MICRO_G
                 texts = rounded(mean_ug, expanded_ug) if is_known else (number(mean_ug), '–')
                 rows.append(Result(f'mean of |f| − g, {name}', *texts, 'µg'))
@@ -198,7 +198,7 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
     calibration = evidence.calibration
     if calibration is None or not calibration.needs_temperature:
         return []
-    known = COVERAGE if calibration.has_uncertainty else np.nan
+    coverage = COVERAGE if calibration.has_uncertainty else np.nan
     slope = slopes(curves(calibration)[0])
     bias_0, *_ = in_a_soak(calibration)
     tables = [
@@ -214,13 +214,13 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
         # other uncertainties; without any uncertainty, the largest value of a column has 4 digits.
         largest = np.maximum(np.abs(value).max(axis=0), 1e-3)
         four_digits = 10.0 ** (np.floor(np.log10(largest)) - 2.0)
-        digits = np.where(known * sd > 0.0, known * sd, four_digits)
+        digits = np.where(coverage * sd > 0.0, coverage * sd, four_digits)
         sd[:, 3:] = np.hypot(sd[:, 3:], 1e6 * _gravity_part(evidence, info))
         for k, table in enumerate(tables):
             for row in range(len(at)):
                 cells = [program.name, minus(f'{at[row]:.1f}')]
                 for column in (k, k + 3):
-                    expanded = float(known * sd[row, column])
+                    expanded = float(coverage * sd[row, column])
                     place = expanded if math.isfinite(expanded) else float(digits[row, column])
                     text, deviation = (
                         rounded(float(part[row, column]), place)[0] for part in (value, off)

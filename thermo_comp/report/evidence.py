@@ -16,7 +16,6 @@ import numpy as np
 
 from ..fitting import FitResult, ResidualRow
 from ..fitting.coverage import LeastKnown, distinct_directions, least_known
-from ..fitting.data_checks import Finding
 from ..fitting.reduction import ReducedBag
 from ..fitting.sensors import learn_detector, readings_in_order
 from ..judging.evaluation import Epoch, history_of, judge_bags
@@ -126,9 +125,9 @@ class Evidence:
     @property
     def is_seen(self) -> bool:
         """Whether the calibration was fitted on a bag of this evidence."""
-        known = {source.sha256 for source in self.sources if source.sha256}
+        fitted = {source.sha256 for source in self.sources if source.sha256}
         shown = {source.sha256 for bag in self.bags for source in bag.sources}
-        return bool(self.steps) or not known.isdisjoint(shown)
+        return bool(self.steps) or not fitted.isdisjoint(shown)
 
     @property
     def is_simulated(self) -> bool:
@@ -311,13 +310,13 @@ def evidence_of_fit(result: FitResult) -> Evidence:
         judged,
         steps=result.residuals,
         left_out={k: left_out[at] for k, at in enumerate(rests) if left_out.get(at, 0.0) > 0.0},
-        checks=tuple(note.message for note in result.findings if not _is_reservation(note)),
+        # The finding `positions` is no reservation: it advises more positions than a fit needs.
+        checks=tuple(
+            note.message
+            for note in result.findings
+            if note.level != 'advice' or note.name == 'positions'
+        ),
     )
-
-
-def _is_reservation(finding: Finding) -> bool:
-    # The finding `positions` is no reservation: it advises more positions than a fit needs.
-    return finding.level == 'advice' and finding.name != 'positions'
 
 
 def _reservations(calibration: Calibration) -> tuple[str, ...]:
@@ -390,9 +389,9 @@ def shown_bag(bag: ReducedBag, index: int, detector: DetectorSettings) -> ShownB
 
 def _settled(value: Floats, variance: Floats) -> Floats:
     """Replace an estimate by NaN until its sd has fallen to three times its median sd."""
-    known = np.isfinite(value) & np.isfinite(variance)
-    if not known.any():
+    is_known = np.isfinite(value) & np.isfinite(variance)
+    if not is_known.any():
         return np.full(len(value), np.nan)
-    usual = float(np.median(variance[known]))
-    first = int(np.argmax(known & (variance <= 9.0 * usual)))
-    return np.where(known & (np.arange(len(value)) >= first), value, np.nan)
+    usual = float(np.median(variance[is_known]))
+    first = int(np.argmax(is_known & (variance <= 9.0 * usual)))
+    return np.where(is_known & (np.arange(len(value)) >= first), value, np.nan)

@@ -71,7 +71,7 @@ def draw_dynamics(evidence: Evidence) -> Figure:
         _plot(panels[0], evidence, drift, unit, label=AXES)
         panels[0].set_ylabel(name)
         style.legend_above(panels[0], 'a  drift of the readings in each position')
-    rates, bend, flag = panels[-3:]
+    rates, second, flag = panels[-3:]
     for label, rate, line in (
         ('dT case/dt', shown.case_rate, style.CASE_LINE),
         ('dT board/dt', shown.board_rate, style.BOARD_LINE),
@@ -81,9 +81,9 @@ def draw_dynamics(evidence: Evidence) -> Figure:
     rates.set_ylabel('K/min')
     style.legend_above(rates, 'b  first derivatives')
     line = style.CASE_LINE if shown.leader == 'case' else style.BOARD_LINE
-    bend.plot(shown.time / unit, shown.acceleration * 3600.0, **line)
-    bend.set(ylabel='K/min²', title=f'second derivative of T {shown.leader}')
-    bend.locator_params(axis='y', nbins=4)
+    second.plot(shown.time / unit, shown.acceleration * 3600.0, **line)
+    second.set(ylabel='K/min²', title=f'second derivative of T {shown.leader}')
+    second.locator_params(axis='y', nbins=4)
     _draw_flag(flag, shown, unit)
     figure.align_ylabels(panels[:-1])
     return figure
@@ -398,8 +398,8 @@ def draw_distances(
     """Draw each unit's distance from the fleet's median, by quantity; outliers are diamonds."""
     figure = style.new_figure(0.6 + 0.19 * len(labels))
     axes = figure.subplots()
-    known = [limit for limit in limits if np.isfinite(limit)]
-    shown = min(max(1.15 * max(known, default=0.0), 4.0), 12.0)
+    finite = [limit for limit in limits if np.isfinite(limit)]
+    shown = min(max(1.15 * max(finite, default=0.0), 4.0), 12.0)
     for row, (z, limit) in enumerate(zip(distances, limits, strict=True)):
         at = np.clip(z, -1.04 * shown, 1.04 * shown)
         is_far = np.abs(z) > limit

@@ -322,9 +322,8 @@ def findings_of(
     for name, (fault, step) in status.faults.items():
         if fault in _FAULTS:
             yield _WARN, f'{name} temperature {_FAULTS[fault].format(step)}'
-    if status.pending_ahead_s > AHEAD_S:
-        text = f'{status.pending_ahead_s:.0f} s ahead of the samples'
-        yield _WARN, f'temperatures are stamped {text}'
+    if (ahead_s := status.pending_ahead_s) > AHEAD_S:
+        yield _WARN, f'temperatures are stamped {ahead_s:.0f} s ahead of the samples'
     if status.is_lead_reversed:
         yield _ERROR, SWAPPED
     gravity = status.gravity

@@ -250,7 +250,7 @@ class ParameterRequests:
     def _take(self, kind: Any, request: Any, answer: Callable[[Any], None]) -> None:
         is_each, n, reason = kind is srv.SetParameters, len(request.parameters), ''
         groups = [[change] for change in request.parameters] if is_each else [request.parameters]
-        waits = any(parameter.name == 'calibration_file' for parameter in request.parameters)
+        reads_file = any(parameter.name == 'calibration_file' for parameter in request.parameters)
         results: list[SetParametersResult] = []
 
         def respond() -> None:
@@ -262,17 +262,17 @@ class ParameterRequests:
                 self._set(prepared, results)
             finally:
                 if len(results) == len(groups):
-                    self._n_waiting -= waits
+                    self._n_waiting -= reads_file
                     respond()
 
         if n > PARAMETERS_LIMIT:
             reason = f'{n} parameters in one request, at most {PARAMETERS_LIMIT} are allowed'
-        elif waits and self._n_waiting >= WAITING_LIMIT:
+        elif reads_file and self._n_waiting >= WAITING_LIMIT:
             reason = 'too many requests are waiting, try again'
         elif groups:
-            self._n_waiting += waits
+            self._n_waiting += reads_file
             for group in groups:
-                future = (self._slow if waits else self._quick).submit(self._read, group)
+                future = (self._slow if reads_file else self._quick).submit(self._read, group)
                 future.add_done_callback(lambda done: self._loop.call_soon(partial(end, done)))
             return
         # Send at most `PARAMETERS_LIMIT` results: each takes as long as reading a parameter.

@@ -145,13 +145,13 @@ class Relay:
 
     def successor(self, loaded: LoadedCalibration, model: Model, config: NodeConfig) -> Running:
         """Build the next `Running`; the present `Running` does not change."""
-        now, settings = self.running, config.compensator_config()
-        compensator, converter, samples = now.compensator, now.converter, now.samples
+        present, settings = self.running, config.compensator_config()
+        compensator, converter, samples = present.compensator, present.converter, present.samples
         if model is not compensator.thermal.model or settings != compensator.config:
             compensator = compensator.successor(model, settings)
-        if (config.input, config.frame_id) != (now.config.input, now.config.frame_id):
+        if (config.input, config.frame_id) != (present.config.input, present.config.frame_id):
             converter = self._converter(config)
-        if config.input != now.config.input:
+        if config.input != present.config.input:
             samples = self._open_samples(config)
         return Running(loaded, config, compensator, samples, converter)
 

@@ -234,14 +234,14 @@ class WaitLoop:
         if waking and waking.subscription.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT:
             pause_ns = self._pause_ns
         dense_ns = pause_ns * 3 // 4
-        now_ns, look_ns = time.monotonic_ns, 0
+        now_ns, poll_ns = time.monotonic_ns, 0
         is_flowing = False
         with ExitStack() as in_use:
             entities = [*raw, *others, self._guard]
             for entity in (*entities, node.context):
                 in_use.enter_context(entity.handle)
-            everything = _WaitSet(node.context, entities)
-            alone = _WaitSet(node.context, [waking.subscription] if waking else [])
+            full_set = _WaitSet(node.context, entities)
+            waking_set = _WaitSet(node.context, [waking.subscription] if waking else [])
             while not (self._is_stopping or self._is_stale):
                 if self._soon:
                     self._guarded(self._soon.popleft())
@@ -257,17 +257,17 @@ class WaitLoop:
                     self._guarded(self._callback)
                     continue
                 if is_flowing:
-                    is_flowing = bool(alone.wait(min(self._call_ns - now, OTHERS_PERIOD_NS)))
+                    is_flowing = bool(waking_set.wait(min(self._call_ns - now, OTHERS_PERIOD_NS)))
                 else:
-                    everything.wait(min(self._call_ns - now, _LONGEST_WAIT_NS))
-                    is_flowing, look_ns = waking is not None, 0
+                    full_set.wait(min(self._call_ns - now, _LONGEST_WAIT_NS))
+                    is_flowing, poll_ns = waking is not None, 0
                 woken_ns = now_ns()
                 on_data()
-                if woken_ns >= look_ns:
-                    ready = [others[entity] for entity in everything.wait(0) if entity in others]
+                if woken_ns >= poll_ns:
+                    ready = [others[entity] for entity in full_set.wait(0) if entity in others]
                     served = [self._guarded(serve) for serve in ready]
                     # After a request the next request may wait already: look again at once.
-                    look_ns = 0 if any(served) else woken_ns + OTHERS_PERIOD_NS
+                    poll_ns = 0 if any(served) else woken_ns + OTHERS_PERIOD_NS
                 # The interval of messages is 0 if the middleware gives no arrival times.
                 if waking and 0 < waking.interval_ns < dense_ns:
                     left_ns = woken_ns + pause_ns - now_ns()
