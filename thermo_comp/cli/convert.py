@@ -239,7 +239,7 @@ def import_(
     files of imu_tk, imu_calib and Kalibr give bias, scale and misalignment. The
     static and the dynamic regime get the same coefficients. The calibration
     corrects samples in the unit of the file: m/s^2 (node: input:=imu), or counts.
-    Only a fit to bags of a thermal test determines the other parameters.
+    Only a fit to bags of a thermal test gives parameters that the file lacks.
 
     Example:
       thermo_comp import autopilot.params --serial 42 -o unit42.yaml

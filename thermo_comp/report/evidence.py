@@ -79,7 +79,7 @@ class ShownBag:
     duration_s: float
     time: Floats
     board_rate: Floats  # [K/s]
-    case_rate: Floats
+    case_rate: Floats  # [K/s]
     acceleration: Floats  # second derivative of the temperature of the leading sensor [K/s^2]
     stretches: tuple[Stretch, ...]
 
@@ -196,7 +196,7 @@ class Evidence:
 
     @cached_property
     def positions(self) -> tuple[Position, ...]:
-        """The still positions; their attitudes are from corrected or else raw forces."""
+        """The still positions; attitudes by corrected or, without calibration, raw forces."""
         windows = self.windows
         if windows is None or not self.forces:
             return ()
