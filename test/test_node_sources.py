@@ -51,7 +51,7 @@ def test_samples_of_a_second_publisher_are_never_published(peer, unit):
         values = {value.key: value.value for value in status.values}
         assert values['sample publishers'] == '2'
         peer.node.destroy_publisher(other)
-        peer.poll(lambda: node._relay.samples.count_publishers() == 1, 'one left')
+        peer.poll(lambda: node._relay.running.samples.count_publishers() == 1, 'one left')
         # After one of two drivers has ended, samples that it sent before may still arrive.
         samples.send(20)
         before = len(samples.heard)
@@ -121,7 +121,7 @@ def test_after_a_driver_was_killed_output_continues_within_two_seconds(peer, uni
         peer.poll(lambda: time.monotonic() - killed > 1.0, 'a second')
         with driver_process('second') as (_, began_ns):
             peer.wait_for(lambda: of('second'), 'samples of the second driver')
-            assert node._relay.samples.count_publishers() == 2
+            assert node._relay.running.samples.count_publishers() == 2
             assert (ros.stamp_of(of('second')[0]) - began_ns) * 1e-9 < 2.0
             text = '2 publishers on /accel/counts, of which one sends'
             warned = DiagnosticStatus.WARN
@@ -217,7 +217,7 @@ def test_reports_more_frequent_than_samples_report_no_missing_samples(peer, tmp_
         heard = peer.listen(DiagnosticArray, '/diagnostics')
         driver = ros.drive(peer, node)
         imu = peer.listen(Imu, 'imu/data_raw')
-        peer.poll(node._relay.samples.count_publishers, 'the driver')
+        peer.poll(node._relay.running.samples.count_publishers, 'the driver')
         for k in range(5):
             stamp_ns = ros.START_NS + k * ros.SECOND_NS
             driver.temperatures(stamp_ns, 20.0, 20.0)

@@ -23,15 +23,16 @@ from ..unit.gravity import STANDARD_GRAVITY
 
 # Minimum length of a rest [s], unless the wanted soak is shorter.
 _REST_S = 10.0
-# Shortest cell of averaged samples [s]; number of first samples that set the length of a cell.
+# Shortest length of a cell, whose samples are averaged [s]; number of first samples from whose
+# interval the length of a cell is computed.
 _CELL_S, _SAMPLES_TO_BEGIN = 0.5, 30
 # Number of earlier cells that each search for rests includes, besides the new cells.
 _LOOKED_BACK = 200
 # Sd of a position's mean force due to hysteresis, mounting and drift, even in a long rest [g].
 _FLOOR_SD = 2e-5
 # A position is 'restless' if its noise is above `_RESTLESS` times the median of all positions.
-# After the first rests, a still interval is a rest up to `_LOUDEST` times the noise of the rests.
-_RESTLESS, _LOUDEST = 3.0, 10.0
+# A still interval after the known rests is a rest if its noise is below `_NOISIEST` times theirs.
+_RESTLESS, _NOISIEST = 3.0, 10.0
 # Smallest backward step of the stamps that shows a restart of the driver [ns].
 _STEP_BACK_NS = 10**9
 # A stamp earlier than any stamp of a sample [ns].
@@ -43,8 +44,8 @@ Surveys = Mapping[str, ThermometerSurvey]
 @dataclass(frozen=True)
 class Position:
     """
-    A position: direction of the specific force (NaN before a rest), total time at rest, number of
-    rests, sd of the mean force [g], temperatures, reason why the position is not good, or ''.
+    A position: direction of the specific force (NaN before the first rest), total time at rest,
+    number of rests, sd of the mean force [g], thermometers, and why it does not count ('': good).
     """
 
     up: Floats
@@ -62,8 +63,8 @@ class Account:
     The last of the `positions` is unfinished. `worst_sd_g` is the sd of the corrected force in
     the attitude with the largest sd, `constants_sd` the sds of bias [g], scale and misalignment
     [rad]. `now` is the direction of the newest sample, NaN without samples. `next_up` is the
-    direction recommended for the next position, at `next_deg` [deg] from `now`. `farthest_up` is
-    the direction that is farthest, by `farthest_deg`, from all positions.
+    direction recommended for the next position; `next_deg` is its angle to `now` [deg]. The angle
+    of `farthest_up` to the nearest position, `farthest_deg`, is the largest of all directions.
     """
 
     positions: tuple[Position, ...]
@@ -164,13 +165,13 @@ class Acquisition:
         ranges = still_intervals(cells, self._rest_s)
         if not ranges:
             return None
-        # Search the cells after the last rest with a variance limit from these cells alone.
+        # Search the cells after the last rest again, with a variance limit from these cells alone.
         end = ranges[-1][1]
-        behind = cells.part(slice(end, None))
+        later = cells.part(slice(end, None))
         ranges += [
             (end + lower, end + upper)
-            for lower, upper in still_intervals(behind, self._rest_s)
-            if _noise(behind, [(lower, upper)]) < _LOUDEST * _noise(cells, ranges)
+            for lower, upper in still_intervals(later, self._rest_s)
+            if _noise(later, [(lower, upper)]) < _NOISIEST * _noise(cells, ranges)
         ]
         means = np.array([_mean(cells, [bounds]) for bounds in ranges])
         if self._first is None:
@@ -186,12 +187,9 @@ class Acquisition:
     def _close(self, end_ns: int) -> None:
         """End the present position at a stamp [ns]; later samples belong to the next position."""
         self._rests.append(self._rest(self._cells(), end_ns))
-        self._readings = {
-            name: [
-                later for part in parts if len((later := _part(part, end_ns, -_FIRST_NS)).stamp_ns)
-            ]
-            for name, parts in self._readings.items()
-        }
+        for name, parts in self._readings.items():
+            later = (_part(part, end_ns, -_FIRST_NS) for part in parts)
+            self._readings[name] = [part for part in later if len(part.stamp_ns)]
         self._begin_ns, self._n_looked, self._first = end_ns, 0, None
         means = np.array([rest.mean for rest in self._rests if rest.n_rests]).reshape(-1, 3)
         self._centre = coverage.rough_centre(means)
@@ -229,11 +227,11 @@ class Acquisition:
         one_g = np.sum((means - self._centre) * ups, axis=1)
         noise = np.array([rest.noise for rest in rests]) / one_g
         median = float(np.median(noise[np.isfinite(noise)])) if np.isfinite(noise).any() else 1.0
-        of_means = noise / np.sqrt([max(rest.n, 1) for rest in rests])
-        in_1_hz = of_means * np.sqrt([rest.still_s for rest in rests])
-        in_1_hz = in_1_hz[np.isfinite(in_1_hz)] * STANDARD_GRAVITY
-        misalignment_sd = misalignment_scale(float(np.median(in_1_hz)) if len(in_1_hz) else 0.0)
-        sds = np.hypot(of_means, _FLOOR_SD)
+        mean_sd = noise / np.sqrt([max(rest.n, 1) for rest in rests])
+        density = mean_sd * np.sqrt([rest.still_s for rest in rests])
+        density = density[np.isfinite(density)] * STANDARD_GRAVITY
+        misalignment_sd = misalignment_scale(float(np.median(density)) if len(density) else 0.0)
+        sds = np.hypot(mean_sd, _FLOOR_SD)
         positions: list[Position] = []
         for up, rest, ratio, sd in zip(ups, rests, noise / median, sds.tolist(), strict=True):
             reason = self._reason(rest, up, ratio, positions)
@@ -265,13 +263,13 @@ class Acquisition:
             (*findings, *thermal_findings(thermometers)),
         )
 
-    def _reason(self, rest: _Rest, up: Floats, noise: float, before: Sequence[Position]) -> str:
-        """Return the reason why a position is not good; '' if the position is good."""
+    def _reason(self, rest: _Rest, up: Floats, ratio: float, before: Sequence[Position]) -> str:
+        """Return why a position is not good, else ''; `ratio`: its noise / median noise."""
         if not rest.n_rests:
             return 'not at rest yet'
         if np.isnan(up).any():
             return 'all axes read zero'
-        if noise > _RESTLESS:
+        if ratio > _RESTLESS:
             return 'restless'
         near = math.cos(math.radians(coverage.SAME_DIRECTION_DEG))
         for number, earlier in enumerate(before, 1):
@@ -289,7 +287,7 @@ class Acquisition:
             return np.full(3, np.nan), False
         cells = cells.part(slice(-_LOOKED_BACK, None))
         ranges = still_intervals(cells, 0.0)
-        # The last cell may be incomplete: judge rest and direction by the cell before the last.
+        # The last cell may be incomplete: take rest and direction from the cell before it.
         is_still = bool(ranges) and ranges[-1][1] >= len(cells.count) - 1
         last = cells.mean[-2:-1] if len(cells.count) > 1 else cells.mean
         return self._directions(last)[0], is_still

@@ -3,9 +3,9 @@
 """
 Owns the entry point of the command line: its commands and exit codes.
 
-Exit code 0: done; 1: error in data, files, packages, or an invalid result; 2: wrong command line;
-3: `update` does not improve the calibration; 70: a bug of thermo_comp, whose traceback is saved in
-a file. The text of an error is printed on one line of stderr.
+Exit code 0: done; 1: error in data or files, missing package, or invalid result; 2: wrong command
+line; 3: `update` does not improve the calibration; 70: a bug of thermo_comp, whose traceback is
+saved in a file. The text of an error is printed on one line of stderr.
 
 Heavy libraries are imported by the commands when they run, so that ``--help`` is fast.
 """
@@ -28,7 +28,7 @@ from .shared_options import expanded, option
 # Base class of all errors of a command line; typer does not export this class.
 _UsageMistake: Any = typer.BadParameter.__mro__[2]
 
-#: Matches typer's message for a value that is no number; groups: two names of the option, type.
+#: Matches typer's message for a value that is not a number; groups: names of the option, type.
 _NO_NUMBER = re.compile(r"'(-[\w-]+)'(?: / '(-[\w-]+)')?: .*\b(?:a )?valid (number|float|integer)")
 
 # `--help` prints the range of an option's value on its own line, to leave room for the name.
@@ -114,7 +114,7 @@ def run(arguments: list[str]) -> int:
 
 
 def _plain(message: str, arguments: list[str]) -> str:
-    """Rewrite a message of typer in plain words; quote a given value that is not a number."""
+    """Rewrite typer's message on a value that is not a number, and quote the value."""
     message = message.removeprefix('Invalid value: ')  # the rest of the message names the option
     option = _NO_NUMBER.search(message)
     if option is None:

@@ -27,7 +27,7 @@ _LEFT_OUT = {
         '(linear_acceleration_covariance[0] = -1)'
     ),
     'n_saturated': 'samples at the full scale of the calibration',
-    'n_out_of_order': 'samples with a stamp not later than an earlier stamp, or far ahead',
+    'n_out_of_order': 'samples whose stamp is not later than all earlier stamps, or too far ahead',
     'n_no_temperature': 'samples before the first board temperature',
     'n_stale': 'samples with a board temperature older than --temperature-timeout',
     'n_stuck': 'samples that repeat earlier values for too long, or are 0 on all axes',
@@ -55,7 +55,7 @@ def info(
     from ..recording.overview import survey_recording
 
     if path.suffix in ('.yaml', '.yml'):
-        _calibration(out, path)
+        _print_calibration(out, path)
         return
     with out.progress(f'reading {path.name}') as done:
         survey = survey_recording(path, topics, done)
@@ -96,7 +96,7 @@ def info(
     )
 
 
-def _calibration(out: Output, path: Path) -> None:
+def _print_calibration(out: Output, path: Path) -> None:
     from ..field.series import last_rest
     from ..online.trial import tried
     from ..unit.calibration_file import load_calibration
@@ -148,7 +148,7 @@ def _calibration(out: Output, path: Path) -> None:
                 )
                 for n in provenance.residuals
             ],
-            title='|f| - g of the fit and on data left out, and left-out drift of an axis, in ug',
+            title='|f| - g in the fit and on data left out, and drift of an axis on these, in ug',
         )
     print_nonlinearity(out, calibration)
     out.points(provenance.notes)
@@ -274,8 +274,8 @@ def play(
     context: typer.Context,
     bag: Path = _BAG,
     rate: float = option(
-        'Speed relative to real time; 0: as fast as reliable subscribers receive, so that a '
-        'subscriber that processes messages more slowly loses some.',
+        'Speed relative to real time; 0: as fast as reliable subscribers receive. A subscriber '
+        'that processes messages more slowly than they arrive loses some of them.',
         1.0,
         min=0.0,
     ),
@@ -288,7 +288,7 @@ def play(
 
     The topics are published as accel/counts (or imu/uncompensated),
     temperature/board and temperature/case, whatever their names in the bag;
-    remap the topics after --ros-args. The playback ends when every reliable
+    arguments after --ros-args remap them. The playback ends when every reliable
     subscriber has received all messages. For topics that the node does not
     read, and for pauses and loops, use ros2 bag play.
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 Tool = Literal['px4', 'ardupilot', 'imu_tk', 'imu_calib', 'kalibr']
 
-#: Texts of the findings of a conversion, printed in front of the number of rows found.
+#: Texts of the findings of a conversion, printed in front of the number of rows concerned.
 _FINDINGS = {
     'short_rows': 'rows left out, with fewer cells than the column map needs',
     'non_numeric': 'rows left out, with a time or a sample that is not a finite number',
@@ -43,13 +43,13 @@ def convert(
     rate_hz: float | None = options.TABLE_RATE,
     imu: int | None = option('Number of the IMU in an autopilot log, counted from 0.'),
     baro: int | None = option(
-        'Number of the barometer in an autopilot log that gives the case temperature.'
+        'Number of the barometer of an autopilot log whose temperature is that of the case.'
     ),
     allow_compensated: bool = option(
         'Accept samples that the autopilot has corrected by INS_TCAL or TC_A parameters.', False
     ),
     names: dict[str, str] = options.named_topics,
-    unit: Literal['m/s^2', 'g', 'mg'] = option('Unit of acceleration in the bag.', 'm/s^2'),
+    unit: Literal['m/s^2', 'g', 'mg'] = option('Unit of acceleration in an input bag.', 'm/s^2'),
     force: bool = options.FORCE,
     out: Output = options.out,
 ) -> None:
@@ -62,8 +62,8 @@ def convert(
     table with the columns t ax ay az wx wy wz, in this order, or without t or
     wx wy wz, needs no headings. The board temperature of a PX4 or ArduPilot log
     is the IMU's (if missing, the barometer's), the case temperature the
-    barometer's; in a bag the board thermometer is the one with most namespaces in
-    common with the Imu.
+    barometer's. In a bag, the thermometer whose topic has most namespaces in
+    common with the Imu is that of the board.
 
     Example:
       thermo_comp convert log.csv --columns map.yaml -o unit42
@@ -135,17 +135,17 @@ def _print_conversion(out: Output, report: 'ConversionReport', output: Path) -> 
     out.sources([(log.path, log.chosen, log.missing)])
 
 
-def print_guess(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:
+def print_guess(out: Output, log: 'ForeignLog', printed: dict[str, str]) -> None:
     """
-    Print a guessed column map and the unused columns of a table, unless `shown` contains the same
-    map or list of columns from another table.
+    Print the guessed column map and the unused columns of a table. `printed`: table of each text
+    printed so far; a repeated map is replaced by the name of its first table.
     """
     from ..convert.column_map import column_map_text
     from ..convert.headings import map_lines
 
     if log.guessed is not None and log.guessed.format is None:  # guessed from headings
         lines = map_lines(log.guessed)
-        first = shown.setdefault('\n'.join(lines), log.path)
+        first = printed.setdefault('\n'.join(lines), log.path)
         if first == log.path:
             out.line(f'{log.path}: guessed column map; if the map is wrong, edit it for --columns')
             for line in lines:
@@ -156,7 +156,7 @@ def print_guess(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:
         text = column_map_text(log.guessed)
         out.line(f'{log.path}: guessed {text}; if this guess is wrong, give --columns')
     not_used = f'columns not used: {", ".join(log.not_used)}'
-    if log.not_used and shown.setdefault(not_used, log.path) == log.path:
+    if log.not_used and printed.setdefault(not_used, log.path) == log.path:
         out.line(f'{log.path}: {not_used}')
 
 
@@ -239,7 +239,7 @@ def import_(
     files of imu_tk, imu_calib and Kalibr give bias, scale and misalignment. The
     static and the dynamic regime get the same coefficients. The calibration
     corrects samples in the unit of the file: m/s^2 (node: input:=imu), or counts.
-    Parameters that the file lacks need a fit to bags of a thermal test.
+    Only a fit to bags of a thermal test gives parameters that the file lacks.
 
     Example:
       thermo_comp import autopilot.params --serial 42 -o unit42.yaml

@@ -45,7 +45,8 @@ def fit(
     ),
     dynamic_curve: Curve | None = option(
         'Curve of bias and scale over temperature in ramps; default: the curve in a soak plus a '
-        'quadratic, for spline or exponential a second one; for --model golovach: quadratic.',
+        'quadratic, or a separate spline or exponential if the curve in a soak is one; quadratic '
+        'for --model golovach.',
         metavar='CURVE',
     ),
     groups: str | None = option(
@@ -112,10 +113,10 @@ def fit(
     if certificate_info is not None and report is None:
         raise options.usage('--certificate-info fills the page of --report: give both')
 
-    shown: dict[str, str] = {}
+    printed: dict[str, str] = {}
 
     def print_log(log: 'ForeignLog') -> None:
-        print_guess(out, log, shown)
+        print_guess(out, log, printed)
         out.sources([(log.path, log.chosen, None)])
 
     with options.usage_of():
@@ -128,7 +129,7 @@ def fit(
 
         info = load_certificate_info(certificate_info, serial or sources[0].serial)
     with options.usage_of():
-        wanted = FitOptions(
+        fit_options = FitOptions(
             **settings,
             static_curve=static_curve,
             dynamic_curve=dynamic_curve,
@@ -142,7 +143,7 @@ def fit(
             offset=offset,
         )
     with out.progress('fitting') as done:
-        result = run(sources, wanted, done)
+        result = run(sources, fit_options, done)
     out.recordings(result.bags)
     save_calibration(result.calibration, output, overwrite=force)
     if report is not None:
@@ -165,8 +166,8 @@ def prior(
     """
     Make the prior of a type of unit from calibrations of several units.
 
-    A prior is the mean and scatter of units' parameters. With `fit --prior`
-    a further unit of the type needs less time in the chamber than without.
+    A prior is the mean and scatter of the parameters over units. With
+    `fit --prior` a further unit of the type needs less time in the chamber.
     Nonlinear terms (K2, K3) of the calibrations are left out.
 
     Example:
@@ -207,7 +208,7 @@ def _print_fit(
     _print_models(out, result.fit.selected.trials)
     parts = result.fit.windows.model.parts
     if parts:
-        out.line(_text_of(parts))
+        out.line(_parts_text(parts))
     _print_groups(out, calibration, has_prior=result.fit.posterior.prior.informative is not None)
     print_nonlinearity(out, calibration)
     _print_contributions(out, result)
@@ -242,11 +243,11 @@ def _print_fit(
 
 
 def _behind_s(parts: Sequence['Part']) -> list[float]:
-    """Return the time by which each part's temperature lags its surroundings in a ramp [s]."""
+    """Return the time by which the temperature of each part lags its source in a ramp [s]."""
     return [part.tau_s + part.second_tau_s for part in parts]
 
 
-def _text_of(parts: Sequence['Part']) -> str:
+def _parts_text(parts: Sequence['Part']) -> str:
     """Describe, for each axis, the lag of the part that determines bias and scale."""
     lags = ', '.join(f'{behind_s:.0f}' for behind_s in _behind_s(parts))
     text = f'lags the board by {lags} s (x, y, z)'
@@ -298,12 +299,12 @@ def _print_groups(out: Output, calibration: 'Calibration', has_prior: bool) -> N
 
 
 def _print_contributions(out: Output, result: 'FitResult') -> None:
-    """Print a table of the thermal response and of the effects of the unknowns of the bags."""
+    """Print the RMS effects of the thermal response and of the unknowns of the bags."""
     effects = {name: x for name, x in vars(result.contributions).items() if x is not None}
     out.table(
         ('effect', 'RMS ug'),
         [(name.replace('_', ' '), micro_g(value)) for name, value in effects.items()],
-        title='effects on an axis: response of the unit, then unknowns of the bags',
+        title="effects on an axis: first the unit's thermal response, then unknowns of the bags",
     )
 
 
@@ -342,7 +343,7 @@ def _print_rates(out: Output, result: 'FitResult', gyroscope: 'Gyroscope') -> No
 
 
 def _print_models(out: Output, trials: Sequence['Trial']) -> None:
-    """Print a table of the error of each model on data left out of the fit, and its legend."""
+    """Print the errors of each model on data left out of the fit, and the legend of the table."""
     columns = {
         'positions': 'drift of an axis in a left-out position',
         'sections': 'drift of an axis in a left-out section of the temperature program',
@@ -360,17 +361,17 @@ def _print_models(out: Output, trials: Sequence['Trial']) -> None:
         rows.append((mark, *(row[k] for k in kept), first))
         rows += [('', *[''] * len(kept), line) for line in more]
     out.table(
-        ('', *names, 'model'), rows, title='models compared on data left out of the fit, RMS in ug'
+        ('', *names, 'model'), rows, title='RMS error of each model on data left out of it, in ug'
     )
     for name in names:
         out.line(f'{name}: {columns[name]}')
-    out.line('*: chosen; ~: worse than * by at most a standard error; +: groups besides the curve')
+    out.line('*: chosen; ~: worse than * by at most a standard error; +: curve plus groups')
 
 
 def _name_lines(groups: tuple[str, ...]) -> list[str]:
     """
-    Name a model by its groups, without `curve` if this is the first of several groups; a long
-    name is broken before a group, so that the table fits 80 columns.
+    Name a model by its groups, without a leading `curve` before other groups; break a long name
+    before a group, so that the table fits 80 columns.
     """
     name = '+'.join(groups) or 'constants'
     if len(groups) > 1:

@@ -43,9 +43,9 @@ def fleet_fit(
     Each folder of bags is a thermal test of a unit; bags directly in DIR are
     grouped by the serial in their metadata. Calibrations go to OUT/units, the
     table of the tests to OUT/fleet.parquet and .csv, its statistics to
-    OUT/fleet.html, a prior of the units with complete data and a valid
-    calibration (see `thermo_comp prior`) to OUT/prior.yaml. A second run fits
-    only tests without a result for the same bags and options. Exit code 1
+    OUT/fleet.html. OUT/prior.yaml is the prior (see `thermo_comp prior`) of the
+    units with complete data and a valid calibration. A second run fits only
+    tests without a result for the same bags and options. The exit code is 1
     unless every unit has a valid calibration from all of its bags.
 
     Example:
@@ -57,7 +57,7 @@ def fleet_fit(
     from ..fleet.work import FleetOptions
 
     with options.usage_of():
-        wanted = FleetOptions(
+        fleet_options = FleetOptions(
             fit=FitOptions(**settings), topics=topics, certificates=not no_certificates
         )
     before = [row for path in earlier or () for row in read_parquet(path)]
@@ -73,7 +73,7 @@ def fleet_fit(
             result = fit_fleet(
                 folder,
                 output,
-                wanted,
+                fleet_options,
                 with_prior=with_prior,
                 scheduler=scheduler,
                 n_workers=workers,
@@ -142,6 +142,6 @@ def _micro(value: object) -> str | None:
 
 
 def _short(name: object) -> str:
-    """Shorten a long name to its last 21 characters, so that the table fits 80 columns."""
+    """Shorten a name above 22 characters to its end, so that the table fits 80 columns."""
     clean = one_line(str(name))
     return clean if len(clean) <= 22 else f'~{clean[-21:]}'

@@ -50,10 +50,10 @@ def evaluate(
 
     The verdict compares the RMS residual with --tolerance or, without
     --tolerance, with twice the uncertainty that the calibration claims for the
-    same windows; six positions or more show which axis has shifted. Exit code 0
-    only if the bags show that the calibration is valid. Rest logs of the node
-    instead of bags show the drift over the days, and the day from which the
-    drift exceeds the claimed uncertainty.
+    same windows; six positions or more show which axis has shifted. The exit
+    code is 0 only if the bags show that the calibration is valid. With rest logs
+    of the node instead of bags, the command prints the drift over the days, and
+    the day from which the drift exceeds the claimed uncertainty.
 
     Example:
       thermo_comp evaluate held_out.mcap -c unit42.yaml --tolerance 100ug
@@ -87,16 +87,16 @@ def evaluate(
         with table_writer(csv, {}, overwrite=force) as write:
             write(columns_of(judged.windows, [bag.source.name for bag in result.bags]))
     drifts = drifts_of(history_of([model for _, model in models]))
-    print_sections(out, result.judgements)
+    _print_sections(out, result.judgements)
     _print_axes(out, judged)
     _print_expectations(out, judged)
-    _print_levels(out, judged)
+    _print_by_force(out, judged)
     rates = {k: judged.rate for k, judged in result.judgements.items() if judged.rate is not None}
     if rows := _sections(rates, millidegrees):
         out.table(
             ('section', 'model', 'windows', 'RMS', 'max', 'claimed', 'ratio'),
             rows,
-            title='angular rate at rest less the mean of each rest, of all axes in mdeg/s',
+            title='angular rate at rest less the mean of each rest, all axes together, in mdeg/s',
         )
     _print_drifts(out, drifts)
     out.points(result.notes)
@@ -128,7 +128,7 @@ def _print_axes(out: Output, judged: 'Judgement') -> None:
 
 
 def _print_expectations(out: Output, judged: 'Judgement') -> None:
-    """Print the errors beside those on data left out of the fit, if the file has any of these."""
+    """Print the errors next to those on data left out of the fit, if the file states these."""
     names = {'norm': '|f| - g', 'drift': 'drift of an axis'}
     parts = {names[key]: part for key, part in judged.expectations.items()}
     if any(isfinite(part.expected_rms) for part in parts.values()):
@@ -142,7 +142,7 @@ def _print_expectations(out: Output, judged: 'Judgement') -> None:
         )
 
 
-def _print_levels(out: Output, judged: 'Judgement') -> None:
+def _print_by_force(out: Output, judged: 'Judgement') -> None:
     """Print the residuals for each value of |f|, if |f| differed from gravity in any window."""
     if judged.by_force:
         out.table(
@@ -173,8 +173,7 @@ def _print_drifts(out: Output, drifts: Sequence['Drift']) -> None:
         )
 
 
-def print_sections(out: Output, judgements: Mapping[str, Any]) -> None:
-    """Print the residuals of |f| of each calibration."""
+def _print_sections(out: Output, judgements: Mapping[str, Any]) -> None:
     (window_s,) = {judgement.windows.window_s for judgement in judgements.values()}
     out.table(
         ('section', 'model', 'windows', 'RMS ug', 'max ug', 'claimed ug', 'ratio'),
@@ -224,9 +223,9 @@ def report(
     """
     Write the certificate of a unit: one HTML page without network access.
 
-    Shows temperatures, regime, |f| before and after the correction, the
-    functions of temperature with their uncertainty, and the verdict of
-    `evaluate`, with its exit code. `fit --report` writes a fit's certificate.
+    The page shows temperatures, regime, |f| before and after the correction, the
+    functions of temperature with their uncertainty, and the verdict. The exit
+    code is that of `evaluate`. `fit --report` writes the certificate of a fit.
 
     Example:
       thermo_comp report held_out.mcap -c unit42.yaml -o unit42.html
@@ -241,24 +240,24 @@ def report(
     if not paths and not calibration:
         raise options.usage('give bags, a calibration, or both')
     check_output(output, PAGE, overwrite=force, others=[*paths, *(calibration or [])])
-    known = [load_calibration(path) for path in calibration or []]
-    loaded = known[0] if known else None
-    _require_one_unit(calibration or [], known)
+    calibrations = [load_calibration(path) for path in calibration or []]
+    first = calibrations[0] if calibrations else None
+    _require_one_unit(calibration or [], calibrations)
     info = None
     if certificate_info is not None:
-        info = load_certificate_info(certificate_info, loaded.unit.serial if loaded else None)
+        info = load_certificate_info(certificate_info, first.unit.serial if first else None)
     with out.progress('reading') as done:
         usual: dict[str, Any] = {'topics': topics, 'force': known_force, 'progress': done}
-        opened = open_bags(paths, known[:1], window_s=judging['window_s'], **usual)
+        opened = open_bags(paths, calibrations[:1], window_s=judging['window_s'], **usual)
     with options.usage_of():
-        evidence = evidence_of_bags(opened, loaded, **judging, others=known[1:])
+        evidence = evidence_of_bags(opened, first, **judging, others=calibrations[1:])
     out.recordings(opened)
     write_report(evidence, output, info=info, figures=figures, overwrite=force)
     out.points(evidence.findings)
     judgement = evidence.judgement
     out.line(f'{output}: {evidence.headline}')
     out.end(
-        judgement.exit_code if judgement else int(bool(opened and loaded)),
+        judgement.exit_code if judgement else int(bool(opened and first)),
         output=output,
         **picked(evidence, 'headline findings'),
         history=drifts_of(evidence.history),
@@ -280,10 +279,10 @@ def update(
     output: Path = options.NEW_CALIBRATION,
     where: tuple[float | None, float] = options.place,
     ahead: float = option(
-        'Days of ageing after the last rest that the claimed sd covers.', 1.0, min=0.0, max=3650.0
+        'Days after the last rest whose ageing the claimed sd covers.', 1.0, min=0.0, max=3650.0
     ),
     allow: list[str] | None = option(
-        'gravity: take local gravity as exact; unit: accept a |f| like that of another unit.'
+        'gravity: take local gravity as exact; unit: accept a |f| that suggests another unit.'
     ),
     force: bool = options.FORCE,
     out: Output = options.out,
@@ -295,8 +294,8 @@ def update(
     rests, which may be in any attitude. Old and new calibration are compared on
     days left out of the update. The new calibration is written only if the rests
     determine an axis and the mean decrease of (|f| - g)^2 on left-out days
-    exceeds its standard error; else the exit code is 3, and sds with ageing are
-    printed.
+    exceeds its standard error; else the exit code is 3, and the command prints
+    the sd of each axis with ageing.
 
     Example:
       thermo_comp update unit42.yaml rests -o unit42_new.yaml
@@ -319,7 +318,7 @@ def update(
     if 'unit' not in allowed:
         refuse_another_unit(result)
     out.points(notes)
-    _show_axis_changes(result, out)
+    _print_axis_changes(out, result)
     out.points(change_texts(result))
     out.line(str(result.judged))
     is_better = result.judged.is_better and any(axis.is_determined for axis in result.axis_changes)
@@ -344,7 +343,7 @@ def update(
     )
 
 
-def _show_axis_changes(result: 'Update', out: Output) -> None:
+def _print_axis_changes(out: Output, result: 'Update') -> None:
     out.table(
         ('axis', 'bias ug', '+-', 'scale ppm', '+-', 'curve ug', '+-', 'at rest ug', '+-', 'sds'),
         [
@@ -378,9 +377,9 @@ def _evaluate_rests(
     from ..field.watch import LIMIT, watch
     from ..unit.calibration_file import load_calibration
 
-    known, tolerance = load_calibration(calibration), judging['tolerance']
-    logged, _, notes = read_rests(rests, known, is_for_update=False)
-    result = watch(series_of(logged, known, judging['gravity']), known, tolerance)
+    loaded, tolerance = load_calibration(calibration), judging['tolerance']
+    logged, _, notes = read_rests(rests, loaded, is_for_update=False)
+    result = watch(series_of(logged, loaded, judging['gravity']), loaded, tolerance)
     out.points(notes)
     limit = f'{LIMIT:g} times the claimed sd' if tolerance is None else ug_text(tolerance)
     for rows, name in ((result.periods, 'from'), (result.temperatures, 'board')):

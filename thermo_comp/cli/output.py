@@ -37,7 +37,7 @@ class Output:
 
     def __init__(self, as_json: bool = False, quiet: bool = False) -> None:
         self.as_json, self.quiet = as_json, quiet
-        self._is_torn = False
+        self._has_missing_parts = False
 
     def line(self, text: str = '') -> None:
         """Print a sentence of the result."""
@@ -51,15 +51,15 @@ class Output:
 
     def sources(self, bags: Iterable[tuple[object, str | None, str | None]]) -> None:
         """Print the notes on chosen topics (equal notes once), and the missing parts of bags."""
-        alike: dict[str, list[object]] = {}
+        by_note: dict[str, list[object]] = {}
         for bag, chosen, missing in bags:
             if chosen:
-                alike.setdefault(chosen, []).append(bag)
+                by_note.setdefault(chosen, []).append(bag)
             if missing:
-                # A missing part sets the exit code, so the reason is printed with --quiet, too.
+                # Missing parts make the exit code 1, so they are printed with --quiet, too.
                 _print(f'thermo_comp: {bag}: {missing}', sys.stderr)
-                self._is_torn = True
-        for chosen, names in alike.items():
+                self._has_missing_parts = True
+        for chosen, names in by_note.items():
             more = f' and {len(names) - 1} more' if len(names) > 1 else ''
             self.note(f'{names[0]}{more}: {chosen}')
 
@@ -74,11 +74,11 @@ class Output:
         """End a command: print JSON if requested; exit with `code`, or 1 if a bag lacks parts."""
         if self.as_json:
             print(json.dumps(plain(data), indent=2, allow_nan=False))
-        if code or self._is_torn:
+        if code or self._has_missing_parts:
             raise typer.Exit(code or 1)
 
     def points(self, findings: Iterable[object]) -> None:
-        """Print findings, one per line."""
+        """Print texts as a list, one per line."""
         for finding in findings:
             self.line(f'- {finding}')
 
@@ -90,7 +90,7 @@ class Output:
 
     @contextmanager
     def live(self) -> Iterator[Callable[..., None] | None]:
-        """Yield a function that redraws a table and lines; None if `quiet` or no terminal."""
+        """Yield a function that redraws a table and lines; None without a terminal or if quiet."""
         if self.quiet or not sys.stderr.isatty():
             yield None
             return
@@ -113,7 +113,7 @@ class Output:
 
     @contextmanager
     def progress(self, what: str, total: float | None = 1.0) -> Iterator[Callable[[float], None]]:
-        """Show a progress bar on a terminal; yields a function that takes the progress so far."""
+        """Show a progress bar on a terminal; yield a function that takes the part done so far."""
         if self.quiet or not sys.stderr.isatty():
             yield lambda _done: None
             return

@@ -48,7 +48,7 @@ def record(
     out: Output = options.out,
 ) -> None:
     """
-    Record a test, a bag per position, and show the missing data.
+    Record a test, a bag per position, and show which data are missing.
 
     Reads the topics of the driver, or a growing bag. Shows the positions with
     their temperatures and ramps, the expected accuracy of bias, scale and
@@ -65,53 +65,53 @@ def record(
 
     test = Acquisition(positions, _duration(soak), offset or 0.0)
     _print_leftovers(out, output, finish)
-    known = numbered_bags(output)
-    serial = _read_earlier(out, known, serial, test)
+    earlier = numbered_bags(output)
+    serial = _read_earlier(out, earlier, serial, test)
     bags = PositionBags(output, serial)
-    over = threading.Event()
+    stopped = threading.Event()
     problems: Callable[[], Sequence[str]] = tuple
-    collected: dict[str, str] = {}
+    printed: dict[str, str] = {}
     # A second SIGINT or SIGTERM ends the process at once.
     with SignalWatch() as signals, closing(bags), ExitStack() as stack:
-        signals.on_signal(over.set)
+        signals.on_signal(stopped.set)
         if bag is not None:
-            news = growing_blocks(bag, topics=topics, wait=over.wait)
+            news = growing_blocks(bag, topics=topics, wait=stopped.wait)
         else:
             options.require_ros()
             from ..ros.listener import LiveTopics
 
             live = stack.enter_context(LiveTopics(topics=topics, ros_args=context.obj))
-            news, problems = live.blocks(over.wait), lambda: live.problems
+            news, problems = live.blocks(stopped.wait), lambda: live.problems
             out.line('listening; Ctrl-C ends the recording with complete bags')
             sys.stdout.flush()  # a program that reads the pipe waits for 'listening'
         show = stack.enter_context(out.live())
         for account in _accounts(out, news, test, bags):
             if show is None:
-                _print_account(out, account, problems(), collected)
+                _print_account(out, account, problems(), printed)
             else:
                 lines = [*problems(), _now(account), *_lines(account)]
                 show(_COLUMNS, _rows(account.positions), lines)
     if bag is None and live.n_lost:
         out.note(f'lost messages of the drivers: {live.n_lost}')
-    _end(out, test.account(), output, [*known, *bags.written], offset, over.is_set())
+    _end(out, test.account(), output, [*earlier, *bags.written], offset, stopped.is_set())
 
 
 def _read_earlier(
-    out: Output, known: Sequence[Path], serial: str | None, test: 'Acquisition'
+    out: Output, earlier: Sequence[Path], serial: str | None, test: 'Acquisition'
 ) -> str | None:
     """Add the bags of earlier runs, one per position, to the test; return the unit's serial."""
     from ..recording.reader import open_recording
 
-    with out.progress('reading the existing bags', total=len(known)) as done:
-        for number, path in enumerate(known, 1):
+    with out.progress('reading the existing bags', total=len(earlier)) as done:
+        for number, path in enumerate(earlier, 1):
             with open_recording(path, require=()) as reader:
-                of_bag = reader.info.metadata.get('serial')
-                if serial is not None and of_bag not in (serial, None):
+                bag_serial = reader.info.metadata.get('serial')
+                if serial is not None and bag_serial not in (serial, None):
                     raise ThermoCompError(
-                        f'{path} is of unit {of_bag}, not {serial}: record each unit into a '
+                        f'{path} is of unit {bag_serial}, not {serial}: record each unit into a '
                         'separate folder'
                     )
-                serial = serial or of_bag
+                serial = serial or bag_serial
                 for block in reader.blocks():
                     test.add(block)
             test.begin()
@@ -122,7 +122,7 @@ def _read_earlier(
 def _accounts(
     out: Output, news: Iterable['News | None'], test: 'Acquisition', bags: 'PositionBags'
 ) -> Iterator['Account']:
-    """Write blocks until test or bag ends; each None in `news` yields the state of the test."""
+    """Write blocks until test or bag ends; yield the state of the test at each None in `news`."""
     chosen: str | None = None
     for new in news:
         if new is not None:
@@ -158,7 +158,7 @@ def _end(
         command += f' --offset {offset:g}'
     out.line(f'{counted(len(written), "bag")} in {folder}')
     if written:
-        out.line('now fit the bags, with the local gravity in m/s^2:')
+        out.line('now fit the bags; replace G by the local gravity in m/s^2:')
         out.line(f'  {command}')
     bias, scale, misalignment = account.constants_sd.reshape(3, 3)
     out.end(
@@ -197,19 +197,19 @@ def _duration(text: str) -> float:
 
 
 def _print_account(
-    out: Output, account: 'Account', problems: Sequence[str], last: dict[str, str]
+    out: Output, account: 'Account', problems: Sequence[str], printed: dict[str, str]
 ) -> None:
-    """Print those texts about the test that have changed; `last`: texts printed last, by name."""
+    """Print the texts about the test that differ from those in `printed`, by name."""
     news = {'problem': ', '.join(problems)} if problems else {}
     if not problems:
-        last.pop('problem', None)
+        printed.pop('problem', None)
     for number, position in enumerate(account.positions, 1):
         if position.n_rests:
             news[f'position {number}'] = f'{position.reason or "good"}; {_reading(position.up)}'
     # Noise changes the direction after the semicolon: compare the text before the semicolon.
-    new = {name: text for name, text in news.items() if last.get(name) != text.partition(';')[0]}
+    new = {name: x for name, x in news.items() if printed.get(name) != x.partition(';')[0]}
     for name, text in new.items():
-        last[name] = text.partition(';')[0]
+        printed[name] = text.partition(';')[0]
         out.note(f'{name}: {text}')
     if any(text.startswith('good') for text in new.values()):
         out.note(_accuracy(account))
@@ -246,8 +246,8 @@ def _now(account: 'Account') -> str:
 def _next(account: 'Account') -> str:
     from ..fitting.coverage import direction_text
 
-    by = '' if isnan(account.next_deg) else f', {account.next_deg:.0f} deg from the present one'
-    return f'next position: {direction_text(account.next_up)}{by}'
+    angle = '' if isnan(account.next_deg) else f', {account.next_deg:.0f} deg from the present one'
+    return f'next position: {direction_text(account.next_up)}{angle}'
 
 
 def _accuracy(account: 'Account') -> str:

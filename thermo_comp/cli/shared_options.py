@@ -27,8 +27,8 @@ from ..text import valid_serial
 from ..unit.gravity import parse_acceleration
 from .output import Output
 
-# Placeholder of an option's value in `--help`, by the value's type: short, so that the longest
-# name of an option fits a terminal of 80 columns.
+# Placeholder of an option's value in `--help`, by the value's type: short, so that all names of
+# options fit a terminal of 80 columns.
 _VALUES: dict[Any, str] = {
     bool: ' ',
     **dict.fromkeys((int, int | None), 'N'),
@@ -37,7 +37,7 @@ _VALUES: dict[Any, str] = {
     **dict.fromkeys((Path, Path | None, list[Path], list[Path] | None), 'PATH'),
 }
 
-#: Options whose names differ from the names of the parameters and of the library's arguments.
+#: Options whose names do not follow from the name of their parameter or of the library's argument.
 _FLAGS = {
     'as_json': '--json',
     'begin': '--from',
@@ -106,8 +106,8 @@ def _flag_of(name: str) -> str:
 @contextmanager
 def usage_of(what: str = '', **flags: str) -> Iterator[None]:
     """
-    Turn a ValueError of a `with` block into a usage error. The error's text begins with `what`;
-    without `what`, names of options (`flags`, `_FLAGS`) replace argument names in the text.
+    Turn a ValueError of a `with` block into a usage error, whose text begins with `what`. Without
+    `what`, names of options (by `flags`, else `_flag_of`) replace argument names in the text.
     """
     try:
         yield
@@ -220,7 +220,7 @@ def place(
     latitude: float | None = option('Latitude in degrees, with --height.'),
     height: float | None = option('Height above the ellipsoid in m.'),
 ) -> tuple[float | None, float]:
-    """Return local gravity, or None if not stated, and its default standard deviation [m/s^2]."""
+    """Return local gravity (None if not stated) and its default standard deviation [m/s^2]."""
     if gravity is not None and not (latitude is None and height is None):
         raise usage('give --gravity, or --latitude and --height, not both')
     if latitude is None and height is None:
@@ -252,7 +252,7 @@ def site(
 def judging(
     where: tuple[float | None, float] = place,
     window_s: float = option(
-        'Averaging time at rest, in s.', 60.0, metavar='S', min=1e-3, max=86400.0
+        'Length of a window at rest, in s.', 60.0, metavar='S', min=1e-3, max=86400.0
     ),
     tolerance: str | None = option('Largest accepted RMS of |f| - g, e.g. 100ug, 1e-3m/s^2.'),
     serial: str | None = SERIAL,
@@ -281,10 +281,10 @@ def force(
         'Distance of the unit from the axis of rotation, in m.', min=1e-3
     ),
     radius_sd: float | None = option(
-        'Standard deviation of --radius, in m, with which the radius is estimated.', min=0.0
+        'Standard deviation of --radius, in m; if above 0, the fit estimates the radius.', min=0.0
     ),
 ) -> Any:
-    """Build `ForceOptions`: the user's statements about |f| in rests that are not at 1 g."""
+    """Build `ForceOptions`: |f| as the user knows it in rests that are not at 1 g."""
     from ..fitting.sources import ForceOptions
 
     with usage_of():
@@ -301,7 +301,7 @@ def fitting(
     ),
     full_scale: float | None = option(
         'Magnitude of a saturated sample, in the unit of the input; default: 32767 counts, or the '
-        'smallest usual range above all samples, from 2 g.',
+        'smallest usual range (2 g or more) above all samples.',
         metavar='VALUE',
     ),
     reference_temperature: float = option(

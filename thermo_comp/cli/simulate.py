@@ -37,8 +37,8 @@ def simulate(
         'tumble, tumble-3, tumble-1, held-out, or with rotation: centrifuge, rate-table.'
     ),
     profile: str | None = option(
-        'Chamber program: a name (default: chamber), or steps of a temperature in degC, @ a rate '
-        "in K/min, and a soak, as '20 30min, 35@0.5 1h, 5@1 1h'."
+        'Chamber program: a name (default: chamber), or steps, each of a temperature in degC, @ a '
+        "rate in K/min, and the time of a soak, as '20 30min, 35@0.5 1h, 5@1 1h'."
     ),
     positions: int | None = option('Number of positions, a bag each; default: 1.', min=1, max=999),
     position_seed: int = option('Seed of the random positions.', 0, min=0),
@@ -140,7 +140,7 @@ def simulate(
 def _metadata(
     unit: 'UnitModel', station: 'Position', truth: dict[str, Any], gravity: float, is_known: bool
 ) -> dict[str, str]:
-    """Return a bag's metadata: serial, true parameters, for a rotating unit the source of |f|."""
+    """Return a bag's metadata: serial, true parameters and, with rotation, |f| or its source."""
     from .. import __version__
     from ..fitting import sources
 
@@ -192,10 +192,9 @@ def _write(
     start_ns: int | None = None
     for run in runs:
         if start_ns is None:
-            first = [
-                stamps[0] for stamps in (run.board_stamp_ns, run.case_stamp_ns) if len(stamps)
-            ]
-            start_ns = max(first) if len(first) == 2 else 0
+            # With two thermometers the samples begin at the later one's first reading.
+            board_ns, case_ns = run.board_stamp_ns, run.case_stamp_ns
+            start_ns = max(board_ns[0], case_ns[0]) if len(board_ns) and len(case_ns) else 0
         keep = run.accel_stamp_ns >= start_ns
         # Write temperatures first, so that at equal stamps a temperature precedes the sample.
         writer.write_temperature(topics.board, run.board_stamp_ns, run.board)

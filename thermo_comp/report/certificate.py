@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the parts of a certificate after ISO/IEC 17025: results, bias and scale over temperature,
-budget, conformity.
+Owns the parts of a certificate according to ISO/IEC 17025: results, bias and scale over
+temperature, uncertainty budget, statement of conformity.
 """
 
 import math
@@ -27,8 +27,8 @@ from .style import minus, number, rounded
 
 #: Coverage factor of an expanded uncertainty: 95 % of a normal distribution.
 COVERAGE = 2.0
-_N_SLOPE = 33
-_N_CURVE = 61
+# Numbers of temperatures at which a slope and a curve are evaluated.
+_N_SLOPE, _N_CURVE = 33, 61
 #: Steps of a table over temperature [K], and the largest number of temperatures in a table.
 _STEPS_K = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 _MOST_TEMPERATURES = 8
@@ -65,7 +65,7 @@ class Contribution(NamedTuple):
     """One line of the uncertainty budget: a standard uncertainty of |f| [m/s^2]."""
 
     name: str
-    evaluation: str
+    evaluation: str  # type A or B, as in the GUM
     standard: float | None  # None if the uncertainty is not stated
     basis: str
 
@@ -111,34 +111,33 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
         by_element = np.stack((x * y, x * z, y * z)) * windows.gravity
         attitude = _rms(np.linalg.norm(by_element.T * calibration.misalignment_sd, axis=1))
         claimed = _rms(windows.claimed_sd)
-        of_gravity = evidence.gravity_sd  # the claimed sd contains it
         lack = _rms(windows.lack_sd)
-        known = noise**2 + attitude**2 + lack**2 + of_gravity**2
-        model = float(np.sqrt(max(claimed**2 - known, 0.0)))
+        # The claimed variance is the sum of these variances and of that of the other parameters.
+        itemised = noise**2 + attitude**2 + lack**2 + evidence.gravity_sd**2
+        model = float(np.sqrt(max(claimed**2 - itemised, 0.0)))
     excess = float(np.sqrt(max(judgement.headline_rms**2 - claimed**2, 0.0)))
     drift_k, drift, slope = info.thermometers.standard_uncertainty_k, None, ''
     if drift_k is not None:
         drift = drift_k * _slope(calibration)
         slope = f'{drift_k:g} K times the RMS slope of the bias'
-    seconds = f'white noise of a mean over {windows.window_s:g} s'
-    left_out = 'left-out errors beyond noise and sd of parameters'
     gravity = unclaimed_gravity_sd(evidence, info)
     if gravity is not None and calibration.has_uncertainty:
         gravity = float(np.hypot(gravity, evidence.gravity_sd))
-    in_fit = 'given to the fit' if evidence.gravity_sd else ''
-    return (
-        Contribution('noise', 'A', noise, seconds),
-        Contribution('gravity', 'B', gravity, info.gravity.source or in_fit),
-        Contribution('attitude', 'A', attitude, 'uncertainty of the misalignment of the axes'),
-        Contribution('thermometers', 'B', drift, slope),
-        Contribution('lack of fit', 'A', lack, left_out),
-        Contribution('model', 'A', model, 'rest of the claimed sd of |f|'),
-        Contribution('repeatability', 'A', excess, 'RMS of |f| − g beyond the claimed sd'),
+    source = info.gravity.source or ('given to the fit' if evidence.gravity_sd else '')
+    parts = (
+        ('noise', 'A', noise, f'white noise of a mean over {windows.window_s:g} s'),
+        ('gravity', 'B', gravity, source),
+        ('attitude', 'A', attitude, 'uncertainty of the misalignment of the axes'),
+        ('thermometers', 'B', drift, slope),
+        ('lack of fit', 'A', lack, 'left-out errors beyond noise and sd of parameters'),
+        ('model', 'A', model, 'remainder of the claimed sd of |f|'),
+        ('repeatability', 'A', excess, 'RMS of |f| − g beyond the claimed sd'),
     )
+    return tuple(Contribution(*part) for part in parts)
 
 
 def unclaimed_gravity_sd(evidence: Evidence, info: CertificateInfo) -> float | None:
-    """Return the sd of gravity beyond that in the covariance [m/s^2]; None if not stated."""
+    """Return the part of gravity's sd that the covariance lacks [m/s^2]; None if not stated."""
     stated = info.gravity.standard_uncertainty_m_s2
     if stated is None:
         return 0.0 if evidence.gravity_sd else None
@@ -159,7 +158,7 @@ def results(
         return []
     unit = 'counts' if calibration.unit.input == 'counts' else 'm/s²'
     bias, bias_sd, scale, scale_sd = in_a_soak(calibration)
-    known = COVERAGE if calibration.has_uncertainty else np.nan
+    coverage = COVERAGE if calibration.has_uncertainty else np.nan
     scale_sd = np.hypot(scale_sd, _gravity_part(evidence, info)) * np.abs(scale)
     below = ((1, 0), (2, 0), (2, 1))
     constants = {
@@ -173,13 +172,13 @@ def results(
         ),
     }
     rows = [
-        Result(name.format(part), *rounded(float(value), float(known * sd)), of)
-        for name, (parts, values, sds, of) in constants.items()
+        Result(name.format(part), *rounded(float(value), float(coverage * sd)), in_unit)
+        for name, (parts, values, sds, in_unit) in constants.items()
         for part, value, sd in zip(parts, values, sds, strict=True)
     ]
     for term in nonlinear_coefficients(calibration):
         rows += [
-            Result(f'{term.name} {axis}', *rounded(value, known * sd), term.unit)
+            Result(f'{term.name} {axis}', *rounded(value, coverage * sd), term.unit)
             for axis, value, sd in zip(AXES, term.value.tolist(), term.sd.tolist(), strict=True)
         ]
     if contributions and evidence.judgement is not None:
@@ -187,7 +186,7 @@ def results(
         for name in ('static', 'dynamic'):
             section = evidence.judgement.sections[name]
             if section.n:
-                is_known = known > 0.0 and unclaimed_gravity_sd(evidence, info) is not None
+                is_known = coverage > 0.0 and unclaimed_gravity_sd(evidence, info) is not None
                 mean_ug = section.mean / MICRO_G
                 texts = rounded(mean_ug, expanded_ug) if is_known else (number(mean_ug), '–')
                 rows.append(Result(f'mean of |f| − g, {name}', *texts, 'µg'))
@@ -199,7 +198,7 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
     calibration = evidence.calibration
     if calibration is None or not calibration.needs_temperature:
         return []
-    known = COVERAGE if calibration.has_uncertainty else np.nan
+    coverage = COVERAGE if calibration.has_uncertainty else np.nan
     slope = slopes(curves(calibration)[0])
     bias_0, *_ = in_a_soak(calibration)
     tables = [
@@ -215,13 +214,13 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
         # other uncertainties; without any uncertainty, the largest value of a column has 4 digits.
         largest = np.maximum(np.abs(value).max(axis=0), 1e-3)
         four_digits = 10.0 ** (np.floor(np.log10(largest)) - 2.0)
-        digits = np.where(known * sd > 0.0, known * sd, four_digits)
+        digits = np.where(coverage * sd > 0.0, coverage * sd, four_digits)
         sd[:, 3:] = np.hypot(sd[:, 3:], 1e6 * _gravity_part(evidence, info))
         for k, table in enumerate(tables):
             for row in range(len(at)):
                 cells = [program.name, minus(f'{at[row]:.1f}')]
                 for column in (k, k + 3):
-                    expanded = float(known * sd[row, column])
+                    expanded = float(coverage * sd[row, column])
                     place = expanded if math.isfinite(expanded) else float(digits[row, column])
                     text, deviation = (
                         rounded(float(part[row, column]), place)[0] for part in (value, off)
@@ -232,7 +231,7 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
 
 
 def _gravity_part(evidence: Evidence, info: CertificateInfo) -> float:
-    """Return the scale's relative uncertainty due to gravity; NaN if gravity has no stated sd."""
+    """Return the scale's relative sd due to gravity's sd; NaN if gravity has no stated sd."""
     sd = unclaimed_gravity_sd(evidence, info)
     if sd is None or evidence.calibration is None:
         return np.nan
@@ -240,7 +239,7 @@ def _gravity_part(evidence: Evidence, info: CertificateInfo) -> float:
 
 
 def conformity(evidence: Evidence) -> tuple[str, str]:
-    """Return the statement of conformity and its rule, or '' and why no statement is made."""
+    """Return the statement of conformity and its rule; '' and a reason if none is made."""
     judgement = evidence.judgement
     if judgement is None:
         return '', 'No recording was judged: no statement of conformity is made.'
@@ -260,7 +259,7 @@ def conformity(evidence: Evidence) -> tuple[str, str]:
 
 
 def _slope(calibration: Calibration) -> float:
-    """RMS of the slope of the bias, over the static range and the axes [m/s^2/K]."""
+    """Return the RMS of the bias's slope over the static range and the axes [m/s^2/K]."""
     temperature = np.linspace(*calibration.static.temperature_range_c, _N_SLOPE)
     bias, _ = bias_and_scale(calibration, ramp_states(calibration, temperature))
     return _rms(np.diff(bias, axis=0) / np.diff(temperature)[:, None])

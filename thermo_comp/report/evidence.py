@@ -16,7 +16,6 @@ import numpy as np
 
 from ..fitting import FitResult, ResidualRow
 from ..fitting.coverage import LeastKnown, distinct_directions, least_known
-from ..fitting.data_checks import Finding
 from ..fitting.reduction import ReducedBag
 from ..fitting.sensors import learn_detector, readings_in_order
 from ..judging.evaluation import Epoch, history_of, judge_bags
@@ -44,7 +43,7 @@ CHOSEN = 'calibration'
 LEFT_OUT = 'left out'
 # Rate from which the heating (cooling) in bags counts as a heating (cooling) ramp [K/min].
 _SLOWEST_RAMP_K_MIN = 0.05
-#: Key of a bag's metadata in which the simulator stores the truth.
+#: Key of a bag's metadata in which the simulator stores the true parameters.
 _SIMULATED = 'truth'
 # Largest number of points of a line; a figure has fewer pixels in a row.
 _MOST_POINTS = 4000
@@ -72,16 +71,16 @@ class Stretch(NamedTuple):
 
 @dataclass(frozen=True)
 class ShownBag:
-    """A bag's regimes; temperature rates [K/s], second derivative [K/s^2], NaN until settled."""
+    """A bag, its regimes, and estimated derivatives, which are NaN until they have settled."""
 
     index: int
     bag: ReducedBag
     start_ns: int
     duration_s: float
     time: Floats
-    board_rate: Floats
-    case_rate: Floats
-    acceleration: Floats
+    board_rate: Floats  # [K/s]
+    case_rate: Floats  # [K/s]
+    acceleration: Floats  # second derivative of the temperature of the leading sensor [K/s^2]
     stretches: tuple[Stretch, ...]
 
     @property
@@ -96,9 +95,9 @@ class Evidence:
     The content of a report; missing parts are None or empty.
 
     `windows`: windows at rest of all bags; `judgement`: judgement of `windows`; `steps`: residuals
-    after each step of the model; `left_out`: for each position of `windows` its RMS of ``|f| - g``
-    by a fit to the other positions [m/s^2]; `findings`: reservations about calibration or bags;
-    `checks`: passed checks.
+    after each step of the model; `left_out`: error of each position of `windows` with a fit to the
+    other positions [m/s^2], see `left_out_text`; `findings`: reservations about calibration or
+    bags; `checks`: passed checks.
     """
 
     serial: str
@@ -126,9 +125,9 @@ class Evidence:
     @property
     def is_seen(self) -> bool:
         """Whether the calibration was fitted on a bag of this evidence."""
-        known = {source.sha256 for source in self.sources if source.sha256}
+        fitted = {source.sha256 for source in self.sources if source.sha256}
         shown = {source.sha256 for bag in self.bags for source in bag.sources}
-        return bool(self.steps) or not known.isdisjoint(shown)
+        return bool(self.steps) or not fitted.isdisjoint(shown)
 
     @property
     def is_simulated(self) -> bool:
@@ -153,7 +152,7 @@ class Evidence:
 
     @property
     def level(self) -> Literal['good', 'reserved', 'poor', 'open']:
-        """Verdict as a word; 'reserved': valid, with reservations or a large claimed sd."""
+        """Class of the verdict; 'reserved': valid, but with reservations or a large claimed sd."""
         if self.judgement is None or self.judgement.kind in (Verdict.OUTSIDE, Verdict.NO_CLAIM):
             return 'open'
         if not self.judgement.is_valid:
@@ -163,7 +162,7 @@ class Evidence:
 
     @cached_property
     def shown(self) -> ShownBag | None:
-        """The bag that the figures over time show, with the node's thermal state."""
+        """The bag that the figures over time show, with its temperature rates and regimes."""
         if not self.bags:
             return None
         calibration, index = self.calibration, widest(self.bags)
@@ -197,7 +196,7 @@ class Evidence:
 
     @cached_property
     def positions(self) -> tuple[Position, ...]:
-        """The still positions, with attitudes from the best known correction in `forces`."""
+        """The still positions; attitudes by corrected or, without calibration, raw forces."""
         windows = self.windows
         if windows is None or not self.forces:
             return ()
@@ -243,7 +242,7 @@ class Evidence:
         )
 
     def axis_residuals(self) -> dict[str, Floats]:
-        """Return the force less the mean direction of the position times the known |f|, (n, 3)."""
+        """Return the force less the known |f| in the position's mean direction, shape (n, 3)."""
         windows = self.windows
         if windows is None or self.gravity is None or not self.positions:
             return {}
@@ -296,7 +295,7 @@ def evidence_of_bags(
         bags=tuple(bags),
         windows=judgement.windows if judgement else windows,
         judgement=judgement,
-        findings=_against(calibration) if calibration else (),
+        findings=_reservations(calibration) if calibration else (),
         history=history_of([calibration, *others]) if calibration and others else (),
     )
 
@@ -311,16 +310,16 @@ def evidence_of_fit(result: FitResult) -> Evidence:
         judged,
         steps=result.residuals,
         left_out={k: left_out[at] for k, at in enumerate(rests) if left_out.get(at, 0.0) > 0.0},
-        checks=tuple(note.message for note in result.findings if not _is_reservation(note)),
+        # The finding `positions` is no reservation: it advises more positions than a fit needs.
+        checks=tuple(
+            note.message
+            for note in result.findings
+            if note.level != 'advice' or note.name == 'positions'
+        ),
     )
 
 
-def _is_reservation(finding: Finding) -> bool:
-    # The finding `positions` is no reservation: it advises more positions than a fit needs.
-    return finding.level == 'advice' and finding.name != 'positions'
-
-
-def _against(calibration: Calibration) -> tuple[str, ...]:
+def _reservations(calibration: Calibration) -> tuple[str, ...]:
     """Return the reservations about a calibration, except advice to record more positions."""
     lower, upper = calibration.dynamic.rate_range_k_min
     notes = [
@@ -384,15 +383,15 @@ def shown_bag(bag: ReducedBag, index: int, detector: DetectorSettings) -> ShownB
     )
     every = slice(None, None, len(time) // _MOST_POINTS + 1)
     columns = np.array(rows).reshape(-1, 3, 2)[every]
-    board, case, bend = (_settled(*columns[:, k].T) for k in range(3))
-    return ShownBag(index, bag, start_ns, end, time[every], board, case, bend, tuple(stretches))
+    board, case, second = (_settled(*columns[:, k].T) for k in range(3))
+    return ShownBag(index, bag, start_ns, end, time[every], board, case, second, tuple(stretches))
 
 
 def _settled(value: Floats, variance: Floats) -> Floats:
     """Replace an estimate by NaN until its sd has fallen to three times its median sd."""
-    known = np.isfinite(value) & np.isfinite(variance)
-    if not known.any():
+    is_known = np.isfinite(value) & np.isfinite(variance)
+    if not is_known.any():
         return np.full(len(value), np.nan)
-    usual = float(np.median(variance[known]))
-    first = int(np.argmax(known & (variance <= 9.0 * usual)))
-    return np.where(known & (np.arange(len(value)) >= first), value, np.nan)
+    usual = float(np.median(variance[is_known]))
+    first = int(np.argmax(is_known & (variance <= 9.0 * usual)))
+    return np.where(is_known & (np.arange(len(value)) >= first), value, np.nan)

@@ -31,7 +31,7 @@ _ZERO_S = 120.0
 _SHADE = '#E9E9E9'
 # Diameter of the ring of the position with the largest residual [pt].
 _RING = 22.0
-# Largest number of positions, and so of rows, in `draw_every_position`.
+# Largest number of rows, one for each position, in `draw_every_position`.
 _MOST = 24
 #: Two-sided 95 % of a normal distribution, in standard deviations.
 BAND_SDS = 1.96
@@ -43,6 +43,7 @@ _LOOKS: dict[str, tuple[style.Line, str, str]] = {
     'cooling': (style.AXIS_LINES[2], '....', 'v'),
 }
 _POINT: style.Line = {'color': style.BLACK, 'ms': 3.0, 'mfc': 'none', 'mew': 0.8}
+_LABEL: style.Line = {'textcoords': 'offset points', 'fontsize': 7.5}
 
 
 def draw_temperatures(evidence: Evidence) -> Figure:
@@ -70,7 +71,7 @@ def draw_dynamics(evidence: Evidence) -> Figure:
         _plot(panels[0], evidence, drift, unit, label=AXES)
         panels[0].set_ylabel(name)
         style.legend_above(panels[0], 'a  drift of the readings in each position')
-    rates, bend, flag = panels[-3:]
+    rates, second, flag = panels[-3:]
     for label, rate, line in (
         ('dT case/dt', shown.case_rate, style.CASE_LINE),
         ('dT board/dt', shown.board_rate, style.BOARD_LINE),
@@ -80,9 +81,9 @@ def draw_dynamics(evidence: Evidence) -> Figure:
     rates.set_ylabel('K/min')
     style.legend_above(rates, 'b  first derivatives')
     line = style.CASE_LINE if shown.leader == 'case' else style.BOARD_LINE
-    bend.plot(shown.time / unit, shown.acceleration * 3600.0, **line)
-    bend.set(ylabel='K/min²', title=f'second derivative of T {shown.leader}')
-    bend.locator_params(axis='y', nbins=4)
+    second.plot(shown.time / unit, shown.acceleration * 3600.0, **line)
+    second.set(ylabel='K/min²', title=f'second derivative of T {shown.leader}')
+    second.locator_params(axis='y', nbins=4)
     _draw_flag(flag, shown, unit)
     figure.align_ylabels(panels[:-1])
     return figure
@@ -135,7 +136,10 @@ def draw_gravity(evidence: Evidence) -> Figure:
 def _panels(
     evidence: Evidence, heights: Sequence[float], *, more: float = 0.0, is_flagged: bool = False
 ) -> tuple[Figure, list[Axes], ShownBag, float]:
-    """Return a figure, its panels over time, the bag that they show, unit of the time axis [s]."""
+    """
+    Return a figure, its panels over time, the bag that they show, and the unit of time [s].
+    `more`: height besides the panels [in]; `is_flagged`: the last panel, the flag, is not shaded.
+    """
     shown = required(evidence.shown)
     unit, name = style.time_unit(shown.duration_s)
     figure = style.new_figure(more + sum(heights))
@@ -237,7 +241,7 @@ def draw_every_position(evidence: Evidence) -> Figure:
 
 
 def draw_positions(evidence: Evidence) -> Figure:
-    """Draw the directions of the positions on the sphere, and the residual of each."""
+    """Draw the directions of the positions on the sphere, and the residual of each position."""
     figure = style.new_figure(3.0)
     up, down = figure.subplots(1, 2)
     axis = evidence.least_known
@@ -250,7 +254,7 @@ def draw_positions(evidence: Evidence) -> Figure:
             text = '±' + ug_text(axis.sd_m_s2).replace('ug', 'µg')
             # Shift the label towards the centre of the disc, as axis names are outside the disc.
             by = (0.0, 6.0 if place[1] < 0.0 else -12.0)
-            _note(axes, text, place, by, ha='center', color=style.RED)
+            axes.annotate(text, place, by, ha='center', color=style.RED, **_LABEL)
         axes.set_title(name, loc='center')
     return figure
 
@@ -262,22 +266,13 @@ def equal_area(up: tuple[float, ...], side: int) -> tuple[float, float]:
     return float(x * factor), float(y * factor)
 
 
-def _note(
-    axes: Axes, text: str, place: tuple[float, float], by: tuple[float, float], **look: Any
-) -> None:
-    axes.annotate(text, place, by, textcoords='offset points', fontsize=7.5, **look)
-
-
 def _draw_hemisphere(axes: Axes, positions: tuple[Position, ...], side: int, judged: str) -> None:
     angle = np.linspace(0.0, 2.0 * np.pi, 181)
     axes.plot(np.cos(angle), np.sin(angle), color='black', linewidth=0.8)
     # Radius of the circle at an elevation of 45 degrees, in the projection of `equal_area`.
     ring = np.sqrt(1.0 - np.sin(np.pi / 4.0))
-    for line in (
-        (ring * np.cos(angle), ring * np.sin(angle)),
-        ([-1, 1], [0, 0]),
-        ([0, 0], [-1, 1]),
-    ):
+    lines = (ring * np.cos(angle), ring * np.sin(angle)), ([-1, 1], [0, 0]), ([0, 0], [-1, 1])
+    for line in lines:
         axes.plot(*line, color='#BBBBBB', linewidth=0.6)
     for label, x, y in (('+x', 1.2, 0), ('−x', -1.2, 0), ('+y', 0, 1.2), ('−y', 0, -1.2)):
         axes.text(x, y, label, ha='center', va='center', color='#555555', fontsize=7.5)
@@ -289,7 +284,7 @@ def _draw_hemisphere(axes: Axes, positions: tuple[Position, ...], side: int, jud
             if largest > 0.0:
                 size = _RING * np.sqrt(position.residual_rms.get(judged, 0.0) / largest)
                 axes.plot(*place, 'o', markersize=size, mfc='none', mec=style.RED, mew=1.1)
-            _note(axes, str(position.number), place, (3.5, 2.5))
+            axes.annotate(str(position.number), place, (3.5, 2.5), **_LABEL)
     axes.set(xlim=(-1.32, 1.32), ylim=(-1.32, 1.32), aspect='equal')
     axes.set_axis_off()
 
@@ -403,8 +398,8 @@ def draw_distances(
     """Draw each unit's distance from the fleet's median, by quantity; outliers are diamonds."""
     figure = style.new_figure(0.6 + 0.19 * len(labels))
     axes = figure.subplots()
-    known = [limit for limit in limits if np.isfinite(limit)]
-    shown = min(max(1.15 * max(known, default=0.0), 4.0), 12.0)
+    finite = [limit for limit in limits if np.isfinite(limit)]
+    shown = min(max(1.15 * max(finite, default=0.0), 4.0), 12.0)
     for row, (z, limit) in enumerate(zip(distances, limits, strict=True)):
         at = np.clip(z, -1.04 * shown, 1.04 * shown)
         is_far = np.abs(z) > limit

@@ -54,7 +54,7 @@ class GravityStatement:
 
 @dataclass(frozen=True)
 class Thermometers:
-    """Standard uncertainty due to drift of the unit's thermometers from calibration to use."""
+    """Standard uncertainty of the unit's thermometers due to drift between calibration and use."""
 
     standard_uncertainty_k: NotNegative | None = None
 

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the style of pages, whose content policy forbids scripts and external files, and of figures,
-whose lines differ in dashes and in colours (from the palette of Okabe and Ito).
+Owns the style of pages and figures. The content policy of a page forbids scripts and external
+files. Lines of a figure differ in dashes and in colours (from the palette of Okabe and Ito).
 """
 
 import datetime as dt
@@ -78,11 +78,11 @@ _POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-
 # Largest number of characters in the margin of a printed page.
 _LONGEST_MARGIN = 90
 _PNG_DPI = 160
-_WIDTH = 7.1
+_WIDTH = 7.1  # width of a figure and of the text of a printed page [in]
 
 
 def drawing() -> AbstractContextManager[None]:
-    """Return a context in which matplotlib uses the style of the report, not of the user."""
+    """Return a context in which matplotlib uses the style of the report, not that of the user."""
     return style.context(_RC, after_reset=True)
 
 

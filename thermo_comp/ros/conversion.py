@@ -19,9 +19,9 @@ from typing import Any
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu, Temperature
 
-#: Compensates a sample: from stamp [ns], x, y, z to force and covariance; None: sample dropped.
+#: Corrects a sample: takes stamp [ns], x, y, z; returns force and covariance, None if dropped.
 Process = Callable[[int, float, float, float], 'tuple[float, ...] | None']
-#: Corrects the angular rate of a sample: from stamp [ns], x, y, z to rate and its variances.
+#: Corrects the angular rate of a sample: takes stamp [ns], x, y, z; returns rate and variances.
 CorrectRate = Callable[[int, float, float, float], 'tuple[float, ...]']
 
 #: Longest message read [bytes]; an Imu with the longest frame name is shorter.
@@ -29,12 +29,13 @@ _LONGEST_MESSAGE = 1024
 
 _ENCAPSULATION = b'\0\1\0\0'
 _HEADER = struct.Struct('<4siI4x')
-# Bytes of an Imu that are passed on: orientation 4 + 9 and angular velocity 3 + 9 float64 values;
-# linear acceleration 3 + 9 follow.
+# Number of bytes of an Imu that are passed on: orientation 4 + 9 and angular velocity 3 + 9
+# float64 values; linear acceleration 3 + 9 follow. `_UNKNOWN`: these bytes for counts, with the
+# mark -1 of quantities that are not measured.
 _PASSED = 8 * 25
-_NO_GYRO = struct.Struct('<25d').pack(*[0.0] * 3, 1.0, -1.0, *[0.0] * 11, -1.0, *[0.0] * 8)
+_UNKNOWN = struct.Struct('<25d').pack(*[0.0] * 3, 1.0, -1.0, *[0.0] * 11, -1.0, *[0.0] * 8)
 #: Offset of the angular rate in the `_PASSED` bytes; formats of the rate with the first element of
-#: its covariance, and with all nine elements.
+#: its covariance (input), and with all nine elements (output).
 _RATE_AT = 8 * 13
 _RATE_IN, _RATE_OUT = struct.Struct('<4d'), struct.Struct('<12d')
 _CELSIUS = struct.Struct('<d')
@@ -54,17 +55,17 @@ class Traffic:
 
 
 class SampleConverter:
-    """Converts serialized samples to serialized Imu; empty `frame_id`: the frame of the input."""
+    """Converts serialized samples to serialized Imu; with `frame_id` '' in the input's frame."""
 
     def __init__(self, kind: Any, frame_id: str = '', traffic: Traffic | None = None) -> None:
         self._kind, self._frame_id = kind, frame_id
         self.traffic = traffic or Traffic()
-        # Layout of the last input message: frame, offset of the bytes passed on, struct to unpack.
-        # Layout of the Imu that is written: frame, struct to pack.
+        # Layout of the last input message: frame name, offset of the `_PASSED` bytes, function to
+        # unpack it. Layout of the Imu that is written: frame name, function to pack it.
         self._name, self._passed, self._frame = b'', 0, b''
         self._unpack: Callable[[bytes], tuple[Any, ...]] = struct.Struct('').unpack
         self._pack: Callable[..., bytes] = struct.Struct('').pack
-        #: Last result of `process`, for reports.
+        #: Force and covariance that `process` returned last, for the diagnostics.
         self.last_result: tuple[float, ...] | None = None
 
     def convert(
@@ -89,7 +90,7 @@ class SampleConverter:
         if result is None:
             return None
         self.last_result = result
-        block = _NO_GYRO
+        block = _UNKNOWN
         if self._passed:
             block = data[self._passed : self._passed + _PASSED]
             if correct_rate is not None:
@@ -137,7 +138,7 @@ def read_temperature(data: bytes) -> tuple[int, float] | None:
 
 
 def _values_at(data: bytes, size: int) -> int:
-    """Return the offset of the `size` bytes of numbers in a message; 0 if it is not plain CDR."""
+    """Return the offset of the last `size` bytes, the numbers; 0 if it is not plain CDR."""
     if not 16 < len(data) <= _LONGEST_MESSAGE or data[:4] != _ENCAPSULATION:
         return 0
     length = int.from_bytes(data[12:16], 'little')
@@ -152,7 +153,7 @@ def _values_at(data: bytes, size: int) -> int:
 
 
 def _plain(data: bytes, size: int, message_type: Any) -> tuple[bytes, int]:
-    """Return a message as plain CDR, by rclpy if needed, and the offset of its numbers or 0."""
+    """Return a message as plain CDR and the offset of its numbers; offset 0 if unreadable."""
     start = _values_at(data, size)
     if not start and len(data) <= _LONGEST_MESSAGE:
         # RuntimeError: rclpy cannot read the message. ValueError: a frame name is not UTF-8.

@@ -31,14 +31,14 @@ from .reader import LoadedCalibration
 from .relay import Relay
 from .waitloop import WaitLoop
 
-# Time without samples until waiting readings are used [s]; Fast DDS may deliver samples 3 s late.
+# Time without samples after which readings are used [s]; Fast DDS may deliver samples 3 s late.
 IDLE_S = 5.0
-#: A temperature reading stamped later than the samples by over this time [s] has another clock.
+#: Stamps of readings that are ahead of those of samples by more than this show another clock [s].
 AHEAD_S = 5.0
-#: Samples have stopped if none arrives for this number of conversion cycles and this time [s].
+#: The samples have stopped if none has arrived for this number of conversion cycles and time [s].
 SILENT_CYCLES, SILENT_S = 5.0, 0.5
-#: Time for which the level must be lower before a lower level is logged [s], so that a fault that
-#: comes and goes does not fill the log.
+#: Time for which the level must stay lower until the lower level is logged [s], so that a fault
+#: that comes and goes does not fill the log.
 RELIEF_S = 5.0
 #: Largest error of |f| at rest without a warning, in standard deviations of the error.
 GRAVITY_SIGMAS = 5.0
@@ -46,7 +46,7 @@ GRAVITY_SIGMAS = 5.0
 _ERROR, _WARN = DiagnosticStatus.ERROR[0], DiagnosticStatus.WARN[0]
 _DIRECTIONS = {-1: 'cooling', 0: 'none', 1: 'heating'}
 
-#: Level and text of a counter that has risen; the number follows the text. `topic`: the samples.
+#: Level and text of a finding if a counter has risen; the rise follows the text.
 _RISEN = {
     'n_contested': (_ERROR, 'messages of more than one publisher, dropped'),
     'n_failures': (_ERROR, 'callbacks failed, see the log of the node'),
@@ -85,8 +85,7 @@ class Reporter:
     def __init__(self, loop: WaitLoop, relay: Relay) -> None:
         self._loop, self._node, self._relay = loop, loop.node, relay
         self._publisher = loop.publisher(DiagnosticArray, STATUS.name, qos_of(STATUS))
-        #: The level in the last line of the log, and the time of the last report of this level or
-        #: a higher level.
+        # Level in the last line of the log; time of the last report of this level or a higher one.
         self._level, self._level_s = b'', time.monotonic()
         self._n_publishers = 0
         self._last_samples = time.monotonic()
@@ -115,11 +114,11 @@ class Reporter:
             if passed_s > 0.0 and new['n_in'] and self._before['n_in']:
                 rate = new['n_in'] / passed_s
         self._before, self._before_ns = counts, status.stamp_ns
-        topic = self._relay.samples.subscription.topic_name
+        topic = self._relay.running.samples.subscription.topic_name
         findings = list(self._findings())
         findings += findings_of(loaded, status, new, rate, silence_s, topic)
-        # Vehicle accelerations give no warning: without nonlinearity in the calibration, warnings
-        # begin at 2.01 g, where the unknown square term has an sd of 0.1 mg.
+        # Without nonlinearity in the calibration, warnings begin at 2.01 g, where the unknown
+        # square term has an sd of 0.1 mg, so that accelerations of a vehicle give no warning.
         allowance = 0.0 if loaded.calibration.nonlinearity else STANDARD_GRAVITY
         if (over := self._force_excess()) > allowance:
             text = f'|f| {over:.3g} m/s^2 above the largest |f| of the fit: the covariance grows'
@@ -151,7 +150,7 @@ class Reporter:
                 log.error(message.message)
 
     def _force_excess(self) -> float:
-        """Return by how much the last |f| exceeds the largest |f| of the fit or 1.01 g [m/s^2]."""
+        """Return the excess of the last |f| over 1.01 g and the largest |f| of the fit [m/s^2]."""
         last = self._relay.running.converter.last_result
         if last is None:
             return 0.0
@@ -163,8 +162,8 @@ class Reporter:
         return {'n_in': counters.n_in, **asdict(counters), **traffic}
 
     def _count_lost(self) -> None:
-        """Count messages missing by the driver's sequence numbers, if no other node publishes."""
-        samples = self._relay.samples
+        """Count samples missing in the sequence numbers, if the driver is the only publisher."""
+        samples = self._relay.running.samples
         n_lost, samples.n_lost = samples.n_lost, 0
         before, self._n_publishers = self._n_publishers, samples.count_publishers()
         if before == self._n_publishers == 1:
@@ -306,7 +305,7 @@ def findings_of(
     silence_s: float,
     topic: str = '',
 ) -> Iterator[Finding]:
-    """Yield the problems of the inputs and of the correction."""
+    """Yield the problems of inputs and correction; `new`: increases of the counters."""
     unit, needs_board = loaded.calibration.unit, loaded.calibration.needs_temperature
     if new['n_in'] == 0 and silence_s > max(SILENT_S, SILENT_CYCLES * unit.cycle_time_s):
         yield _ERROR, 'no samples are coming in'
@@ -323,9 +322,8 @@ def findings_of(
     for name, (fault, step) in status.faults.items():
         if fault in _FAULTS:
             yield _WARN, f'{name} temperature {_FAULTS[fault].format(step)}'
-    if status.pending_ahead_s > AHEAD_S:
-        text = f'{status.pending_ahead_s:.0f} s ahead of the samples'
-        yield _WARN, f'temperatures are stamped {text}'
+    if (ahead_s := status.pending_ahead_s) > AHEAD_S:
+        yield _WARN, f'temperatures are stamped {ahead_s:.0f} s ahead of the samples'
     if status.is_lead_reversed:
         yield _ERROR, SWAPPED
     gravity = status.gravity

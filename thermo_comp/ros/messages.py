@@ -4,7 +4,7 @@
 Owns rclpy's message classes and QoS profiles by name, and numbers read from any message.
 
 A temperature may be a number in a message of any type. The class of a message is imported at run
-time: a driver brings the package of its messages, which is no dependency of this package.
+time, because this package does not depend on the packages of drivers' messages.
 """
 
 import re

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the node `thermo_comp`: from samples and temperatures to force, regime flag and diagnostics.
+Owns the node `thermo_comp`: samples and temperatures in; force, regime flag, diagnostics out.
 
 The output equals that of the offline replay of the same messages in the same order bit for bit.
 Parameters are checked when they are set, and applied between two wake-ups of the node's loop.
@@ -34,9 +34,9 @@ NODE_NAME = 'thermo_comp'
 
 #: Pause after a wake-up [s], for best-effort samples at 7 kHz or more. The pause saves a third
 #: of the CPU time at 10 kHz; at 5 kHz it would delay a sample by more than the correction takes.
-REST_S = 0.2e-3
+PAUSE_S = 0.2e-3
 
-#: Time within which the process ends after a signal, even if a call hangs [s].
+#: Time after a signal at which a process is ended even if a call hangs [s].
 ENDING_S = 1.8
 
 USAGE = f"""\
@@ -53,7 +53,7 @@ parameters:
 #: Prefix that the launch file puts before the name of a parameter whose argument is missing.
 NOT_GIVEN = 'not_given.'
 
-#: Errors caused by the user's files, values or environment, or the middleware (RuntimeError).
+#: Errors due to the user's files, values or environment, or to the middleware (RuntimeError).
 _USER_ERRORS = (ThermoCompError, OSError, RuntimeError, rclpy.exceptions.ParameterException)
 
 
@@ -74,7 +74,7 @@ class CompensationNode:
         loaded = read_within(config.calibration_file, config.calibration_directory)
         compensator = Compensator(loaded.calibration, config.compensator_config())
         self._check(loaded, config, compensator.thermal.inputs)
-        self._loop = WaitLoop(self.node, REST_S)
+        self._loop = WaitLoop(self.node, PAUSE_S)
         self._relay = Relay(self._loop, loaded, compensator, config)
         self._reporter = Reporter(self._loop, self._relay)
         self._reader = Reader()

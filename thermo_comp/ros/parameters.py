@@ -45,7 +45,7 @@ def _parameter(default: Any, description: str, bounds: tuple[float, ...] = (), *
 
 @dataclass(frozen=True, slots=True)
 class NodeConfig:
-    """The parameters; those without `is_fixed` can be set while the node runs."""
+    """The node's parameters; those without `is_fixed` can be set while the node runs."""
 
     calibration_file: str = _parameter(
         '',
@@ -79,7 +79,7 @@ class NodeConfig:
     input: str = _parameter(
         'counts',
         'Input to compensate: accel/counts (Vector3Stamped) or imu/uncompensated (Imu). If '
-        '`topics` names only one of counts and imu, the start sets `input` to it.',
+        '`topics` names only one of counts and imu, `input` is set to this one at the start.',
         choices=('counts', 'imu'),
     )
     frame_id: str = _parameter(
@@ -107,7 +107,7 @@ class NodeConfig:
     )
     stuck_timeout: float = _parameter(
         _DEFAULTS.stuck_timeout_s,
-        'Longest repetition of equal readings that is published [s], on all axes, or on one axis '
+        'Longest repetition of equal values that is published [s], on all axes, or on one axis '
         'while the others change or show noise; at least 50 repetitions are published. Samples of '
         'three zeros are dropped at once. 0: repetitions and zeros are published.',
         (0.0, 3600.0),
@@ -119,9 +119,9 @@ class NodeConfig:
     )
     gravity_tolerance: float = _parameter(
         _DEFAULTS.gravity_tolerance_m_s2,
-        'Error of |f| at rest [m/s^2], beyond 5 sd, at which publishing stops, as with the '
-        'calibration of another unit; 0: no error of |f| stops publishing. A reversed axis '
-        'changes |f| at rest by at most twice the bias of the axis.',
+        'Publishing stops if the error of |f| at rest exceeds this value plus 5 sd [m/s^2], as '
+        'with the calibration of another unit; 0: no error of |f| stops publishing. A reversed '
+        'axis changes |f| at rest by at most twice the bias of the axis.',
         (0.0, 100.0),
     )
     diagnostics_period: float = _parameter(1.0, 'Period of /diagnostics [s].', (0.01, 60.0))
@@ -250,7 +250,7 @@ class ParameterRequests:
     def _take(self, kind: Any, request: Any, answer: Callable[[Any], None]) -> None:
         is_each, n, reason = kind is srv.SetParameters, len(request.parameters), ''
         groups = [[change] for change in request.parameters] if is_each else [request.parameters]
-        waits = any(parameter.name == 'calibration_file' for parameter in request.parameters)
+        reads_file = any(parameter.name == 'calibration_file' for parameter in request.parameters)
         results: list[SetParametersResult] = []
 
         def respond() -> None:
@@ -262,17 +262,17 @@ class ParameterRequests:
                 self._set(prepared, results)
             finally:
                 if len(results) == len(groups):
-                    self._n_waiting -= waits
+                    self._n_waiting -= reads_file
                     respond()
 
         if n > PARAMETERS_LIMIT:
             reason = f'{n} parameters in one request, at most {PARAMETERS_LIMIT} are allowed'
-        elif waits and self._n_waiting >= WAITING_LIMIT:
+        elif reads_file and self._n_waiting >= WAITING_LIMIT:
             reason = 'too many requests are waiting, try again'
         elif groups:
-            self._n_waiting += waits
+            self._n_waiting += reads_file
             for group in groups:
-                future = (self._slow if waits else self._quick).submit(self._read, group)
+                future = (self._slow if reads_file else self._quick).submit(self._read, group)
                 future.add_done_callback(lambda done: self._loop.call_soon(partial(end, done)))
             return
         # Send at most `PARAMETERS_LIMIT` results: each takes as long as reading a parameter.

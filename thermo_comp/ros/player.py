@@ -4,11 +4,11 @@
 Owns the player: publishes a bag on the node's input topics, with `/clock`, at a multiple of real
 time or as fast as the subscribers acknowledge messages.
 
-Topics have the node's relative names. Messages keep the bag's order and their bytes; ROS 1
-messages are rewritten in CDR, and temperatures of other types as Temperature. After `WINDOW`
+Topics have the relative names of the node's inputs. Messages keep the bag's order and their bytes;
+ROS 1 messages are rewritten in CDR, temperatures of other types as Temperature. After `WINDOW`
 messages of a topic the player waits until every reliable subscriber has acknowledged them. Fast
-DDS requests acknowledgements every 3 s, and with every message while a history is full: the
-histories are small, and transient-local durability keeps them full.
+DDS requests acknowledgements every 3 s, but with every message while a history is full; therefore
+the histories are small, and transient-local durability keeps them full.
 """
 
 from __future__ import annotations
@@ -56,10 +56,8 @@ class PlayReport:
 
     n_messages: dict[str, int]
     duration_s: float  # wall time from the first message to the last acknowledgement [s]
-    #: Topics without a subscriber; topics with a best-effort subscriber, which may lose messages.
-    unheard: list[str]
-    lossy: list[str]
-    #: Description of the bag, with topics chosen by type and parts that could not be read.
+    unheard: list[str]  # topics without a subscriber
+    lossy: list[str]  # topics with a best-effort subscriber, which may lose messages
     info: RecordingInfo
 
 
@@ -117,7 +115,7 @@ class Player:
     def run(
         self, progress: Callable[[float], None], throttle: Callable[[int], object] = lambda _: None
     ) -> PlayReport:
-        """Send the bag; after each WINDOW of samples, call `throttle` with the number sent."""
+        """Send the bag; call `throttle` with the number of samples sent after each window."""
         reader, n_sent = self._reader, dict.fromkeys(self._publishers, 0)
         total = sum(reader.info.topics[name][1] for name in reader.topics.values())
         topics = {publisher.topic_name: role for role, publisher in self._publishers.items()}
@@ -178,7 +176,7 @@ class Player:
 
 
 def _in_order(block: Block) -> list[tuple[float, int, Role, bytes]]:
-    """List a block's messages in the order of the bag: place, log time, role, bytes."""
+    """List a block's messages in the bag's order, each as place, log time, role and bytes."""
     rows: list[tuple[float, int, Role, bytes]] = []
     places: dict[Role, Any] = {role: part.after - 0.5 for role, part in block.temperatures.items()}
     places['accel'] = np.arange(len(block))

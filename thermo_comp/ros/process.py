@@ -34,8 +34,8 @@ def use_profile() -> None:
 class SignalWatch:
     """
     Calls a stop function at the first signal. A `SignalWatch` must be used in the main thread.
-    `os._exit` ends a process that still runs `ending_s` [s] after the stop function has returned;
-    without `ending_s`, a second signal ends the process.
+    A process that still runs `ending_s` [s] after the stop function has returned is ended by
+    `os._exit`; without `ending_s`, a second signal ends the process.
     """
 
     # A separate thread calls the stop function, because the interpreter runs no signal handlers
@@ -75,7 +75,7 @@ class SignalWatch:
         if os.read(self._reader, 1):
             self._is_over = True
             self._stop()
-            # A launch without a terminal passes a signal of the process group on, as a second one.
+            # A launch without a terminal repeats a signal that the process group has received.
             while select.select([self._reader], [], [], self._ending_s)[0]:
                 number = os.read(self._reader, 1)
                 if not number:

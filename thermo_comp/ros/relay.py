@@ -30,10 +30,10 @@ from .reader import LoadedCalibration
 from .rest_log import BLOCK, RestKeeper
 from .waitloop import RawSubscription, RCLError, WaitLoop
 
-#: Without samples, a reading is used once a reading arrives with a stamp later by this time [ns].
+#: Without samples, a reading is used once it is this much older than the newest reading [ns].
 IDLE_NS = 1_000_000_000
 
-_SECOND = slice(4, 8)  # bytes of a message in CDR: seconds of the stamp
+_SECOND = slice(4, 8)  # bytes of a CDR message that hold the seconds of its stamp
 
 # A received temperature: time of reception [ns]; thermometer, stamp [ns], degC.
 _Reading = tuple[int, tuple[str, int, float]]
@@ -83,7 +83,7 @@ class Relay:
         self.rests = RestKeeper(config.rest_log) if config.rest_log else None
         #: Samples that the rest log has not summed yet, or None without a rest log.
         self.waiting: list[bytes] | None = [] if self.rests else None
-        self._second = b''  # seconds of the last stamp in `waiting`, as in the message
+        self._second = b''  # the `_SECOND` bytes of the last message in `waiting`
         self._readings: list[_Reading] = []
         self._newest_reading_ns: int | None = None
 
@@ -100,7 +100,7 @@ class Relay:
             twin = roles.setdefault((topic, split_field(self._topic(name))[1]), name)
             if twin != name:
                 raise ThermoCompError(TWINS.format(twin, name), key=topic)
-        if self.samples.subscription.topic_name == output:
+        if self.running.samples.subscription.topic_name == output:
             reason = f'is both input and output: remap {IMU_OUT.name} to another name'
             raise ThermoCompError(reason, key=output)
 
@@ -129,14 +129,9 @@ class Relay:
         self.thermometers[name] = subscribe(field.kind, topic, qos_of(BOARD), wakes=False)
 
     @property
-    def samples(self) -> RawSubscription:
-        """The subscription to the samples."""
-        return self.running.samples
-
-    @property
     def inputs(self) -> dict[str, RawSubscription]:
         """Subscriptions by their names in the diagnostics: samples first, then thermometers."""
-        return {'sample': self.samples, **self.thermometers}
+        return {'sample': self.running.samples, **self.thermometers}
 
     def _open_samples(self, config: NodeConfig) -> RawSubscription:
         usual = SAMPLES[config.input]
@@ -150,24 +145,24 @@ class Relay:
 
     def successor(self, loaded: LoadedCalibration, model: Model, config: NodeConfig) -> Running:
         """Build the next `Running`; the present `Running` does not change."""
-        now, settings = self.running, config.compensator_config()
-        compensator, converter, samples = now.compensator, now.converter, now.samples
+        present, settings = self.running, config.compensator_config()
+        compensator, converter, samples = present.compensator, present.converter, present.samples
         if model is not compensator.thermal.model or settings != compensator.config:
             compensator = compensator.successor(model, settings)
-        if (config.input, config.frame_id) != (now.config.input, now.config.frame_id):
+        if (config.input, config.frame_id) != (present.config.input, present.config.frame_id):
             converter = self._converter(config)
-        if config.input != now.config.input:
+        if config.input != present.config.input:
             samples = self._open_samples(config)
         return Running(loaded, config, compensator, samples, converter)
 
     def release(self, samples: RawSubscription) -> None:
         """Destroy a subscription to samples, unless it is in use."""
-        if samples is not self.samples:
+        if samples is not self.running.samples:
             self._loop.unsubscribe(samples)
 
     def on_data(self) -> None:
         """Process all samples and readings that have arrived."""
-        messages, received_ns, n_others = self.samples.drain_single_source()
+        messages, received_ns, n_others = self.running.samples.drain_single_source()
         for name, subscription in self.thermometers.items():
             readings, read_ns, n_more = subscription.drain_single_source()
             n_others += n_more
@@ -228,11 +223,9 @@ class Relay:
             end = bisect_left(received_ns, received, start)
             self._relay(messages[start:end])
             name, stamp_ns, celsius = reading
-            now_ns = self.running.compensator.now_ns
-            if stamp_ns != NO_STAMP_NS:
-                push(name, stamp_ns, celsius)
-            elif now_ns is not None:
-                push(name, now_ns, celsius)
+            at_ns = stamp_ns if stamp_ns != NO_STAMP_NS else self.running.compensator.now_ns
+            if at_ns is not None:
+                push(name, at_ns, celsius)
             start = end
         return messages[start:]
 

@@ -204,7 +204,7 @@ class RestKeeper:
 
 
 def samples_of(messages: Sequence[bytes], *, is_imu: bool) -> tuple[Stamps, Floats]:
-    """Read stamps [ns] and samples of the little-endian messages as long as the last one."""
+    """Read stamps [ns] and samples of little-endian messages with the length of the last one."""
     size = len(messages[-1]) if messages else 0
     # A message shorter than one with an empty frame_id is malformed.
     if size < _SHORTEST[is_imu]:

@@ -58,7 +58,7 @@ Serve = Callable[[Any, Callable[[Any], None]], None]
 
 class Sources:
     """
-    Decides whether a topic's messages are from one publisher if the middleware lists several.
+    Decides whether the messages of a topic with several listed publishers come from only one.
 
     The middleware lists a killed publisher until its lease of 20 s ends. Messages do not
     identify their publisher, but each publisher numbers its messages, so consecutive numbers over
@@ -75,7 +75,7 @@ class Sources:
     def first_of_single_source(
         self, n_known: int, numbers: Sequence[int | None], received_ns: Sequence[int]
     ) -> int:
-        """Return the index of the first message that is surely from the only active publisher."""
+        """Return the index from which all messages surely come from the only active publisher."""
         was_contested, n_before, self._n_known = self.is_contested, self._n_known, n_known
         if n_known <= 1:
             # The first messages taken after a publisher has left may be from this publisher.
@@ -115,13 +115,13 @@ class RawSubscription:
         self.count_publishers: Callable[[], int] = subscription.handle.get_publisher_count
         self._sequence: int | None = None
         self._newest_ns = 0
-        #: Number of messages sent and not received, by the sequence numbers of one publisher.
+        #: Number of messages that were sent but not received, from gaps in the sequence numbers.
         self.n_lost = 0
         #: Mean interval between the messages that the last `drain` took [ns].
         self.interval_ns = 0
 
     def drain_single_source(self) -> tuple[list[bytes], list[int], int]:
-        """Take waiting messages that are surely from one publisher; count the other messages."""
+        """Like `drain`; drop and count messages that may come from more than one publisher."""
         messages, received_ns, numbers = self.drain()
         if not messages:
             return messages, received_ns, 0
@@ -154,11 +154,11 @@ class RawSubscription:
 class WaitLoop:
     """Runs a node without an executor; the caller takes the messages of raw subscriptions."""
 
-    # `rest_s`: pause after each wake-up by best-effort messages [s], if four messages or more
-    # arrive in three times this pause.
-    def __init__(self, node: Node, rest_s: float = 0.0) -> None:
+    # `pause_s`: pause after each wake-up by best-effort messages [s], if the mean interval between
+    # messages is below three quarters of the pause.
+    def __init__(self, node: Node, pause_s: float = 0.0) -> None:
         self.node = node
-        self._rest_ns = int(rest_s * 1e9)
+        self._pause_ns = int(pause_s * 1e9)
         self._guard = node.create_guard_condition(lambda: None)
         self._raw: list[RawSubscription] = []
         #: Handlers of services; a handler may return before the answer is sent.
@@ -214,7 +214,7 @@ class WaitLoop:
             self._guard.trigger()
 
     def run(self, on_data: Callable[[], None]) -> None:
-        """Serve until `stop`; `on_data` is called at wake-ups and drains all subscriptions."""
+        """Serve until `stop`; call `on_data`, which drains all subscriptions, at each wake-up."""
         try:
             while not self._is_stopping:
                 self._guarded(partial(self._serve, on_data), (RCLError, ExternalShutdownException))
@@ -223,25 +223,25 @@ class WaitLoop:
                 raise
 
     def _serve(self, on_data: Callable[[], None]) -> None:
-        """Wait and serve until the entities change or the loop stops."""
+        """Wait and serve until the loop stops, or subscriptions or services may have changed."""
         node, self._is_stale = self.node, False
         raw = [subscription.subscription for subscription in self._raw]
         others = {sub: partial(_take_message, sub) for sub in node.subscriptions if sub not in raw}
         others |= {service: partial(self._take_request, service) for service in node.services}
         waking = next((subscription for subscription in self._raw if subscription.wakes), None)
-        rest_ns = 0
+        pause_ns = 0
         # Pause only with best-effort QoS: with reliable QoS a wake-up takes less CPU than a sleep.
         if waking and waking.subscription.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT:
-            rest_ns = self._rest_ns
-        crowd_ns = rest_ns * 3 // 4
-        now_ns, look_ns = time.monotonic_ns, 0
+            pause_ns = self._pause_ns
+        dense_ns = pause_ns * 3 // 4
+        now_ns, poll_ns = time.monotonic_ns, 0
         is_flowing = False
         with ExitStack() as in_use:
             entities = [*raw, *others, self._guard]
             for entity in (*entities, node.context):
                 in_use.enter_context(entity.handle)
-            everything = _WaitSet(node.context, entities)
-            alone = _WaitSet(node.context, [waking.subscription] if waking else [])
+            full_set = _WaitSet(node.context, entities)
+            waking_set = _WaitSet(node.context, [waking.subscription] if waking else [])
             while not (self._is_stopping or self._is_stale):
                 if self._soon:
                     self._guarded(self._soon.popleft())
@@ -257,20 +257,20 @@ class WaitLoop:
                     self._guarded(self._callback)
                     continue
                 if is_flowing:
-                    is_flowing = bool(alone.wait(min(self._call_ns - now, OTHERS_PERIOD_NS)))
+                    is_flowing = bool(waking_set.wait(min(self._call_ns - now, OTHERS_PERIOD_NS)))
                 else:
-                    everything.wait(min(self._call_ns - now, _LONGEST_WAIT_NS))
-                    is_flowing, look_ns = waking is not None, 0
+                    full_set.wait(min(self._call_ns - now, _LONGEST_WAIT_NS))
+                    is_flowing, poll_ns = waking is not None, 0
                 woken_ns = now_ns()
                 on_data()
-                if woken_ns >= look_ns:
-                    ready = [others[entity] for entity in everything.wait(0) if entity in others]
+                if woken_ns >= poll_ns:
+                    ready = [others[entity] for entity in full_set.wait(0) if entity in others]
                     served = [self._guarded(serve) for serve in ready]
                     # After a request the next request may wait already: look again at once.
-                    look_ns = 0 if any(served) else woken_ns + OTHERS_PERIOD_NS
+                    poll_ns = 0 if any(served) else woken_ns + OTHERS_PERIOD_NS
                 # The interval of messages is 0 if the middleware gives no arrival times.
-                if waking and 0 < waking.interval_ns < crowd_ns:
-                    left_ns = woken_ns + rest_ns - now_ns()
+                if waking and 0 < waking.interval_ns < dense_ns:
+                    left_ns = woken_ns + pause_ns - now_ns()
                     if left_ns > 0:
                         time.sleep(left_ns * 1e-9)
 
@@ -304,13 +304,13 @@ class WaitLoop:
             if now - self._logged_ns >= _LOG_PERIOD_NS:
                 self._logged_ns = now
                 lines = ''.join(traceback.format_exception(error)).splitlines()
-                text = '\n'.join(['a callback failed, the node goes on:', *map(one_line, lines)])
+                text = '\n'.join(['a callback failed, the node continues:', *map(one_line, lines)])
                 self.node.get_logger().error(text)
             return None
 
 
 class _WaitSet:
-    """A wait set of rclpy, filled again for each wait."""
+    """A wait set of rclpy for fixed entities, which rclpy needs again before each wait."""
 
     def __init__(self, context: rclpy.context.Context, entities: Sequence[Any]) -> None:
         types = [type(entity) for entity in entities]
@@ -355,8 +355,7 @@ def separate_node(name: str, ros_args: Sequence[str]) -> Iterator[Node]:
         try:
             yield node
         finally:
-            # Destroy the node now: otherwise its publishers live until the next garbage
-            # collection.
+            # Otherwise the node's publishers would live until the next garbage collection.
             node.destroy_node()
     finally:
         context.try_shutdown()
