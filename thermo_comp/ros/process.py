@@ -14,6 +14,7 @@ import os
 import select
 import signal
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -75,8 +76,11 @@ class SignalWatch:
         if os.read(self._reader, 1):
             self._is_over = True
             self._stop()
+            end = None if self._ending_s is None else time.monotonic() + self._ending_s
             # A launch without a terminal repeats a signal that the process group has received.
-            while select.select([self._reader], [], [], self._ending_s)[0]:
+            while select.select(
+                [self._reader], [], [], None if end is None else max(end - time.monotonic(), 0.0)
+            )[0]:
                 number = os.read(self._reader, 1)
                 if not number:
                     return
