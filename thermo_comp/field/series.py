@@ -99,6 +99,15 @@ def is_rest_log(path: Path) -> bool:
     return path.suffix == SUFFIX or (path.is_dir() and any(path.glob(f'*{SUFFIX}')))
 
 
+def _content(file: Path) -> bytes:
+    try:
+        # The node writes at most 320 kB a day; larger files than 64 MB are refused.
+        return read_bounded(file, 1 << 26)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, 'strerror', None) or str(error)
+        raise RecordingError(f'cannot be read: {reason}', file) from error
+
+
 def read_rests(
     paths: Sequence[Path],
     calibration: Calibration,
@@ -133,15 +142,7 @@ def read_rests(
             others.add(f'{start.serial} ({start.input})')
         return is_own
 
-    contents = []
-    for file in files:
-        try:
-            # The node writes at most 320 kB a day; larger files than 64 MB are refused.
-            contents.append(read_bounded(file, 1 << 26))
-        except (OSError, ValueError) as error:
-            reason = getattr(error, 'strerror', None) or str(error)
-            raise RecordingError(f'cannot be read: {reason}', str(file)) from error
-    rests, n_damaged = rests_of(contents, is_wanted)
+    rests, n_damaged = rests_of([_content(file) for file in files], is_wanted)
     notes = [f'{counted(n_damaged, "damaged line")} of the rest logs skipped'] if n_damaged else []
     if others:
         notes.append(f'rests of {", ".join(sorted(others))} are not of unit {wanted}: left out')
