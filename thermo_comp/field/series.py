@@ -142,7 +142,8 @@ def read_rests(
             others.add(f'{start.serial} ({start.input})')
         return is_own
 
-    rests, n_damaged = rests_of([_content(file) for file in files], is_wanted)
+    contents = [_content(file) for file in files]
+    rests, n_damaged = rests_of(contents, is_wanted)
     notes = [f'{counted(n_damaged, "damaged line")} of the rest logs skipped'] if n_damaged else []
     if others:
         notes.append(f'rests of {", ".join(sorted(others))} are not of unit {wanted}: left out')
