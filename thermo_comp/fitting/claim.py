@@ -33,7 +33,7 @@ from ..typing import Floats, Ints
 from .elimination import inverse_root
 from .equations import as_vector
 from .hyperparameters import CLEAR_GAIN, log_density, log_student
-from .initial_triad import within_positions
+from .initial_triad import block_means, within_positions
 from .layout import Layout
 from .regression import PosteriorMode, Regression
 from .selection import LARGE_OFFSETS, Fit
@@ -64,8 +64,8 @@ def claim_of(fit: Fit, gravity_sd: float = 0.0, known_offset_sd: float = 0.0) ->
     offsets by a prior calibration, or 0 [m/s^2]
     """
     regression, chosen = fit.regression, fit.posterior
-    # The rests of a mounting share an offset, but the regression has an offset for each rest: its
-    # variance is multiplied by `n_rests`, so that the mean over the rests has the right variance.
+    # The rests of a mounting share an offset, but the regression has an offset for each rest. With
+    # `n_rests` times the variance, their mean over a mounting has the variance of one offset.
     mounting = regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
     prior = replace(chosen.prior, offset_sd=chosen.prior.offset_sd * n_rests**0.5)
@@ -76,8 +76,8 @@ def claim_of(fit: Fit, gravity_sd: float = 0.0, known_offset_sd: float = 0.0) ->
     offsets = _over_offsets(regression, posterior, offset_sd, known_offset_sd)
     covariance, offset_sd, turn_on_variance = offsets
     if informative := fit.selected.informative:
-        # Few rests do not show which constants have aged since the prior calibration: the mixture
-        # is of fits that assume different amounts of ageing.
+        # Few rests do not show which constants have aged since the prior calibration: mix fits
+        # that assume different amounts of ageing.
         priors = [replace(prior, informative=each) for each in informative]
         fits = _fits(regression, posterior, priors, n_steps=3)
         log_weight = np.array([log_density(each) for each in fits])
@@ -108,11 +108,12 @@ def _over_offsets(
 ) -> tuple[Floats, float, float]:
     """
     Return three results: the covariance of the unit's unknowns, by mixtures over the sds of
-    offsets; the sd of the bias offset of a new mounting after a new turn-on [m/s^2]; and the
-    variance of the bias offset that all bags share if they have one turn-on (the regression has no
-    unknown for this offset), or 0 if they have several turn-ons.
+    offsets; the sd of the bias offset of a new mounting after a new turn-on [m/s^2]; and, if all
+    bags are of one turn-on, the variance of their common bias offset, for which the regression has
+    no unknown, or else 0.
 
-    `offset_sd`: sd of mounting offsets in the fit; `known_sd`: in a prior calibration [m/s^2]
+    `offset_sd`: sd of mounting offsets in the fit; `known_sd`: sd of offsets by a prior
+    calibration, or 0 [m/s^2]
     """
     windows, scale = regression.windows, posterior.prior.offset_scale
     n_mountings = int(windows.mounting[-1]) + 1
@@ -148,24 +149,23 @@ def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Fl
     log prior density of the logarithm of this sd at these values.
 
     `scale`: `Prior.offset_scale` [m/s^2]; `known_sd`: offset sd by a prior calibration [m/s^2],
-    0 without a prior calibration; `kind`: 'mounting', 'turn-on' or 'both', see `largest`
+    0 without a prior calibration; `kind`: 'mounting', 'turn-on' or 'both', see `largest_ratio`
     """
     if known_sd:
         # A test of 12 positions determines the sd of mounting offsets within a factor of 1.5.
         ratio = 10.0 ** np.arange(-1.5, 1.51, 0.125)
         return known_sd * ratio, log_student(np.log(ratio) / np.log(1.5))
-    # `least`: smallest usual offset sd / `scale`. By data sheets, the bias of navigation-grade
+    # Smallest usual ratio of offset sd to `scale`. By data sheets, the bias of navigation-grade
     # triads repeats to 10 ug at best between turn-ons, better between mountings of a turn-on.
     smallest_ratio = 0.01 if kind == 'mounting' else min(1e-4 / scale, 1.0)
-    # `largest`: largest usual offset sd / `scale`, for mountings within a turn-on, for a single
-    # turn-on, and ('both') for several turn-ons or mountings that each begin with a turn-on. A
-    # single turn-on shows no repeatability, and a bias that repeats perfectly has the ratio 0, so
-    # its value is between 0 and `LARGE_OFFSETS`.
-    largest = {'mounting': 1.0, 'turn-on': 2.0, 'both': LARGE_OFFSETS}[kind]
+    # Largest usual ratio: of mountings within a turn-on; of a single turn-on, which shows no
+    # repeatability (a value between 0, for a bias that repeats perfectly, and `LARGE_OFFSETS`);
+    # and, 'both', of several turn-ons, or of mountings that each begin with a turn-on.
+    largest_ratio = {'mounting': 1.0, 'turn-on': 2.0, 'both': LARGE_OFFSETS}[kind]
     # The log evidence is smooth over the grid's step, a third of a decade of the sd.
     ratio = 10.0 ** np.linspace(-3.45, 2.25, 19)
     small = np.minimum(np.log(ratio / smallest_ratio), 0.0)
-    return scale * ratio, log_student(ratio / largest) + small
+    return scale * ratio, log_student(ratio / largest_ratio) + small
 
 
 def _places(layout: Layout, widened: Layout) -> Ints:
@@ -178,10 +178,14 @@ def _places(layout: Layout, widened: Layout) -> Ints:
 
 
 def _widened(
-    regression: Regression, posterior: PosteriorMode, candidates: Floats, of_means: State | None
+    regression: Regression, posterior: PosteriorMode, typical: Floats, of_means: State | None
 ) -> tuple[Layout, Floats]:
-    """Return layout and covariance, extended by the columns that the data do not determine."""
-    prior, state = _with_unseen(regression, posterior, candidates), posterior.state
+    """
+    Return layout and covariance, extended by the columns that the data do not determine.
+
+    `typical`, `of_means`: see `Fit`
+    """
+    prior, state = _with_unseen(regression, posterior, typical), posterior.state
     if of_means is None:
         with_unseen = regression.solve(state, prior, n_steps=0)
         return with_unseen.layout, with_unseen.covariance.copy()
@@ -226,7 +230,8 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
     sd[inactive.part, inactive.column] = 1.0 / np.sqrt(np.maximum(information, 1e-300))
     is_of_lags = np.isin(groups, LAGS)
     if not regression.windows.has_drifts:
-        # At constant temperatures only thermometer errors change lags: do not bound lags' weights.
+        # At constant temperatures lags change by thermometer errors alone, so the data do not
+        # bound the weights of lags.
         sd = np.where((sd > 0.0) & (regression.windows.lag >= 0), np.inf, sd)
     sd = np.where(is_of_lags, sd, np.minimum(sd, typical))
     if CURVE in active:
@@ -260,11 +265,10 @@ def _over_mountings(
     """
     prior, mounting = posterior.prior, regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
-
     priors = [replace(prior, offset_sd=sd) for sd in tried.tolist()]
     fits = _fits(regression, posterior, priors)
-    # A large sd of mounting offsets lets attitudes absorb errors of the model, so the log evidence
-    # of a fit rises: limit it to the rise of the log evidence of |f|, plus `CLEAR_GAIN`.
+    # With a large sd of mounting offsets attitudes absorb model errors, which raises the evidence:
+    # limit the rise of its logarithm to that of the log evidence of |f|, plus `CLEAR_GAIN`.
     of_data = np.array([fit.log_evidence for fit in fits])
     of_norms = _norm_evidence(regression, posterior, tried, fits[-1].root)
     nearest = int(np.argmin(np.abs(np.log(tried * n_rests**0.5 / prior.offset_sd))))
@@ -326,15 +330,12 @@ def _norm_evidence(
     point, first = regression.at(state, prior), regression.windows.edges[:-1]
     along = point.norms_by_unit
     weight = np.add.reduceat(regression.weight, first)
-    residual = regression.weight[:, None] * regression.residual(state, layout)
-    residual = np.add.reduceat(residual, first) / weight[:, None]
+    residual = block_means(regression.residual(state, layout), regression.weight, first)
     # Average derivatives and errors (with offset) of |f| over the rests of each mounting.
     errors = np.sum(point.norm_by_axes * (residual + state.offset), axis=1)
     first = np.flatnonzero(np.diff(regression.windows.mounting, prepend=-1))
-    rows = np.column_stack((along, errors, np.ones(len(along))))
-    rows = np.add.reduceat(rows * weight[:, None], first, axis=0)
-    weight = rows[:, -1]
-    along, errors = rows[:, :-2] / weight[:, None], rows[:, -2] / weight
+    means = block_means(np.column_stack((along, errors)), weight, first)
+    along, errors, weight = means[:, :-1], means[:, -1], np.add.reduceat(weight, first)
     if prior.informative is None:
         # The prior of the constants is so wide that their fitted values can replace its mean.
         weights = layout.axis[:, 2:].ravel()
