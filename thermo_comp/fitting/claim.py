@@ -79,7 +79,7 @@ def claim_of(fit: Fit, gravity_sd: float = 0.0, known_offset_sd: float = 0.0) ->
         # Few rests do not show which constants have aged since the prior calibration: mix fits
         # that assume different amounts of ageing.
         priors = [replace(prior, informative=each) for each in informative]
-        fits = _fits(regression, posterior, priors, n_steps=3)
+        fits = [regression.solve(posterior.state, each, n_steps=3) for each in priors]
         log_weight = np.array([log_density(each) for each in fits])
         mixture, _ = _mixture(regression, posterior, priors, log_weight)
         covariance = covariance + _excess(mixture, posterior.covariance)
@@ -129,7 +129,7 @@ def _over_offsets(
     if regression.has_turn_ons:
         values, log_prior = _offsets_tried(scale, known_sd, 'both')
         priors = [replace(posterior.prior, turn_on_sd=sd) for sd in values.tolist()]
-        fits = _fits(regression, posterior, priors)
+        fits = [regression.solve(posterior.state, each, n_steps=1) for each in priors]
         evidence = np.array([fit.log_evidence for fit in fits])
         mixture, weight = _mixture(regression, posterior, priors, evidence + log_prior)
         variance = float(weight @ values**2)
@@ -266,7 +266,7 @@ def _over_mountings(
     prior, mounting = posterior.prior, regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
     priors = [replace(prior, offset_sd=sd) for sd in tried.tolist()]
-    fits = _fits(regression, posterior, priors)
+    fits = [regression.solve(posterior.state, each, n_steps=1) for each in priors]
     # With a large sd of mounting offsets attitudes absorb model errors, which raises the evidence:
     # limit the rise of its logarithm to that of the log evidence of |f|, plus `CLEAR_GAIN`.
     of_data = np.array([fit.log_evidence for fit in fits])
@@ -280,12 +280,6 @@ def _over_mountings(
         evidence = of_norms
     covariance, weight = _mixture(regression, posterior, priors, evidence + log_prior)
     return covariance, float(np.sqrt(weight @ tried**2))
-
-
-def _fits(
-    regression: Regression, posterior: PosteriorMode, priors: Sequence[Prior], n_steps: int = 1
-) -> list[PosteriorMode]:
-    return [regression.solve(posterior.state, prior, n_steps) for prior in priors]
 
 
 def _mixture(

@@ -72,7 +72,7 @@ def add_gyroscope(
     # Sd of the component of the Earth's rate along one axis in an unknown attitude [rad/s].
     earth_sd = EARTH_RATE / math.sqrt(3.0)
     prior = Prior(
-        bias_sd=np.full(3, 1.0),  # prior sd of the bias [rad/s], wide for any gyroscope
+        bias_sd=np.ones(3),  # prior sd of the bias [rad/s], wide for any gyroscope
         scale_sd=1.0,
         misalignment_sd=1.0,
         column_sd=np.zeros((2, len(data.groups))),
