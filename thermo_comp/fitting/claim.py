@@ -7,8 +7,8 @@ not determine, and for effects that the model lacks.
 The standard deviation of mounting and turn-on offsets, unless the user states it, is marginalised:
 the covariance is that of a mixture of fits on a grid of this standard deviation. The weight of a
 fit in the mixture is its evidence, limited by the evidence of |f| in the positions, times the
-prior density of the offset sd (half-Student [1]_ without a prior calibration). An error of local
-gravity, included in the covariance, changes all scale factors by the same ratio.
+prior density of the offset sd (half-Student [1]_ without a prior calibration). The covariance
+includes the error of local gravity, which changes all scale factors by the same ratio.
 
 If the model lacks an effect, the best weights differ between sections of the chamber program, and
 the error in another program is as large as these differences: a jackknife [2]_ estimates them.
@@ -46,7 +46,7 @@ class Claim:
     """
     The published uncertainty of a unit.
 
-    layout: indices of the unknowns of the fit, and of columns of zero weight, in the covariance
+    layout: indices in the covariance of the fit's unknowns, and of further weights that are 0
     covariance: of the unknowns that belong to the unit (not to a position), (n_unit, n_unit)
     offset_sd: sd of the bias offset of a new mounting or turn-on [m/s^2]
     """
@@ -119,8 +119,8 @@ def _over_offsets(
     n_mountings = int(windows.mounting[-1]) + 1
     is_single = windows.n_turn_ons == 1 < n_mountings
     if scale <= 0.0:
-        # An sd stated by the user includes mounting and turn-on offsets. The regression averages m
-        # mountings to a variance of sd^2 / m: (1 - 1 / m) sd^2 is missing if they share an offset.
+        # An sd stated by the user includes mounting and turn-on offsets. The mean offset of m
+        # mountings has the variance sd^2 / m in the regression, but sd^2 if they share an offset.
         variance = offset_sd**2 * (1.0 - 1.0 / n_mountings) if is_single else 0.0
         return posterior.covariance, offset_sd, variance
     kind = 'mounting' if is_single or windows.has_turn_ons else 'both'
@@ -260,8 +260,8 @@ def _over_mountings(
     regression: Regression, posterior: PosteriorMode, tried: Floats, log_prior: Floats
 ) -> tuple[Floats, float]:
     """
-    Return the covariance of the unit's unknowns, and the RMS of the sd of mounting offsets
-    [m/s^2], by a mixture of fits, one per sd `tried`, (k,); `log_prior`: log density of these sds.
+    Mix fits with the sds `tried` of mounting offsets, shape (k,); `log_prior`: log prior density
+    of these sds. Return the covariance of the unit's unknowns, and the RMS of the sd [m/s^2].
     """
     prior, mounting = posterior.prior, regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
@@ -288,9 +288,9 @@ def _mixture(
     """
     Return the unit's covariance about the mode by a mixture over `priors`, and their weights.
 
-    The equations of all priors are linearised at the mode: bias and scale that the attitudes do
-    not separate change by percents from prior to prior, and the covariance at another point
-    would attribute a part of their large sds to directions that the data determine well.
+    The equations of all priors are linearised at the mode. Bias and scale that the attitudes do
+    not separate differ by percents between priors; at another point the covariance would attribute
+    a part of their large sds to directions that the data determine well.
     """
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
@@ -382,7 +382,7 @@ def _ratios_to_noise(change: Floats, remaining: Floats) -> Floats:
     covariance of the fit of all windows is the unit matrix
     """
     shares, directions = np.linalg.eigh(remaining.T @ remaining)
-    # Leave out combinations of unknowns of which all but 1e-6 of the information remains.
+    # Ignore combinations of unknowns that lose less than 1e-6 of their information.
     is_measured = shares < 1.0 - 1e-6
     shares = np.maximum(shares[is_measured], 1e-12)
     return np.asarray((change @ directions[:, is_measured]) ** 2 * shares / (1.0 - shares))

@@ -32,7 +32,7 @@ class Contributions:
     support_tilt: effect of the tilts less its mean in each position, RMS over the windows
     mounting_offsets, turn_on_offsets: bias offsets of positions and of bags, RMS over these; the
         posterior variance is included, because |f| shows only the vertical part of an offset
-    slow_noise: sd of the exponentially correlated noise
+    slow_noise: sd of the slow noise, see `Noise`
     """
 
     thermal_response: float

@@ -61,10 +61,10 @@ def next_direction(covariance: Floats, sd: float, positions: Floats) -> Floats:
     Find the direction of a new position, of noise `sd` [g], that most reduces the variance of the
     force, averaged over all attitudes.
 
-    The direction of a cube's face, easiest to hold, is returned if it reduces the variance at
-    least half as much as the best direction; else that of an edge, else of a corner, else any
-    other. Directions within 20 degrees of one in `positions`, shape (n, 3), are not proposed; if
-    `positions` leave no other direction, the result is +z.
+    A cube is held most easily on a face: the direction of a face is returned if it reduces the
+    variance at least half as much as the best direction; else that of an edge, else of a corner,
+    else any other. Directions within 20 degrees of one in `positions`, shape (n, 3), are not
+    proposed; if `positions` leave no other direction, the result is +z.
     """
     columns = force_columns(_SPHERE)
     weight = np.einsum('nij,nik->jk', columns, columns) / len(columns)
@@ -145,7 +145,7 @@ def rough_centre(means: Floats) -> Floats:
 
 
 def geometry(up: Floats, with_misalignment: bool) -> float:
-    """Return the largest ratio of a constant's sd to the noise of |f|; inf if not determined."""
+    """Return the largest ratio of a constant's sd to the noise of |f|, inf if undetermined."""
     jacobian = norm_columns(up)[:, : 9 if with_misalignment else 6]
     values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
     if values[0] < 1e-9 * values[-1]:

@@ -103,7 +103,7 @@ def judge_windows(
 
 
 def _judge_order(windows: ThermalWindows) -> Iterator[Finding]:
-    """Refuse bags if the board leads the case in the ramps of all bags together, or of a bag."""
+    """Refuse bags if the board leads the case in ramps of all bags together, or of some bags."""
     moving, bag = np.abs(_ramp_rates(windows)) > RAMP_K_MIN, windows.data.bag
     least, where = _correlation(windows, moving), ''
     numbers, first = np.unique(bag, return_index=True)
@@ -189,7 +189,7 @@ def _judge_ramps(windows: ThermalWindows) -> Iterator[Finding]:
             'unknown; record ramps between the soaks',
         )
         steps = np.diff(np.sort(windows.temperature))
-        # Smallest difference of the temperatures of two soaks [K]: 1 K and a tenth of the span.
+        # Temperatures that differ by more than this [K] belong to different soaks.
         least = max(1.0, 0.1 * steps.sum())
         is_gap = steps > least
         n = 1 + int(is_gap.sum())
@@ -259,8 +259,9 @@ def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator
     """
     Report the sd of mounting and turn-on offsets if the fit had to assume this sd.
 
-    `offset_sd`: published sd of the bias offset of a mounting [m/s^2]. Nine constants explain |f|
-    in nine positions with any mounting offsets, and drifts show large mounting offsets only.
+    `offset_sd`: published sd of the bias offset of a mounting [m/s^2]. In nine positions the nine
+    constants of a triad explain |f| whatever the mounting offsets are, and drifts show only large
+    mounting offsets.
     """
     prior = fit.posterior.prior
     n, n_turn_ons = int(fit.windows.data.mounting[-1]) + 1, fit.windows.data.n_turn_ons

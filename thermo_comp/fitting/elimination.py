@@ -132,8 +132,8 @@ class Reduced:
         from the prior mean, shape (2, n_bags, r)
     matrix: Hessian (with the prior `common`) and, in the last column, gradient, (n + 1, n + 1)
     positions: blocks of the positions, with columns for unknowns of the bag, then of the unit
-    shares: contribution of each position to the block of its bag, with off-diagonal blocks and
-        gradients, shape (n_positions, r, r + n + 1); and to the diagonal of this block before the
+    shares: contribution of each position to block, off-diagonal blocks and gradient of its bag,
+        shape (n_positions, r, r + n + 1); and its contribution to the block's diagonal before the
         elimination of the positions, shape (n_positions, r)
     bags: the blocks of the bags
     common: the prior on the sum of the initial lag states over the bags, as a block, or None

@@ -121,6 +121,9 @@ class Equations(Series):
         scaled, by_kappa, by_force = (base.size + k for k in range(3))
         starts = base.size + 3 + np.arange(n_starts)
         in_bias, in_scale = (1 + np.flatnonzero(mask[base.columns]) for mask in layout.used)
+        # A rotation of a pose rotates the attitude of each position that is in this pose.
+        is_in_pose = layout.pose_of[:, None] == np.arange(len(layout.pose))
+        by_poses = by_rotation[:, :, None] * is_in_pose[:, None, :, None]
         by_radius: Floats | float = 1.0
         if self.forces is not None:
             by_radius = self.forces.by_radius(state.radius)[:, None, None] * along
@@ -137,7 +140,7 @@ class Equations(Series):
             self._by_coefficients(state, layout, base, scaled),
             ([by_force] * layout.radius.size, by_radius),
             ([by_force] * 3, self._by_misalignment(state)),
-            ([by_force] * layout.pose.size, _by_poses(by_rotation, layout)),
+            ([by_force] * layout.pose.size, by_poses.reshape(*force.shape, -1)),
             ([base.size + 3 + n_starts], 1.0),
         ]
         place = np.array([k for at, _ in unknowns for k in at], dtype=np.int64)
@@ -306,13 +309,6 @@ def with_step(state: State, step: Floats, layout: Layout) -> State:
     up = _unit_vector(state.up + np.einsum('pij,pj->pi', state.tangents, turn))
     added = {name: getattr(state, name) + padded[getattr(layout, name)] for name in _added(layout)}
     return without_inactive(replace(state, up=up, pose=pose, **added), layout)
-
-
-def _by_poses(by_rotation: Floats, layout: Layout) -> Floats:
-    """Return the readings' derivatives by rotations of poses, (n_positions, 3, 2 n_poses)."""
-    is_in = layout.pose_of[:, None] == np.arange(len(layout.pose))
-    each = by_rotation[:, :, None, :] * is_in[:, None, :, None]
-    return np.asarray(each.reshape(*by_rotation.shape[:2], -1))
 
 
 def _unit_vector(vector: Floats) -> Floats:

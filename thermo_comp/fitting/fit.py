@@ -139,7 +139,7 @@ def _judged_result(result: FitResult) -> FitResult:
     contributions, likeness = contributions_of(fit.regression, fit.posterior), likenesses(fit)
     findings += judge_contributions(contributions, fit.selected.score.noise)
     if all(finding.name != 'environment' for finding in findings):
-        # With this finding, the fit excluded a bag of another environment.
+        # After the exclusion of a bag of another environment, terms are not judged.
         n_directions = len(distinct_directions(fit.posterior.state.up))
         findings += judge_likeness(likeness, n_directions)
     return replace(
@@ -156,14 +156,13 @@ def _fit_without_code_offset(
     codes = ' '.join(f'{code:g}' for code in offset)
     how = 'estimated; --offset can state it' if options.offset is None else 'by --offset'
     text = f'zero force reads {codes} counts (x y z), {how}: the fit subtracts this offset'
-    finding = advice('offset', text)
     prior = options.prior and with_code_offset(options.prior, -offset)
     centred_bags = [without_code_offset(bag, offset) for bag in bags]
     result = _fit_one_environment(centred_bags, replace(options, prior=prior), progress)
     return replace(
         result,
         calibration=with_code_offset(result.calibration, offset),
-        findings=(finding, *result.findings),
+        findings=(advice('offset', text), *result.findings),
         bags=tuple(bags),
     )
 
@@ -198,7 +197,7 @@ def without_code_offset(bag: ReducedBag, offset: Floats) -> ReducedBag:
 
 
 def with_code_offset(calibration: Calibration, offset: Floats) -> Calibration:
-    """Convert a calibration of codes less the code at zero force into one of raw codes."""
+    """Return a calibration for codes that exceed those of `calibration` by `offset`, (3,)."""
     unit = calibration.unit
     full_scale = unit.full_scale
     if full_scale == COUNTS_FULL_SCALE and offset.max() > 0.0:

@@ -95,8 +95,8 @@ def add_gyroscope(
 
 def _candidates(data: Windows, options: FitOptions) -> Candidates:
     """Return the columns that the bias of the angular rate may have."""
-    allowed = {*data.groups} if options.groups is None else {*options.groups}
-    is_candidate = np.isin(data.groups, list(allowed)) & (data.kelvins > 0.0)
+    allowed = data.groups if options.groups is None else options.groups
+    is_candidate = np.isin(data.groups, allowed) & (data.kelvins > 0.0)
     kelvins = np.outer((1.0, 0.0), is_candidate * data.kelvins)
     none = np.zeros(kelvins.shape, dtype=bool)
     # Typical and largest (consumer MEMS) prior sd of a slope of the bias [rad/s per K].
