@@ -88,10 +88,10 @@ def farthest(up: Floats) -> tuple[Floats, float]:
 
 
 def distinct_directions(up: Floats) -> Floats:
-    """Drop unit vectors, (n, 3), that are within `SAME_DIRECTION_DEG` of an earlier vector."""
+    """Drop NaN, and unit vectors within `SAME_DIRECTION_DEG` of an earlier one, from (n, 3)."""
     kept: list[Floats] = []
     limit = np.cos(np.radians(SAME_DIRECTION_DEG))
-    for direction in up:
+    for direction in up[np.isfinite(up).all(axis=1)]:
         if all(float(direction @ other) < limit for other in kept):
             kept.append(direction)
     return np.array(kept).reshape(-1, 3)
