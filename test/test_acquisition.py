@@ -220,6 +220,18 @@ def test_the_next_direction_reduces_the_mean_variance(n, rng):
     assert np.max(up @ proposed, initial=-1.0) < np.cos(np.radians(20.0))
 
 
+def test_a_direction_is_proposed_if_positions_are_near_all_directions(rng):
+    up = units(rng, 1000)
+    covariance = coverage.constants_covariance(up, np.full(len(up), SD))
+    assert coverage.next_direction(covariance, SD, up).tolist() == [0.0, 0.0, 1.0]
+
+
+def test_a_mean_reading_of_zero_has_no_direction_and_hides_none():
+    # WHY: after a mean reading of zero, which has no direction, no other direction was counted.
+    means = np.vstack([np.zeros(3), FACES, FACES])
+    assert coverage.n_directions(means) == coverage.n_directions(means[::-1]) == 6
+
+
 def test_proposed_and_farthest_directions_are_nearly_as_good_as_spread_positions():
     up = NOTHING
     for _ in range(18):

@@ -28,8 +28,10 @@ def model_of(
     bags: Sequence[ReducedBag], options: FitOptions, parts: tuple[Part, Part, Part] | None = None
 ) -> Model:
     """
-    Return the model of the prior or, without a prior, the model of `options` with all its columns
-    for which the bags have thermometers; `parts`: lag of each axis, or None for the bank of lags
+    Return the model of the prior calibration; without a prior, the model named in `options` with
+    all columns whose thermometers the bags contain.
+
+    `parts`: part of the unit whose lag each axis has, or None for the bank of lags
     """
     prior, reference = options.prior, options.reference_temperature
     if prior is not None:
@@ -43,7 +45,7 @@ def model_of(
         {name for name, readings in bag.temperatures.items() if len(readings.value)}
         for bag in bags
     )
-    # Columns may use the case thermometer, even if not recorded, and thermometers of all bags.
+    # Thermometers of the model: the case's, recorded or not, and others that every bag contains.
     sensors = 'case', *sorted(set.intersection(*recorded) - {'board', 'case'})
     detector = options.detector or learn_detector(bags)
     columns: tuple[Column, ...] = ()
@@ -69,8 +71,8 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     fit = _with_lags(windows, problem)
     has_case = all(len(bag.case.value) for bag in bags)
     has_choice = has_case and options.prior is None and options.detector is None
-    # Compare detectors if the chosen model has a curve for each regime, or a model of almost equal
-    # score (`is_near`) has such curves and under 80 % of the chosen model's noise on each axis.
+    # Compare detectors if the chosen model has a curve for each regime, or if such a model has an
+    # almost equal score (`is_near`) and less than 80 % of the chosen model's noise on each axis.
     trials = fit.selected.trials
     chosen = next(trial for trial in trials if trial.is_chosen)
     limit = 0.8 * chosen.posterior.prior.sigma
@@ -105,9 +107,9 @@ def windows_of(
 
 def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
     """
-    Fit the windows with one lag per axis (`find_parts`). If no lags are found, or all lags leave a
-    left-out drift above `Parts.most_drift`, fit the model of `windows`, too, and return the better
-    fit. With a prior calibration, or for Golovach's model, only the model of `windows` is fitted.
+    Fit models with one lag per axis (`find_parts`) until the left-out drift of a fit is at most
+    `Parts.most_drift`; if there is no such fit, fit the model of `windows`, too. Return the best
+    fit. With a prior calibration, or for Golovach's model, fit only the model of `windows`.
     """
     bags, options = problem.bags, problem.options
     is_free = options.prior is None and options.model != 'golovach'

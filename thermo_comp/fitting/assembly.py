@@ -50,7 +50,7 @@ def build_calibration(
     earlier: Calibration | None = None,
     nonlinearity: Nonlinearity | None = None,
 ) -> Calibration:
-    """Make a fit's calibration; its valid ranges include those of the prior `earlier`."""
+    """Return a fit's calibration; its valid ranges contain those of the prior `earlier`."""
     (windows, regression, *_), posterior = fit, fit.posterior
     model, prior, state, layout = windows.model, posterior.prior, posterior.state, claim.layout
     # Response columns whose weights have rows in the covariance; a weight may be 0.
@@ -104,7 +104,7 @@ def _regime_sets(fit: Fit, claim: Claim, earlier: Calibration | None) -> list[Re
     windows, prior = fit.windows, fit.posterior.prior
     temperatures = ranges.temperature_range(windows)
     rates = ranges.valid_range(windows.rate * 60.0, 0.01 if windows.was_measured else 3.0, order=1)
-    # The sd of mounting offset plus slow noise of each axis [m/s^2].
+    # Sd of the sum of mounting offset and slow noise, for each axis [m/s^2].
     slow = np.sqrt(claim.offset_sd**2 + prior.sigma**2 * prior.noise.variance).tolist()
     lacks: Sequence[tuple[LackOfFit, ...]] = ((), ())
     if fit.regression.gravity:
@@ -140,8 +140,8 @@ def _valid_columns(
         if column.term.bounds is None:
             values, order = windows.raw[:, k], column.term.order
             if column.term.is_temperature:
-                # All bends of a part end at one temperature, the highest of this part in the bags:
-                # beyond, the sum of bends would else change its slope where each of them ends.
+                # The ranges of all bends of a part end at the same temperatures of the part: with
+                # different ends, the sum of the bends would change its slope at each end.
                 coldest = windows.temperature.min() - windows.model.reference_temperature
                 values, order = np.append(values, coldest - column.knee_k), 0
             valid = ranges.valid_range(values, 0.01, order)
@@ -151,10 +151,10 @@ def _valid_columns(
                 largest = (upper - lower) ** column.term.order
                 valid = ranges.union((valid, (-largest, largest)))
         if k in of_parts and column.term.order % 2:
-            # A part lags both in cooling and in heating: the range of an odd power of its lag is
-            # extended to the same values of opposite sign.
+            # The lag of a part has opposite signs in heating and in cooling: the range of an odd
+            # power of the lag is extended to the same values of opposite sign.
             valid = ranges.union((valid, (-valid[1], -valid[0])))
-        # A column with weight only in curves over the temperatures of parts is of group `part`.
+        # A column that has a weight only in curves over temperatures of parts gets group `part`.
         group = PART if k in weighed and not alone[k] else column.group
         valid = valid if earlier is None else ranges.union((valid, column.range))
         result.append(replace(column, group=group, range=valid))
@@ -175,8 +175,8 @@ def _provenance(
     is_norm = bool(np.isfinite(fit.selected.score.norms.square).all())
     now = datetime.now(timezone.utc)
     end_s = 1e-9 * max(bag.end_ns for bag in bags)
-    # The stamps may count from the start of a computer, or be of a wrong clock: only times from
-    # the year 2000 (946684800 s after 1970) to now are taken for dates.
+    # Stamps may count from the start of a computer, or come from a wrong clock: only stamps from
+    # the year 2000 (946684800 s after the start of 1970) to now are taken for dates.
     is_date = 946684800.0 <= end_s <= now.timestamp()
     tested = datetime.fromtimestamp(end_s if is_date else 0.0, timezone.utc)
     date_format = '%Y-%m-%dT%H:%M:%SZ'
@@ -209,7 +209,7 @@ def blank_terms(columns: Iterable[Column]) -> tuple[ResponseTerm, ...]:
 
 
 def parameters_of(calibration: Calibration) -> Floats:
-    """Return the parameters in the posterior's order; constant errors of scale factors are 0."""
+    """Return the parameters in the posterior's order; those for errors of scale factors are 0."""
     values: list[float] = []
     pairs = zip(calibration.static.axes(), calibration.dynamic.axes(), strict=True)
     for axis, (reference, sets) in enumerate(zip(calibration.axes, pairs, strict=True)):
@@ -233,7 +233,7 @@ def with_parameters(
     """
     Replace the scale factors and the parameters of a calibration.
 
-    `values`: parameters in the order of the posterior; their scale factor errors are not used
+    `values`: parameters in the posterior's order; those for errors of scale factors are not used
     """
     layout = parameter_layout(calibration)
     levels = values[[bias.static for bias in layout.bias]]
@@ -242,14 +242,10 @@ def with_parameters(
         axes = []
         for axis, bias, scale in zip(regime.axes(), layout.bias, layout.scale, strict=True):
             of_bias, of_scale = (_numbers(values[at[k] : at[k + 1]]) for at in (bias, scale))
-            axes.append(
-                replace(
-                    axis,
-                    bias_function=axis.bias_function.with_free(of_bias[1:], 0.0),
-                    scale_function=axis.scale_function.with_free(of_scale[1:], 1.0),
-                    delta=float(values[bias[k]] - values[bias.static]),
-                )
-            )
+            Fs = axis.bias_function.with_free(of_bias[1:], 0.0)
+            Fc = axis.scale_function.with_free(of_scale[1:], 1.0)
+            delta = float(values[bias[k]] - values[bias.static])
+            axes.append(AxisSet(Fs, Fc, delta, axis.residual_sd_m_s2))
         x, y, z = axes
         regimes.append(replace(regime, x=x, y=y, z=z))
     a, b, c = _triple(values[-3:])
@@ -297,9 +293,8 @@ def file_jacobian(
     unknown = np.eye(layout.n_unit + 1, layout.n_unit)
     rows: list[Floats] = []
     for axis, K in enumerate(regression.nominal_scale):
-        of_bias, of_scale = np.where(
-            regression.windows.share[axis] < 1.0, -1, layout.weights[:, axis]
-        )
+        is_absent = regression.windows.share[axis] < 1.0
+        of_bias, of_scale = np.where(is_absent, -1, layout.weights[:, axis])
         for places, unit, level in (
             (of_bias, K, K * unknown[layout.bias[axis]]),
             (of_scale, 1.0, unknown[layout.kappa[axis]] / state.kappa[axis]),

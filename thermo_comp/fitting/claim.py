@@ -7,8 +7,8 @@ not determine, and for effects that the model lacks.
 The standard deviation of mounting and turn-on offsets, unless the user states it, is marginalised:
 the covariance is that of a mixture of fits on a grid of this standard deviation. The weight of a
 fit in the mixture is its evidence, limited by the evidence of |f| in the positions, times the
-prior density of the offset sd (half-Student [1]_ without a prior calibration). An error of local
-gravity, included in the covariance, changes all scale factors by the same ratio.
+prior density of the offset sd (half-Student [1]_ without a prior calibration). The covariance
+includes the error of local gravity, which changes all scale factors by the same ratio.
 
 If the model lacks an effect, the best weights differ between sections of the chamber program, and
 the error in another program is as large as these differences: a jackknife [2]_ estimates them.
@@ -33,7 +33,7 @@ from ..typing import Floats, Ints
 from .elimination import inverse_root
 from .equations import as_vector
 from .hyperparameters import CLEAR_GAIN, log_density, log_student
-from .initial_triad import within_positions
+from .initial_triad import block_means, within_positions
 from .layout import Layout
 from .regression import PosteriorMode, Regression
 from .selection import LARGE_OFFSETS, Fit
@@ -46,7 +46,7 @@ class Claim:
     """
     The published uncertainty of a unit.
 
-    layout: indices of the unknowns of the fit, and of columns of zero weight, in the covariance
+    layout: indices in the covariance of the fit's unknowns, and of further weights that are 0
     covariance: of the unknowns that belong to the unit (not to a position), (n_unit, n_unit)
     offset_sd: sd of the bias offset of a new mounting or turn-on [m/s^2]
     """
@@ -64,8 +64,8 @@ def claim_of(fit: Fit, gravity_sd: float = 0.0, known_offset_sd: float = 0.0) ->
     offsets by a prior calibration, or 0 [m/s^2]
     """
     regression, chosen = fit.regression, fit.posterior
-    # The rests of a mounting share an offset, but the regression has an offset for each rest: its
-    # variance is multiplied by `n_rests`, so that the mean over the rests has the right variance.
+    # The rests of a mounting share an offset, but the regression has an offset for each rest. With
+    # `n_rests` times the variance, their mean over a mounting has the variance of one offset.
     mounting = regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
     prior = replace(chosen.prior, offset_sd=chosen.prior.offset_sd * n_rests**0.5)
@@ -76,10 +76,10 @@ def claim_of(fit: Fit, gravity_sd: float = 0.0, known_offset_sd: float = 0.0) ->
     offsets = _over_offsets(regression, posterior, offset_sd, known_offset_sd)
     covariance, offset_sd, turn_on_variance = offsets
     if informative := fit.selected.informative:
-        # Few rests do not show which constants have aged since the prior calibration: the mixture
-        # is of fits that assume different amounts of ageing.
+        # Few rests do not show which constants have aged since the prior calibration: mix fits
+        # that assume different amounts of ageing.
         priors = [replace(prior, informative=each) for each in informative]
-        fits = _fits(regression, posterior, priors, n_steps=3)
+        fits = [regression.solve(posterior.state, each, n_steps=3) for each in priors]
         log_weight = np.array([log_density(each) for each in fits])
         mixture, _ = _mixture(regression, posterior, priors, log_weight)
         covariance = covariance + _excess(mixture, posterior.covariance)
@@ -108,18 +108,19 @@ def _over_offsets(
 ) -> tuple[Floats, float, float]:
     """
     Return three results: the covariance of the unit's unknowns, by mixtures over the sds of
-    offsets; the sd of the bias offset of a new mounting after a new turn-on [m/s^2]; and the
-    variance of the bias offset that all bags share if they have one turn-on (the regression has no
-    unknown for this offset), or 0 if they have several turn-ons.
+    offsets; the sd of the bias offset of a new mounting after a new turn-on [m/s^2]; and, if all
+    bags are of one turn-on, the variance of their common bias offset, for which the regression has
+    no unknown, or else 0.
 
-    `offset_sd`: sd of mounting offsets in the fit; `known_sd`: in a prior calibration [m/s^2]
+    `offset_sd`: sd of mounting offsets in the fit; `known_sd`: sd of offsets by a prior
+    calibration, or 0 [m/s^2]
     """
     windows, scale = regression.windows, posterior.prior.offset_scale
     n_mountings = int(windows.mounting[-1]) + 1
     is_single = windows.n_turn_ons == 1 < n_mountings
     if scale <= 0.0:
-        # An sd stated by the user includes mounting and turn-on offsets. The regression averages m
-        # mountings to a variance of sd^2 / m: (1 - 1 / m) sd^2 is missing if they share an offset.
+        # An sd stated by the user includes mounting and turn-on offsets. The mean offset of m
+        # mountings has the variance sd^2 / m in the regression, but sd^2 if they share an offset.
         variance = offset_sd**2 * (1.0 - 1.0 / n_mountings) if is_single else 0.0
         return posterior.covariance, offset_sd, variance
     kind = 'mounting' if is_single or windows.has_turn_ons else 'both'
@@ -128,7 +129,7 @@ def _over_offsets(
     if regression.has_turn_ons:
         values, log_prior = _offsets_tried(scale, known_sd, 'both')
         priors = [replace(posterior.prior, turn_on_sd=sd) for sd in values.tolist()]
-        fits = _fits(regression, posterior, priors)
+        fits = [regression.solve(posterior.state, each, n_steps=1) for each in priors]
         evidence = np.array([fit.log_evidence for fit in fits])
         mixture, weight = _mixture(regression, posterior, priors, evidence + log_prior)
         variance = float(weight @ values**2)
@@ -148,24 +149,23 @@ def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Fl
     log prior density of the logarithm of this sd at these values.
 
     `scale`: `Prior.offset_scale` [m/s^2]; `known_sd`: offset sd by a prior calibration [m/s^2],
-    0 without a prior calibration; `kind`: 'mounting', 'turn-on' or 'both', see `largest`
+    0 without a prior calibration; `kind`: 'mounting', 'turn-on' or 'both', see `largest_ratio`
     """
     if known_sd:
         # A test of 12 positions determines the sd of mounting offsets within a factor of 1.5.
         ratio = 10.0 ** np.arange(-1.5, 1.51, 0.125)
         return known_sd * ratio, log_student(np.log(ratio) / np.log(1.5))
-    # `least`: smallest usual offset sd / `scale`. By data sheets, the bias of navigation-grade
+    # Smallest usual ratio of offset sd to `scale`. By data sheets, the bias of navigation-grade
     # triads repeats to 10 ug at best between turn-ons, better between mountings of a turn-on.
     smallest_ratio = 0.01 if kind == 'mounting' else min(1e-4 / scale, 1.0)
-    # `largest`: largest usual offset sd / `scale`, for mountings within a turn-on, for a single
-    # turn-on, and ('both') for several turn-ons or mountings that each begin with a turn-on. A
-    # single turn-on shows no repeatability, and a bias that repeats perfectly has the ratio 0, so
-    # its value is between 0 and `LARGE_OFFSETS`.
-    largest = {'mounting': 1.0, 'turn-on': 2.0, 'both': LARGE_OFFSETS}[kind]
+    # Largest usual ratio: of mountings within a turn-on; of a single turn-on, which shows no
+    # repeatability (a value between 0, for a bias that repeats perfectly, and `LARGE_OFFSETS`);
+    # and, 'both', of several turn-ons, or of mountings that each begin with a turn-on.
+    largest_ratio = {'mounting': 1.0, 'turn-on': 2.0, 'both': LARGE_OFFSETS}[kind]
     # The log evidence is smooth over the grid's step, a third of a decade of the sd.
     ratio = 10.0 ** np.linspace(-3.45, 2.25, 19)
     small = np.minimum(np.log(ratio / smallest_ratio), 0.0)
-    return scale * ratio, log_student(ratio / largest) + small
+    return scale * ratio, log_student(ratio / largest_ratio) + small
 
 
 def _places(layout: Layout, widened: Layout) -> Ints:
@@ -178,10 +178,14 @@ def _places(layout: Layout, widened: Layout) -> Ints:
 
 
 def _widened(
-    regression: Regression, posterior: PosteriorMode, candidates: Floats, of_means: State | None
+    regression: Regression, posterior: PosteriorMode, typical: Floats, of_means: State | None
 ) -> tuple[Layout, Floats]:
-    """Return layout and covariance, extended by the columns that the data do not determine."""
-    prior, state = _with_unseen(regression, posterior, candidates), posterior.state
+    """
+    Return layout and covariance, extended by the columns that the data do not determine.
+
+    `typical`, `of_means`: see `Fit`
+    """
+    prior, state = _with_unseen(regression, posterior, typical), posterior.state
     if of_means is None:
         with_unseen = regression.solve(state, prior, n_steps=0)
         return with_unseen.layout, with_unseen.covariance.copy()
@@ -226,7 +230,8 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
     sd[inactive.part, inactive.column] = 1.0 / np.sqrt(np.maximum(information, 1e-300))
     is_of_lags = np.isin(groups, LAGS)
     if not regression.windows.has_drifts:
-        # At constant temperatures only thermometer errors change lags: do not bound lags' weights.
+        # At constant temperatures lags change by thermometer errors alone, so the data do not
+        # bound the weights of lags.
         sd = np.where((sd > 0.0) & (regression.windows.lag >= 0), np.inf, sd)
     sd = np.where(is_of_lags, sd, np.minimum(sd, typical))
     if CURVE in active:
@@ -255,16 +260,15 @@ def _over_mountings(
     regression: Regression, posterior: PosteriorMode, tried: Floats, log_prior: Floats
 ) -> tuple[Floats, float]:
     """
-    Return the covariance of the unit's unknowns, and the RMS of the sd of mounting offsets
-    [m/s^2], by a mixture of fits, one per sd `tried`, (k,); `log_prior`: log density of these sds.
+    Mix fits with the sds `tried` of mounting offsets, shape (k,); `log_prior`: log prior density
+    of these sds. Return the covariance of the unit's unknowns, and the RMS of the sd [m/s^2].
     """
     prior, mounting = posterior.prior, regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
-
     priors = [replace(prior, offset_sd=sd) for sd in tried.tolist()]
-    fits = _fits(regression, posterior, priors)
-    # A large sd of mounting offsets lets attitudes absorb errors of the model, so the log evidence
-    # of a fit rises: limit it to the rise of the log evidence of |f|, plus `CLEAR_GAIN`.
+    fits = [regression.solve(posterior.state, each, n_steps=1) for each in priors]
+    # With a large sd of mounting offsets attitudes absorb model errors, which raises the evidence:
+    # limit the rise of its logarithm to that of the log evidence of |f|, plus `CLEAR_GAIN`.
     of_data = np.array([fit.log_evidence for fit in fits])
     of_norms = _norm_evidence(regression, posterior, tried, fits[-1].root)
     nearest = int(np.argmin(np.abs(np.log(tried * n_rests**0.5 / prior.offset_sd))))
@@ -278,21 +282,15 @@ def _over_mountings(
     return covariance, float(np.sqrt(weight @ tried**2))
 
 
-def _fits(
-    regression: Regression, posterior: PosteriorMode, priors: Sequence[Prior], n_steps: int = 1
-) -> list[PosteriorMode]:
-    return [regression.solve(posterior.state, prior, n_steps) for prior in priors]
-
-
 def _mixture(
     regression: Regression, posterior: PosteriorMode, priors: Sequence[Prior], log_weight: Floats
 ) -> tuple[Floats, Floats]:
     """
     Return the unit's covariance about the mode by a mixture over `priors`, and their weights.
 
-    The equations of all priors are linearised at the mode: bias and scale that the attitudes do
-    not separate change by percents from prior to prior, and the covariance at another point
-    would attribute a part of their large sds to directions that the data determine well.
+    The equations of all priors are linearised at the mode. Bias and scale that the attitudes do
+    not separate differ by percents between priors; at another point the covariance would attribute
+    a part of their large sds to directions that the data determine well.
     """
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
@@ -326,15 +324,12 @@ def _norm_evidence(
     point, first = regression.at(state, prior), regression.windows.edges[:-1]
     along = point.norms_by_unit
     weight = np.add.reduceat(regression.weight, first)
-    residual = regression.weight[:, None] * regression.residual(state, layout)
-    residual = np.add.reduceat(residual, first) / weight[:, None]
+    residual = block_means(regression.residual(state, layout), regression.weight, first)
     # Average derivatives and errors (with offset) of |f| over the rests of each mounting.
     errors = np.sum(point.norm_by_axes * (residual + state.offset), axis=1)
     first = np.flatnonzero(np.diff(regression.windows.mounting, prepend=-1))
-    rows = np.column_stack((along, errors, np.ones(len(along))))
-    rows = np.add.reduceat(rows * weight[:, None], first, axis=0)
-    weight = rows[:, -1]
-    along, errors = rows[:, :-2] / weight[:, None], rows[:, -2] / weight
+    means = block_means(np.column_stack((along, errors)), weight, first)
+    along, errors, weight = means[:, :-1], means[:, -1], np.add.reduceat(weight, first)
     if prior.informative is None:
         # The prior of the constants is so wide that their fitted values can replace its mean.
         weights = layout.axis[:, 2:].ravel()
@@ -387,7 +382,7 @@ def _ratios_to_noise(change: Floats, remaining: Floats) -> Floats:
     covariance of the fit of all windows is the unit matrix
     """
     shares, directions = np.linalg.eigh(remaining.T @ remaining)
-    # Leave out combinations of unknowns of which all but 1e-6 of the information remains.
+    # Ignore combinations of unknowns that lose less than 1e-6 of their information.
     is_measured = shares < 1.0 - 1e-6
     shares = np.maximum(shares[is_measured], 1e-12)
     return np.asarray((change @ directions[:, is_measured]) ** 2 * shares / (1.0 - shares))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the RMS of what the unknowns of bags and positions explain, next to the unit's response.
+Owns the RMS effects of the unknowns of bags and positions, to compare with the unit's response.
 
 The node knows no initial lag states, tilts and offsets of the fitted bags: a drift that the fit
 explains by these unknowns is not corrected in use.
@@ -30,9 +30,9 @@ class Contributions:
         windows; RMS over the windows
     initial_lag_states: effect of the initial lag states, RMS over the windows
     support_tilt: effect of the tilts less its mean in each position, RMS over the windows
-    mounting_offsets, turn_on_offsets: offsets of positions and of bags, RMS over these with the
-        posterior variance, as |f| shows only the vertical part of an offset
-    slow_noise: sd of the exponentially correlated noise
+    mounting_offsets, turn_on_offsets: bias offsets of positions and of bags, RMS over these; the
+        posterior variance is included, because |f| shows only the vertical part of an offset
+    slow_noise: sd of the slow noise, see `Noise`
     """
 
     thermal_response: float
@@ -79,7 +79,7 @@ def _rms(values: Floats) -> float:
 
 def judge_contributions(values: Contributions, noise: float) -> Iterator[Finding]:
     """
-    Report unknowns that explain more than the thermal response of the unit, and more than `noise`,
+    Report unknowns of bags with larger effects than the thermal response of the unit and `noise`,
     the white noise of a window [m/s^2].
     """
     steady = 'keep the unit switched on at a constant temperature for hours before each recording'

@@ -61,9 +61,10 @@ def next_direction(covariance: Floats, sd: float, positions: Floats) -> Floats:
     Find the direction of a new position, of noise `sd` [g], that most reduces the variance of the
     force, averaged over all attitudes.
 
-    The direction to a face of a cube, which is easiest to hold, is returned if it reduces the
-    variance at least half as much as the best direction; else to an edge, else to a corner.
-    Directions within 20 degrees of a direction in `positions`, shape (n, 3), are not proposed.
+    A cube is held most easily on a face: the direction of a face is returned if it reduces the
+    variance at least half as much as the best direction; else that of an edge, else of a corner,
+    else any other. Directions within 20 degrees of one in `positions`, shape (n, 3), are not
+    proposed; if `positions` leave no other direction, the result is +z.
     """
     columns = force_columns(_SPHERE)
     weight = np.einsum('nij,nik->jk', columns, columns) / len(columns)
@@ -72,7 +73,7 @@ def next_direction(covariance: Floats, sd: float, positions: Floats) -> Floats:
     gain = np.einsum('ij,jk,ik->i', moved, weight, moved)
     gain /= np.einsum('ij,ij->i', moved, of_norm) + sd * sd
     gain[np.max(_SPHERE @ positions.T, axis=1, initial=-1.0) > math.cos(math.radians(20.0))] = 0.0
-    good = gain >= max(0.5 * gain.max(), 1e-300)
+    good = gain >= 0.5 * gain.max()
     # Slices of `_SPHERE`: faces, edges and corners of a cube, and all other directions.
     tiers = slice(0, 6), slice(6, 18), slice(18, 26), slice(26, None)
     tier = next(tier for tier in tiers if good[tier].any())
@@ -80,17 +81,17 @@ def next_direction(covariance: Floats, sd: float, positions: Floats) -> Floats:
 
 
 def farthest(up: Floats) -> tuple[Floats, float]:
-    """Return the direction farthest from all `up`, (n, 3), and the angle to the nearest [deg]."""
+    """Return the direction farthest from all `up`, (n, 3), and its angle to the nearest [deg]."""
     nearest = np.max(_SPHERE @ up.T, axis=1, initial=-1.0)
     chosen = int(np.argmin(nearest))
     return _SPHERE[chosen], float(np.degrees(np.arccos(np.minimum(nearest[chosen], 1.0))))
 
 
 def distinct_directions(up: Floats) -> Floats:
-    """Drop unit vectors, (n, 3), that are within `SAME_DIRECTION_DEG` of an earlier vector."""
+    """Drop NaN, and unit vectors within `SAME_DIRECTION_DEG` of an earlier one, from (n, 3)."""
     kept: list[Floats] = []
     limit = np.cos(np.radians(SAME_DIRECTION_DEG))
-    for direction in up:
+    for direction in up[np.isfinite(up).all(axis=1)]:
         if all(float(direction @ other) < limit for other in kept):
             kept.append(direction)
     return np.array(kept).reshape(-1, 3)
@@ -132,19 +133,19 @@ def rough_centre(means: Floats) -> Floats:
     centre = np.linalg.lstsq(columns, np.sum(arms**2, axis=1), rcond=None)[0][:3]
     radii = np.linalg.norm(arms - centre, axis=1)
     # Accept the sphere if the sd of the distances from its centre is below 10 % of the radius, and
-    # the RMS distance of the readings from their mean exceeds half of the radius (six faces give 1
-    # radius, readings within 6 degrees 0.1 radius).
+    # the RMS distance of the readings from their mean exceeds half of the radius (it is 1 radius
+    # for six faces, and 0.1 radius for readings within 6 degrees of each other).
     is_sphere = np.std(radii) < 0.1 * np.mean(radii) < 0.2 * spread
-    # A sphere exists through any four readings, so the coordinates of its centre must agree: the
-    # three zero-g outputs of an analog triad are within 20 % of their mean (ADXL335 data sheet,
-    # 1.2 to 1.8 V).
+    # A sphere exists through any four readings. Accept it only if the coordinates of its centre
+    # agree: the three zero-g outputs of an analog triad are within 20 % of their mean (ADXL335
+    # data sheet, 1.2 to 1.8 V).
     centre = means.mean(axis=0) + centre
     is_common = np.ptp(centre) < 0.4 * abs(centre.mean())
     return np.asarray(centre) if is_sphere and is_common else zero
 
 
 def geometry(up: Floats, with_misalignment: bool) -> float:
-    """Return the largest ratio of a constant's sd to the noise of |f|; inf if not determined."""
+    """Return the largest ratio of a constant's sd to the noise of |f|, inf if undetermined."""
     jacobian = norm_columns(up)[:, : 9 if with_misalignment else 6]
     values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
     if values[0] < 1e-9 * values[-1]:
@@ -157,9 +158,9 @@ def best_rests(candidates: list[Floats]) -> int:
     Return the index of the best candidate: a set of n rests, given by mean readings, (n, 3).
 
     The largest sd of a calibration constant follows from the directions of a set's rests and the
-    residuals of |f|. The best set is the first whose largest sd is at most 2 % above that of any
-    other set, as earlier sets have longer, quieter rests. The index is 0 if no set has rests in
-    six attitudes.
+    residuals of |f|. The first set whose largest sd is at most 2 % above that of every other set
+    is the best, because earlier sets have longer, quieter rests. The index is 0 if no set has
+    rests in six attitudes.
     """
     counts = [n_directions(means) for means in candidates]
     costs = np.array([
@@ -170,7 +171,7 @@ def best_rests(candidates: list[Floats]) -> int:
 
 
 def _cost(means: Floats, with_misalignment: bool) -> float:
-    """Fit constants to rests; return the largest sd of a constant, by the scatter of |f| [g]."""
+    """Return the largest sd [g] of a constant fitted to rests, by the scatter of their |f|."""
     n_free = len(means) - (9 if with_misalignment else 6)
     if n_free < 0:
         return np.inf
@@ -179,10 +180,10 @@ def _cost(means: Floats, with_misalignment: bool) -> float:
     except FitError:
         return np.inf
     norms = np.linalg.norm(force, axis=1)
-    # Prior of the scatter: an error of 1e-3 g with the weight of four rests, so that a set of few
-    # rests whose |f| agrees by chance is not chosen.
-    left = float(np.sum((norms - 1.0) ** 2)) + 4 * 1e-3**2
-    scatter = float(np.sqrt(left / (n_free + 4)))
+    # Prior of the scatter: 1e-3 g, with the weight of four rests, so that a set of few rests whose
+    # |f| agrees by chance is not chosen.
+    square = float(np.sum((norms - 1.0) ** 2)) + 4 * 1e-3**2
+    scatter = float(np.sqrt(square / (n_free + 4)))
     return geometry(force / norms[:, None], with_misalignment) * scatter
 
 
@@ -227,14 +228,13 @@ def least_known(calibration: Calibration, up: Floats) -> LeastKnown | None:
 
 def direction_text(up: Floats) -> str:
     """Describe an attitude: the axes, as +x or -x, that point up, and the reading of each axis."""
-    signs = [f'{"-" if value < 0.0 else "+"}{name}' for name, value in zip('xyz', up, strict=True)]
-    size = np.abs(up)
-    axes = [sign for sign, share in zip(signs, size, strict=True) if share > 0.1]
     # Adding 0 turns a rounded -0 into +0.
     rounded = zip('xyz', (np.round(up, 2) + 0.0).tolist(), strict=True)
     reading = ', '.join(f'{name} {value:+.2f} g' for name, value in rounded)
+    is_up = np.abs(up) > 0.1
+    axes = [f'{"-" if up[k] < 0.0 else "+"}{"xyz"[k]}' for k in np.flatnonzero(is_up)]
     names = ' and '.join(filter(None, (', '.join(axes[:-1]), axes[-1])))
-    how = 'partly ' if np.ptp(size[size > 0.1]) > 0.1 else 'equally ' if len(axes) > 1 else ''
+    how = 'partly ' if np.ptp(np.abs(up[is_up])) > 0.1 else 'equally ' if len(axes) > 1 else ''
     return f'{names} {how}up: {reading}'
 
 

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from .evidence import ResidualRow
     from .selection import Fit
 
-#: Smallest numbers of positions that determine bias and scale factor (six constants), also the
-#: misalignment (nine constants), and also, by |f|, the sd of mounting offsets.
+#: Smallest numbers of positions that determine bias and scale factor of the axes (six constants);
+#: the misalignment, too (nine constants); and, by |f|, the sd of mounting offsets, too.
 POSITIONS_NEEDED, POSITIONS_FOR_MISALIGNMENT, POSITIONS_FOR_MOUNTINGS = 6, 9, 12
 #: Span of the board temperature below which no temperature dependence is visible [K].
 LEAST_SPAN_K = 3.0
@@ -92,14 +92,14 @@ def judge_windows(
     else:
         yield _judge_span(windows)
         yield from _judge_ramps(windows)
-    if not has_case:
-        text = (
+    if has_case:
+        yield from _judge_order(windows)
+    else:
+        yield advice(
+            'case',
             'no case temperature: the regime is detected from the board temperature alone, later '
-            'and less reliably than with a case thermometer'
+            'and less reliably than with a case thermometer',
         )
-        yield advice('case', text)
-        return
-    yield from _judge_order(windows)
 
 
 def _judge_order(windows: ThermalWindows) -> Iterator[Finding]:
@@ -124,7 +124,7 @@ def _judge_order(windows: ThermalWindows) -> Iterator[Finding]:
 
 
 def _correlation(windows: ThermalWindows, rows: Bools) -> float:
-    """Correlate the gradient with the rate in windows; 0 if they are shorter than 30 windows."""
+    """Correlate gradient and rate over windows; 0 if their samples fill less than 30 windows."""
     if windows.data.weight[rows].sum() < 30.0 * windows.data.weight.max():
         return 0.0
     # The case leads the board in a ramp, so the gradient has the sign of the board's rate.
@@ -189,11 +189,12 @@ def _judge_ramps(windows: ThermalWindows) -> Iterator[Finding]:
             'unknown; record ramps between the soaks',
         )
         steps = np.diff(np.sort(windows.temperature))
-        # Two soaks differ if their temperatures differ by over 1 K and over a tenth of the span.
-        is_gap = steps > max(1.0, 0.1 * steps.sum())
+        # Temperatures that differ by more than this [K] belong to different soaks.
+        least = max(1.0, 0.1 * steps.sum())
+        is_gap = steps > least
         n = 1 + int(is_gap.sum())
         # If the temperature drifts slowly through its range, there are no soaks to count.
-        has_soaks = steps[~is_gap].sum() < n * max(1.0, 0.1 * steps.sum())
+        has_soaks = steps[~is_gap].sum() < n * least
         # Five temperatures determine a cubic, and show whether the cubic fits.
         if has_soaks and n < 5:
             yield advice(
@@ -213,8 +214,8 @@ def _judge_ramps(windows: ThermalWindows) -> Iterator[Finding]:
         yield advice(
             'soak',
             f'only {100.0 * share:.0f} % of the windows are static, over '
-            f'{windows.static_span:.1f} of {span:.1f} K: the soaks end before the temperatures of '
-            'the unit are constant; let some soaks last for hours',
+            f'{windows.static_span:.1f} K of the span of {span:.1f} K: the soaks end before the '
+            'temperatures of the unit are constant; let some soaks last for hours',
         )
 
 
@@ -258,8 +259,9 @@ def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator
     """
     Report the sd of mounting and turn-on offsets if the fit had to assume this sd.
 
-    `offset_sd`: published sd of the bias offset of a mounting [m/s^2]. Nine constants explain |f|
-    in nine positions with any mounting offsets, and drifts show large mounting offsets only.
+    `offset_sd`: published sd of the bias offset of a mounting [m/s^2]. In nine positions the nine
+    constants of a triad explain |f| whatever the mounting offsets are, and drifts show only large
+    mounting offsets.
     """
     prior = fit.posterior.prior
     n, n_turn_ons = int(fit.windows.data.mounting[-1]) + 1, fit.windows.data.n_turn_ons
@@ -288,9 +290,9 @@ def determines_misalignment(up: Floats) -> bool:
     """
     Whether the number and the spread of positions are sufficient to estimate the misalignment M.
 
-    The largest sd of a constant, divided by the noise of one position, must be at most 6. The
-    largest sd divided by the noise is 1 for 18 well spread positions, 3 for nine, and 4.5 to 8 for
-    the six faces held three times each by hand.
+    The ratio of the largest sd of a constant to the noise of one position must be at most 6. This
+    ratio is 1 for 18 well spread positions, 3 for nine, and 4.5 to 8 for the six faces held three
+    times each by hand.
     """
     distinct = distinct_directions(up)
     is_enough = len(distinct) >= POSITIONS_FOR_MISALIGNMENT
@@ -310,8 +312,8 @@ def judge_constants(fit: Fit, raw: float, options: FitOptions) -> Iterator[Findi
     scale = float(np.abs(K / (1.0 if options.input == 'm/s^2' else K.mean()) - 1.0).max())
     worst, angle = float(np.abs(state.bias).max()), float(np.abs(state.misalignment).max())
     largest = max(scale, worst / options.gravity, angle)
-    is_none = largest < 1e-4 and raw < 2e-5 * options.gravity
-    if is_none and span > 20.0 and determines_misalignment(state.up):
+    is_small = largest < 1e-4 and raw < 2e-5 * options.gravity
+    if is_small and span > 20.0 and determines_misalignment(state.up):
         yield Finding(
             'compensated',
             'refusal',
@@ -353,11 +355,10 @@ def judge_result(
     drift = within_positions(norms[:, None], fit.windows.data.position)
     span, noise = float(np.ptp(fit.windows.temperature)), fit.selected.score.noise
     prior, K = fit.posterior.prior, fit.posterior.state.kappa * fit.regression.nominal_scale
-    raw, fitted, left_out = (
-        row.rms / MICRO_G for row in (overall.raw, overall.fitted, overall.left_out)
-    )
-    others = f'; error on data left out {left_out:.1f} ug' if overall.left_out.n else ''
-    text = f'|f| - g: {raw:.1f} ug RMS raw, {fitted:.1f} ug in sample{others}'
+    raw, fitted = overall.raw.rms / MICRO_G, overall.fitted.rms / MICRO_G
+    text = f'|f| - g: {raw:.1f} ug RMS raw, {fitted:.1f} ug in sample'
+    if overall.left_out.n:
+        text += f'; error on data left out {overall.left_out.rms / MICRO_G:.1f} ug'
     is_slow = slow / MICRO_G > max(0.3 * raw, 0.5 * fitted)
     # Noise explains a residual of up to twice the white noise.
     if span > 0.0 and is_slow and overall.fitted.rms > 2.0 * noise:
@@ -377,8 +378,8 @@ def judge_result(
     else:
         yield Finding('residual', 'good', text)
     alone = overall.two_sets.rms
-    # Two causes of a large residual do not contradict the prior: bias shifts up to 2 `slow`; and
-    # initial lag states, which the fit estimates, so that they do not increase its noise `sigma`.
+    # A large residual does not contradict the prior if it is due to bias shifts of up to 2 `slow`,
+    # or to initial lag states: the fit estimates these, so they do not increase its noise `sigma`.
     contradiction, sigma = '', float(np.mean(prior.sigma))
     is_above = overall.fitted.rms > np.hypot(1.5 * alone, 2.0 * slow) and sigma > 1.5 * alone
     if options.prior is not None and is_above:

@@ -55,9 +55,10 @@ def factored_with_prior(information: Floats, precision: Floats) -> Floats:
     """
     Return the lower Cholesky factor of an information matrix plus the precision of a prior, (n,).
 
-    The smallest eigenvalues of the information, a difference of larger matrices, are rounding
-    errors. If information plus precision has no Cholesky factor, it is scaled to a unit diagonal,
-    and eigenvalues of the information up to ten times the size of the most negative one become 0.
+    The information is a difference of larger matrices, so its smallest eigenvalues are rounding
+    errors. If information plus precision has no Cholesky factor, both are scaled to a unit
+    diagonal of their sum, and the eigenvalues of the information that are at most ten times the
+    size of its most negative eigenvalue become 0.
     """
     places = np.diag_indices(len(information))
     hessian = information.copy()
@@ -129,10 +130,10 @@ class Reduced:
 
     of_bag_prior: prior precision of the unknowns of bags, and this precision times their distance
         from the prior mean, shape (2, n_bags, r)
-    matrix: Hessian, with the prior `common`, and, in the last column, gradient, (n + 1, n + 1)
-    positions: the blocks of the positions, with columns for the bag's, then the unit's unknowns
-    shares: contribution of each position to the block of its bag, with off-diagonal blocks and
-        gradients, shape (n_positions, r, r + n + 1); and to the diagonal of this block before the
+    matrix: Hessian (with the prior `common`) and, in the last column, gradient, (n + 1, n + 1)
+    positions: blocks of the positions, with columns for unknowns of the bag, then of the unit
+    shares: contribution of each position to block, off-diagonal blocks and gradient of its bag,
+        shape (n_positions, r, r + n + 1); and its contribution to the block's diagonal before the
         elimination of the positions, shape (n_positions, r)
     bags: the blocks of the bags
     common: the prior on the sum of the initial lag states over the bags, as a block, or None
@@ -164,13 +165,13 @@ class Reduced:
     def follow(self, step: Floats) -> tuple[Floats, Floats]:
         """Return the steps of the unknowns of positions and bags, given the unit's step."""
         r, solved = len(self.bags.root[0]), self.positions.solved
-        starts = self.bags.solved[..., -1] - self.bags.solved[..., :-1] @ step
+        bags = self.bags.solved[..., -1] - self.bags.solved[..., :-1] @ step
         if self.common is not None:
             excess = self.common.solved[0, :, -1] - self.common.solved[0, :, :-1] @ step
-            starts -= self.bags.inverse[..., : len(excess)] @ excess
+            bags -= self.bags.inverse[..., : len(excess)] @ excess
         positions = solved[..., -1] - solved[..., r:-1] @ step
-        positions -= np.einsum('pkr,pr->pk', solved[..., :r], starts[self.layout.bag])
-        return positions, starts
+        positions -= np.einsum('pkr,pr->pk', solved[..., :r], bags[self.layout.bag])
+        return positions, bags
 
     def variances(self, root: Floats) -> tuple[Floats, Floats]:
         """
@@ -178,12 +179,12 @@ class Reduced:
         the initial lag states; `root`: upper triangular root of the unit's covariance.
         """
         bag, r, solved = self.layout.bag, len(self.bags.root[0]), self.positions.solved
-        by_unit, by_starts = self.bags.solved[..., :-1], solved[..., :r]
-        starts = np.sum(self.bags.root**2, axis=1) + _variance(by_unit, root)
-        of_starts = by_starts @ np.swapaxes(self.bags.root[bag], 1, 2)
-        positions = np.sum(self.positions.root**2, axis=1) + np.sum(of_starts**2, axis=2)
-        positions += _variance(solved[..., r:-1] - by_starts @ by_unit[bag], root)
-        return positions, starts
+        by_unit, by_bag = self.bags.solved[..., :-1], solved[..., :r]
+        bags = np.sum(self.bags.root**2, axis=1) + _variance(by_unit, root)
+        of_bags = by_bag @ np.swapaxes(self.bags.root[bag], 1, 2)
+        positions = np.sum(self.positions.root**2, axis=1) + np.sum(of_bags**2, axis=2)
+        positions += _variance(solved[..., r:-1] - by_bag @ by_unit[bag], root)
+        return positions, bags
 
     def without(self, places: Ints, normal: Normal) -> Floats:
         """Return `matrix` without positions `places`, whose normal equations are `normal`."""
@@ -217,8 +218,8 @@ class Reduced:
             unit[layout.unit[axis], :, axis] = each[:, n_local:].sum(axis=0)
         local = local.reshape(n_positions, n_own + r, 3 * m)
         of_positions = self.positions.root @ local[:, :n_own]
-        starts = local[:, n_own:] - np.swapaxes(whitened[..., :r], 1, 2) @ of_positions
-        of_bags = self.bags.root @ np.tensordot(_membership(layout), starts, 1)
+        shares = local[:, n_own:] - np.swapaxes(whitened[..., :r], 1, 2) @ of_positions
+        of_bags = self.bags.root @ np.tensordot(_membership(layout), shares, 1)
         cross = unit.reshape(-1, 3 * m)
         cross -= _summed(whitened[..., r:], of_positions) + _summed(self.bags.whitened, of_bags)
         reduction = _square(of_positions, of_bags)
@@ -243,20 +244,16 @@ def eliminate(normal: Normal, layout: Layout, precision: Floats, deviation: Floa
     rows = np.zeros((n_positions, n_own + r, n_own + r + layout.n_unit + 1))
     for axis, at in enumerate(layout.columns):
         rows[:, at[:n_local, None], at] += normal.local[:, axis]
-    block, cross, starts = (
-        rows[:, :n_own, :n_own],
-        rows[:, :n_own, n_own:],
-        rows[:, n_own:, n_own:],
-    )
-    index = np.arange(n_own)
-    block[:, index, index] += precision[layout.own]
+    block, cross = rows[:, :n_own, :n_own], rows[:, :n_own, n_own:]
+    diagonal = np.einsum('pii->pi', block)  # a view
+    diagonal += precision[layout.own]
     cross[..., -1] -= (precision * deviation)[layout.own]
     # A diagonal element of 0, for an attitude without information in the data, is set to 1.
-    block[:, index, index] += np.einsum('pii->pi', block) <= 0.0
+    diagonal += diagonal <= 0.0
     positions = Blocks.of(block, cross)
-    diagonal = np.einsum('pii->pi', starts[..., :r])
-    starts = starts - np.swapaxes(positions.whitened[..., :r], 1, 2) @ positions.whitened
-    shares = (starts, diagonal)
+    of_bag = rows[:, n_own:, n_own:]
+    reduced = of_bag - np.swapaxes(positions.whitened[..., :r], 1, 2) @ positions.whitened
+    shares = reduced, np.einsum('pii->pi', of_bag[..., :r])
     prior = np.stack((precision, precision * deviation))[:, layout.of_bag]
     bags = _of_bags(_membership(layout), shares, prior)
     matrix = _of_unit(normal.unit, layout)
@@ -280,9 +277,8 @@ def _of_unit(normal: Floats, layout: Layout) -> Floats:
 def _of_bags(members: Floats, shares: tuple[Floats, Floats], prior: Floats) -> Blocks:
     """Eliminate the unknowns of m bags; `members`: 1 for positions of a bag, else 0, (m, n)."""
     if not shares[0].size:
-        return Blocks(
-            np.zeros((len(members), 0, 0)), np.zeros((len(members), *shares[0].shape[1:]))
-        )
+        n = len(members)
+        return Blocks(np.zeros((n, 0, 0)), np.zeros((n, *shares[0].shape[1:])))
     sums, diagonals = (np.tensordot(members, share, 1) for share in shares)
     r = diagonals.shape[1]
     block, cross = sums[..., :r], sums[..., r:]
@@ -292,7 +288,7 @@ def _of_bags(members: Floats, shares: tuple[Floats, Floats], prior: Floats) -> B
 
 
 def _variance(derivatives: Floats, root: Floats) -> Floats:
-    """Return the variances of linear functions, shape (n, k), of the unit's unknowns."""
+    """Return the variances, (n, k), of functions of the unit's unknowns with `derivatives`."""
     rows = derivatives.reshape(-1, len(root))
     scaled = dtrmm(1.0, root, rows.T, trans_a=True)
     return np.asarray(np.sum(scaled**2, axis=0).reshape(derivatives.shape[:2]))

@@ -48,18 +48,16 @@ def contradicting_bag(fit: Fit) -> list[int]:
     Return, in a list, the index of a bag that may be of another environment; [] if none may.
 
     A bag is suspect if its left-out drift exceeds five times both the median over the bags and the
-    white noise of a window. If the other bags do not determine the drift of exactly one bag, and
-    the median left-out drift exceeds five times the noise, this bag is suspect.
+    white noise of a window. The only bag whose drift the other bags do not determine is suspect if
+    the median left-out drift exceeds five times the noise.
     """
     square = _square_of_bags(fit)
     is_scored = np.isfinite(square)
     if is_scored.sum() < 4:
         # At least four bags are needed to decide that one bag contradicts the majority.
         return []
-    usual, noise = (
-        float(np.median(square[is_scored])),
-        float(np.mean(fit.posterior.prior.sigma**2)),
-    )
+    usual = float(np.median(square[is_scored]))
+    noise = float(np.mean(fit.posterior.prior.sigma**2))
     if (~is_scored).sum() == 1 and _is_far_above(usual, noise):
         return [int(np.argmin(is_scored))]
     worst = int(np.nanargmax(square))
@@ -85,10 +83,11 @@ def contradiction(
 ) -> tuple[list[int], bool]:
     """
     Return the indices of the bags whose drift the calibration `earlier` of their unit does not
-    explain with any initial lag states; all bags if these are more than half of the bags. Also
-    return whether the bags can update `earlier`: ``|f| - g`` far exceeds the drift and the
-    published sd of |f|, which shows a change of bias or scale, or the bags have the six attitudes
-    that determine bias and scale.
+    explain with any initial lag states; the indices of all bags if these are more than half.
+
+    Also return whether the bags can update `earlier`: either ``|f| - g`` far exceeds the drift and
+    the published sd of |f|, which shows a change of bias or scale; or the bags have the six
+    attitudes that determine bias and scale.
     """
     data = replace(windows.data, tilt=windows.data.tilt[:, :0])
     regression, state = _at_calibration(earlier, data, options.gravity)
@@ -118,7 +117,7 @@ def contradiction(
     may_update = bool(_is_far_above(float(np.mean(norm**2)), usual))
     is_far = _is_far_above(mean, 1.0)
     if np.mean(is_far) > 0.5:
-        # In some attitudes a change of environment hardly shows: if most bags deviate, return all.
+        # A change of environment hardly shows in some attitudes: if most bags deviate, return all.
         is_far[:] = True
     may_update |= len(distinct_directions(state.up)) >= POSITIONS_NEEDED
     return np.flatnonzero(is_far).tolist(), may_update
@@ -155,10 +154,9 @@ def with_excluded_error(
     drift = within_positions(regression.force(state), windows.data.position)
     of_norms = np.mean(_norm_errors(regression, state) ** 2)
     regimes = ~windows.is_dynamic, windows.is_dynamic
+    # A regime without windows gets the drift of all windows.
     static, dynamic = (
-        _widened(
-            regime, of_norms + np.mean(drift[rows if rows.any() else slice(None)] ** 2, axis=0)
-        )
+        _widened(regime, of_norms + np.mean(drift[rows | ~rows.any()] ** 2, axis=0))
         for regime, rows in zip(calibration.regime_sets(), regimes, strict=True)
     )
     names = ', '.join(one_line(bag.source.name) for bag in bags)

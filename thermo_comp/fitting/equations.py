@@ -97,8 +97,8 @@ class Equations(Series):
 
     def _effects(self, state: State) -> tuple[Floats, Floats, Floats, Floats, Floats]:
         """
-        Return, at the reference temperature, the force `along` the axes; the derivative of the
-        reading by a rotation of the attitude, (n_positions, 3, 2); the reading without the bias,
+        Return, at the reference temperature, the force `along` the axes; the derivatives of the
+        readings by rotations of the attitude, (n_positions, 3, 2); the readings without the bias,
         (n_positions, 3); the sum of the nonlinear terms and the sum of their changes per kelvin,
         (2, n_positions, 3); and the derivatives of both sums by the force.
         """
@@ -121,6 +121,9 @@ class Equations(Series):
         scaled, by_kappa, by_force = (base.size + k for k in range(3))
         starts = base.size + 3 + np.arange(n_starts)
         in_bias, in_scale = (1 + np.flatnonzero(mask[base.columns]) for mask in layout.used)
+        # A rotation of a pose rotates the attitude of each position that is in this pose.
+        is_in_pose = layout.pose_of[:, None] == np.arange(len(layout.pose))
+        by_poses = by_rotation[:, :, None] * is_in_pose[:, None, :, None]
         by_radius: Floats | float = 1.0
         if self.forces is not None:
             by_radius = self.forces.by_radius(state.radius)[:, None, None] * along
@@ -137,7 +140,7 @@ class Equations(Series):
             self._by_coefficients(state, layout, base, scaled),
             ([by_force] * layout.radius.size, by_radius),
             ([by_force] * 3, self._by_misalignment(state)),
-            ([by_force] * layout.pose.size, _by_poses(by_rotation, layout)),
+            ([by_force] * layout.pose.size, by_poses.reshape(*force.shape, -1)),
             ([base.size + 3 + n_starts], 1.0),
         ]
         place = np.array([k for at, _ in unknowns for k in at], dtype=np.int64)
@@ -154,14 +157,14 @@ class Equations(Series):
         Return the combinations of base series in `Tangent`: the scale's 1 + S s; the derivatives
         w.r.t. kappa, the force along the axis and the initial lag states; and the residual.
         """
-        force, _, without_bias, (bend, bend_by_t), (slope, slope_by_t) = self._effects(state)
+        force, _, without_bias, (terms, terms_by_t), (slope, slope_by_t) = self._effects(state)
         on_bias, on_scale = state.weights[:, :, base.columns]
         result = np.zeros((*force.shape, base.size, 4 + n_starts))
         result[:, :, 0, :3] = 1.0
         result[:, :, 1 : 1 + len(base.columns), :3] = on_scale[..., None]
-        result[..., 1] *= (force + bend)[..., None]
+        result[..., 1] *= (force + terms)[..., None]
         result[..., 2] *= (1.0 + slope)[..., None]
-        result[:, :, base.t, 1] = bend_by_t[..., None]
+        result[:, :, base.t, 1] = terms_by_t[..., None]
         result[:, :, base.t, 2] = slope_by_t[..., None]
         if n_starts:
             weight = (on_bias + without_bias[..., None] * on_scale)[..., base.lagged, None]
@@ -176,7 +179,7 @@ class Equations(Series):
         Return place and factor, see `Tangent`, of each active nonlinear coefficient.
 
         The factor 1 + S s of the scale multiplies the nonlinear terms at the reference
-        temperature, but not their changes per kelvin, where its effect is negligible.
+        temperature, but not their changes per kelvin, which it would hardly alter.
         """
         active = np.flatnonzero(layout.nonlinear[0] >= 0)
         if self.forces is None or not len(active):
@@ -197,14 +200,14 @@ class Equations(Series):
 
     def misfit(self, state: State, base: Base) -> Floats:
         """Return the residual as combinations of the base series, (n_positions, 3, n_base)."""
-        force, by_rotation, without_bias, (_, bend_by_t), _ = self._effects(state)
+        force, by_rotation, without_bias, (_, terms_by_t), _ = self._effects(state)
         on_bias, on_scale = state.weights[:, :, base.columns]
         result = np.zeros((*force.shape, base.size))
         result[:, :, 0] = self.level - (without_bias + state.bias + state.offset)
         if self.has_turn_ons:
             result[:, :, 0] -= state.turn_on[self.bag_of_position]
         result[:, :, 1 : 1 + len(base.columns)] = -(on_bias + without_bias[..., None] * on_scale)
-        result[:, :, base.t] = -(state.kappa * bend_by_t)[..., None]
+        result[:, :, base.t] = -(state.kappa * terms_by_t)[..., None]
         result[:, :, base.tilts] = -np.einsum('pkt,pit->pik', state.tilt, by_rotation)
         result[:, [0, 1, 2], base.measured] = 1.0
         return result
@@ -251,8 +254,8 @@ class Equations(Series):
         result[layout.tilt] = prior.tilt_sd**-2
         result[layout.start] = 1.0 / prior.start_variance_ratio
         result[layout.turn_on] = prior.turn_on_sd**-2
-        # The prior of attitudes is flat: a precision of 0. Angular rates depend on no attitude: in
-        # a fit of rates a precision of 1 of each attitude prevents singular equations.
+        # The prior of attitudes is flat: its precision is 0. Angular rates do not depend on the
+        # attitudes, so a fit of rates needs a precision of 1 to avoid singular equations.
         result[layout.up] = 0.0 if self.gravity else 1.0
         result[layout.posed] = prior.pose_sd**-2
         # The prior of a pose is almost flat: its sd is 1 rad.
@@ -260,7 +263,7 @@ class Equations(Series):
         return result
 
     def deviation(self, state: State, prior: Prior, layout: Layout) -> Floats:
-        """Return unknowns less prior means; for attitudes in a pose, rotations from the pose."""
+        """Return unknowns less prior means, (n,); for attitudes in a pose, rotations from it."""
         result = as_vector(state, layout)
         if prior.informative is not None:
             result[: layout.n_unit] -= prior.informative.mean
@@ -273,11 +276,8 @@ class Equations(Series):
 
 def _added(layout: Layout) -> list[str]:
     """Return the names of the unknowns to which a step is added; attitudes are rotated instead."""
-    names = (
-        *('kappa', 'bias', 'weights', 'misalignment', 'offset', 'tilt'),
-        *('start', 'turn_on', 'nonlinear', 'radius', 'stretch'),
-    )
-    return [name for name in names if getattr(layout, name).size]
+    names = 'kappa bias weights misalignment offset tilt start turn_on nonlinear radius stretch'
+    return [name for name in names.split() if getattr(layout, name).size]
 
 
 def as_vector(state: State, layout: Layout) -> Floats:
@@ -289,7 +289,7 @@ def as_vector(state: State, layout: Layout) -> Floats:
 
 
 def without_inactive(state: State, layout: Layout) -> State:
-    """Set inactive weights and coefficients to 0; return `state` itself if all of them are 0."""
+    """Set inactive weights and coefficients to 0; if all of them are 0, return `state` itself."""
     kept = {name: getattr(layout, name) >= 0 for name in ('weights', 'nonlinear')}
     if not any(getattr(state, name)[~active].any() for name, active in kept.items()):
         return state
@@ -298,7 +298,7 @@ def without_inactive(state: State, layout: Layout) -> State:
 
 
 def with_step(state: State, step: Floats, layout: Layout) -> State:
-    """Add a step of the unknowns to the fit's state; set inactive weights, coefficients to 0."""
+    """Add a step of the unknowns to a state; set inactive weights and coefficients to 0."""
     padded = np.append(step, 0.0)
     turn, pose = padded[layout.up], state.pose
     if layout.pose.size:
@@ -309,13 +309,6 @@ def with_step(state: State, step: Floats, layout: Layout) -> State:
     up = _unit_vector(state.up + np.einsum('pij,pj->pi', state.tangents, turn))
     added = {name: getattr(state, name) + padded[getattr(layout, name)] for name in _added(layout)}
     return without_inactive(replace(state, up=up, pose=pose, **added), layout)
-
-
-def _by_poses(by_rotation: Floats, layout: Layout) -> Floats:
-    """Return the readings' derivatives by rotations of poses, (n_positions, 3, 2 n_poses)."""
-    is_in = layout.pose_of[:, None] == np.arange(len(layout.pose))
-    each = by_rotation[:, :, None, :] * is_in[:, None, :, None]
-    return np.asarray(each.reshape(*by_rotation.shape[:2], -1))
 
 
 def _unit_vector(vector: Floats) -> Floats:

@@ -69,7 +69,7 @@ class ResidualRow:
     one_set: corrected with one curve for both regimes; empty if each regime has its own curve
     two_sets: corrected with a curve for each regime
     fitted: corrected with the calibration, in sample
-    left_out: corrected by fits without the position; drift if such a fit does not determine |f|
+    left_out: corrected by fits without the position; the drift if such fits do not determine |f|
     left_out_drift: drift of an axis by fits without the position or section (`Score.drift`)
     """
 
@@ -95,7 +95,7 @@ def residual_rows(fit: Fit) -> tuple[tuple[ResidualRow, ...], Floats, Floats]:
     ]
     sizes = regression.norms(state)[regression.windows.position]
     residuals = [norm_residual(regression.force(step), sizes) for step in steps]
-    # If other positions do not determine |f|, the left-out error is the RMS drift of the axes.
+    # If other positions do not determine |f|, the left-out error is the drift, RMS over the axes.
     norm = norm_residual(selected.score.force, sizes)
     drift = np.sqrt(np.mean(selected.score.drift**2, axis=1))
     left_out = np.where(np.isfinite(norm), norm, drift)
@@ -114,7 +114,7 @@ def _with_only(regression: Regression, chosen: PosteriorMode, groups: tuple[str,
     # offsets would absorb: this fit has white noise only and no offsets.
     prior = replace(
         chosen.prior,
-        column_sd=only * regression.windows.parts * [[0.05], [0.005]],
+        column_sd=only * regression.windows.parts * [[0.05], [0.005]],  # [m/s^2], relative
         offset_sd=1e-7,
         offset_scale=0.0,
         noise=Noise(),
@@ -195,7 +195,7 @@ def lack_of_fit(fit: Fit, claim: Claim) -> tuple[tuple[LackOfFit, ...], tuple[La
     """Return the lack of fit in the static and the dynamic regime, at 0 to 5 temperatures each."""
     windows, regression, selected = fit[:3]
     prior, state, position = fit.posterior.prior, fit.posterior.state, windows.data.position
-    # Outliers have the noise of their samples: a small weight is no reason for a large error.
+    # Use weights by numbers of samples: the fit's weights, reduced for outliers, exaggerate noise.
     noise = prior.sigma**2 * (1.0 / windows.data.weight[:, None] + prior.noise.variance)
     claimed = drift_variance(regression, state, claim.layout, claim.covariance)
     excess = selected.score.drift**2 - noise - claimed

@@ -53,7 +53,7 @@ class FitResult:
     A calibration with its residuals and findings.
 
     rates: residuals of the gyroscope
-    contributions: what the unknowns of bags and positions explain; None before the end of a fit
+    contributions: effects of the unknowns of bags and positions; None before the end of a fit
     likeness: correlations of terms that the bags may not tell apart
     """
 
@@ -134,12 +134,12 @@ def fit_bags(
 
 
 def _judged_result(result: FitResult) -> FitResult:
-    """Add what the unknowns of the bags explain, and the terms that the bags do not tell apart."""
+    """Add the effects of the unknowns of bags, and the terms that the bags do not tell apart."""
     fit, findings = result.fit, list(result.findings)
     contributions, likeness = contributions_of(fit.regression, fit.posterior), likenesses(fit)
     findings += judge_contributions(contributions, fit.selected.score.noise)
     if all(finding.name != 'environment' for finding in findings):
-        # Otherwise a bag of another environment was recorded, and excluded from the fit.
+        # After the exclusion of a bag of another environment, terms are not judged.
         n_directions = len(distinct_directions(fit.posterior.state.up))
         findings += judge_likeness(likeness, n_directions)
     return replace(
@@ -156,14 +156,13 @@ def _fit_without_code_offset(
     codes = ' '.join(f'{code:g}' for code in offset)
     how = 'estimated; --offset can state it' if options.offset is None else 'by --offset'
     text = f'zero force reads {codes} counts (x y z), {how}: the fit subtracts this offset'
-    finding = advice('offset', text)
     prior = options.prior and with_code_offset(options.prior, -offset)
     centred_bags = [without_code_offset(bag, offset) for bag in bags]
     result = _fit_one_environment(centred_bags, replace(options, prior=prior), progress)
     return replace(
         result,
         calibration=with_code_offset(result.calibration, offset),
-        findings=(finding, *result.findings),
+        findings=(advice('offset', text), *result.findings),
         bags=tuple(bags),
     )
 
@@ -198,7 +197,7 @@ def without_code_offset(bag: ReducedBag, offset: Floats) -> ReducedBag:
 
 
 def with_code_offset(calibration: Calibration, offset: Floats) -> Calibration:
-    """Convert a calibration of codes less the code at zero force into one of raw codes."""
+    """Return a calibration for codes that exceed those of `calibration` by `offset`, (3,)."""
     unit = calibration.unit
     full_scale = unit.full_scale
     if full_scale == COUNTS_FULL_SCALE and offset.max() > 0.0:
@@ -235,7 +234,7 @@ def _fit_one_environment(
             return _refined(first, bags, options, progress)
         refit = _refined(refit, kept, options, progress)
     elif earlier is not None and not is_updated:
-        # All bags contradict the prior's effects of temperature and may not update them: the bags
+        # All bags contradict the prior's effects of temperature and cannot update them: the bags
         # count as recorded in another environment, and the prior is kept.
         provenance = first.calibration.provenance
         refit = replace(first, calibration=replace(earlier, provenance=provenance))
@@ -350,7 +349,7 @@ def _fit(
 def _judged(
     bags: Sequence[ReducedBag], options: FitOptions
 ) -> tuple[list[ReducedBag], list[Finding]]:
-    """Return the bags less the copies of the board's thermometer; and findings on raw data."""
+    """Return the bags without copies of the board's thermometer, and findings on raw data."""
     has_board = [bool(len(bag.board.value)) for bag in bags]
     if any(has_board) and not all(has_board):
         name = bags[has_board.index(False)].source.name
@@ -363,12 +362,12 @@ def _judged(
     findings += enforce(raw_checks.judge_bags(bags, options), options)
     kept, copies = without_copies(bags)
     text = 'repeats the readings of the board, and is left out'
-    return kept, findings + [data_checks.advice('copy', f'temperature/{k} {text}') for k in copies]
+    return kept, findings + [advice('copy', f'temperature/{name} {text}') for name in copies]
 
 
 def _unusable(error: ValueError, up: Floats) -> FitError:
     if 'misalignment' in str(error):
-        # An angle of 60 degrees between axes is a data error if the positions determine M.
+        # If the positions determine M, an angle of 60 degrees between axes is a data error.
         kind = FitError if data_checks.determines_misalignment(up) else UndeterminedError
         return kind(
             'in the fit the angle between two of the axes is some 60 degrees or less, which no '
@@ -390,8 +389,8 @@ def check_serial(sources: Sequence[FitSource], options: FitOptions) -> str:
     try:
         return valid_serial(options.serial or next(iter(serials), 'unknown'))
     except ValueError as mistake:
-        advice = '' if options.serial else '; the bags state this serial, --serial can replace it'
-        raise FitError(f'{mistake}{advice}') from mistake
+        remedy = '' if options.serial else '; the bags state this serial, --serial can replace it'
+        raise FitError(f'{mistake}{remedy}') from mistake
 
 
 def _unit(bags: Sequence[ReducedBag], options: FitOptions) -> Unit:

@@ -72,7 +72,7 @@ def add_gyroscope(
     # Sd of the component of the Earth's rate along one axis in an unknown attitude [rad/s].
     earth_sd = EARTH_RATE / math.sqrt(3.0)
     prior = Prior(
-        bias_sd=np.full(3, 1.0),  # prior sd of the bias [rad/s], wide for any gyroscope
+        bias_sd=np.ones(3),  # prior sd of the bias [rad/s], wide for any gyroscope
         scale_sd=1.0,
         misalignment_sd=1.0,
         column_sd=np.zeros((2, len(data.groups))),
@@ -95,8 +95,8 @@ def add_gyroscope(
 
 def _candidates(data: Windows, options: FitOptions) -> Candidates:
     """Return the columns that the bias of the angular rate may have."""
-    allowed = {*data.groups} if options.groups is None else {*options.groups}
-    is_candidate = np.isin(data.groups, list(allowed)) & (data.kelvins > 0.0)
+    allowed = data.groups if options.groups is None else options.groups
+    is_candidate = np.isin(data.groups, allowed) & (data.kelvins > 0.0)
     kelvins = np.outer((1.0, 0.0), is_candidate * data.kelvins)
     none = np.zeros(kelvins.shape, dtype=bool)
     # Typical and largest (consumer MEMS) prior sd of a slope of the bias [rad/s per K].

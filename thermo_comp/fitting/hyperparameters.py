@@ -5,11 +5,11 @@ Owns the estimation of prior sds and noises, and the removal of columns of small
 
 Each column has one prior standard deviation of its weights in the bias of all axes and one in the
 scale. All bends (changes of slope at knees) have one sd of the change of slope in the bias and one
-in the scale, which are the smoothness of the curves. Newton's steps move each sd that is not fixed
-to the mode of log evidence [1]_ plus the log of a hyperprior, which is log-normal with centre sd0
-and variance tau^2 of log sd. At this mode ``effective parameters + log(sd / sd0) / tau^2 = sum w^2
-/ sd^2``, w being the weights of the column on the three axes. Without information about a column
-its prior sd stays at sd0.
+in the scale, which set the smoothness of the curves. Newton's steps move each sd that is not fixed
+to the mode of the log evidence [1]_ plus the log density of a hyperprior, which is log-normal with
+centre sd0 and variance tau^2 of log sd. At this mode
+``effective parameters + log(sd / sd0) / tau^2 = sum w^2 / sd^2``, w being the weights of the
+column on the three axes. Without information about a column its prior sd stays at sd0.
 
 References
 ----------
@@ -38,13 +38,14 @@ from .windows import BEND, LAGS, PRODUCTS
 
 #: Degrees of freedom of the half-Student prior of the sd of mounting offsets, as in [2]_.
 STUDENT_NU = 4.0
-#: Smallest log Bayes factor of a column that is kept: below 1 the evidence is "not worth more than
-#: a bare mention" (Kass and Raftery, Bayes factors, JASA 90 (1995), section 3.2).
+#: Smallest log Bayes factor of a column that is kept: below 1 it is "not worth more than a bare
+#: mention" (Kass and Raftery, Bayes factors, JASA 90 (1995), section 3.2).
 LEAST_GAIN = 1.0
 #: Gain in log evidence from which a model is clearly more likely than another: odds of 55 : 1.
 CLEAR_GAIN = 4.0
 #: Variance of the natural log of a prior sd in the hyperprior: 1 sd is a factor of ten.
 LOG_VARIANCE = float(np.log(10.0)) ** 2
+_Value = Floats | float
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class Candidates:
 def settle(
     regression: Regression, state: State, prior: Prior, candidates: Candidates, rounds: int = 25
 ) -> PosteriorMode:
-    """Update prior sds and noises up to `rounds` times, until none changes by over about 5 %."""
+    """Update prior sds and noises up to `rounds` times, until all change by less than some 5 %."""
     posterior = regression.solve(state, prior, n_steps=3)
     for _ in range(rounds):
         prior, change = _updated(regression, posterior, candidates)
@@ -140,8 +141,8 @@ def _misalignment_sd(posterior: PosteriorMode) -> float:
     gamma = float(posterior.determined[posterior.layout.misalignment].sum())
     share = 1.5 * max(1.0 - 1.0 / max(gamma, 1.0), 0.0)
     square = share * np.sum(misalignment**2) + prior.misalignment_scale**2
-    # The misalignment sd is limited to 0.03 rad, a value for separate sensors on a printed
-    # bracket: larger misalignments would explain |f| on six faces, to second order.
+    # Limit of the misalignment sd: 0.03 rad, for separate sensors on a printed bracket. Larger
+    # misalignments would explain |f| on six faces, to second order.
     return min(float(np.sqrt(square / (share * gamma + 1.0))), 0.03)
 
 
@@ -182,17 +183,15 @@ def _pose_sd(posterior: PosteriorMode) -> float:
     return float(sd * np.exp(_toward(effective, power, sd, slope, 1.0 / LOG_VARIANCE)))
 
 
-def _toward(
-    effective: Floats | float,
-    power: Floats | float,
-    sd: Floats | float,
-    slope: Floats | float,
-    bend: Floats | float,
-) -> Floats:
-    """Return Newton's step of log sd, within +-2, to ``power / sd^2 = effective + slope``."""
+def _toward(effective: _Value, power: _Value, sd: _Value, slope: _Value, rise: _Value) -> Floats:
+    """
+    Return Newton's step of log sd, within +-2, to ``power / sd^2 = effective + slope``.
+
+    `slope`, `rise`: minus the first and second derivative of the log hyperprior by log sd
+    """
     ratio = power / (sd * sd)
     gradient = ratio - effective - slope
-    curvature = 2.0 * np.minimum(ratio, 2.0 * effective + 1.0) + 0.5 * effective + bend
+    curvature = 2.0 * np.minimum(ratio, 2.0 * effective + 1.0) + 0.5 * effective + rise
     return np.asarray(np.clip(gradient / curvature, -2.0, 2.0))
 
 
@@ -205,14 +204,14 @@ def _offset_sd(posterior: PosteriorMode, sd: float, places: Ints) -> float:
     power = float(np.sum(as_vector(posterior.state, posterior.layout)[places] ** 2))
     square = (sd / scale) ** 2
     slope = (STUDENT_NU + 1.0) * square / (STUDENT_NU + square)
-    bend = 2.0 * (STUDENT_NU + 1.0) * STUDENT_NU * square / (STUDENT_NU + square) ** 2
-    step = _toward(effective, power, sd, slope, bend + 0.1)
+    rise = 2.0 * (STUDENT_NU + 1.0) * STUDENT_NU * square / (STUDENT_NU + square) ** 2
+    step = _toward(effective, power, sd, slope, rise + 0.1)
     # Bounds of the offset sd: 1e-4 times the prior's scale, and 5 mg (0.05 m/s^2), of cheap MEMS.
     return float(np.clip(sd * np.exp(step), 1e-4 * scale, 0.05))
 
 
 def log_density(posterior: PosteriorMode) -> float:
-    """Return the log evidence plus the log prior density of the offset and pose sds and ageing."""
+    """Return the log evidence plus the log prior densities of offset sds, pose sd and ageing."""
     prior, result = posterior.prior, posterior.log_evidence
     if prior.offset_scale:
         sd = [prior.offset_sd, *[prior.turn_on_sd] * bool(posterior.layout.turn_on.size)]
@@ -240,8 +239,8 @@ def white_noise(regression: Regression, posterior: PosteriorMode) -> Floats:
     common = (layout.shared, layout.up, layout.stretch, layout.tilt, layout.start)
     spent = of_axis + sum(determined[places].sum() for places in common) / 3.0
     sigma = np.sqrt(posterior.square / np.maximum(n - spent, 0.05 * n))
-    # The samples of an axis may be constant, without noise. The noise of an axis is at least a
-    # hundredth of the noise of the noisiest axis.
+    # The samples of an axis may be constant: its noise is at least a hundredth of the noise of the
+    # noisiest axis.
     least_sigma = np.full(3, max(posterior.prior.least_sigma, 0.01 * float(sigma.max())))
     if not regression.windows.has_drifts:
         # If no column changes within a position, slow noise may explain the whole residual: the
@@ -270,8 +269,8 @@ def with_slow_noise(
         return replace(fitted, prior=trial)
 
     def likeliest(n_times: int) -> PosteriorMode:
-        # Search the largest log evidence over the variance ratio and the correlation time, in
-        # steps of a factor of 3, then of 3^(1/2) and 3^(1/4).
+        # Find the variance ratio and correlation time of largest log evidence, by factors of 3,
+        # then of 3^(1/2) and 3^(1/4).
         best, step = with_noise(estimated._replace(n_times=n_times)), 3.0
         while step > 3.0**0.2:
             ratio, time_s, _ = best.prior.noise
@@ -285,7 +284,7 @@ def with_slow_noise(
             step, best = (step**0.5, best) if better is None else (step, better)
         return best
 
-    # The parameters absorb a part of the noise, so residuals underestimate the noise; the log
+    # Residuals underestimate the noise, because the parameters absorb a part of it, but the log
     # evidence does not. All accelerometers have flicker noise, so noise with one correlation time
     # is chosen only if its log evidence exceeds that of flicker noise by `CLEAR_GAIN`.
     single, best = likeliest(1), likeliest(whitener.n_flicker)
@@ -324,7 +323,7 @@ def _pruned(regression: Regression, posterior: PosteriorMode, candidates: Candid
         part, column = np.array(droppable).T
         places = layout.weights[part, :, column]
         gains = log_bayes_factors(mode, covariance, places, weight_sd[part, :, column])
-        # A product t m of temperature and lag approximates the lag m at the rates of one chamber
+        # A product t m of temperature and lag can replace the lag m at the rates of one chamber
         # program, but not at others: a model with products keeps a lag (marginality, [3]_).
         used = column_sd > 0.0
         is_last = (used & is_product).any(axis=1) & ((used & is_lag).sum(axis=1) == 1)
@@ -353,15 +352,15 @@ def downweigh(regression: Regression, posterior: PosteriorMode) -> None:
 
 
 def undisturbed(residual: Floats, weight: Floats, position: Ints) -> Floats:
-    """Return factors of at most 1 for the windows' weights, from residuals of shape (n, 3)."""
+    """Return factors of at most 1 for windows' weights, (n,), by their residuals, (n, 3)."""
     size = residual * np.sqrt(weight)[:, None]
     for part in np.split(size, np.flatnonzero(np.diff(position)) + 1):
         if len(part) > 6:
             # Subtract a running median over seven windows.
             np.subtract(part, median_filter(part, (7, 1), mode='mirror'), out=part)
     size = np.abs(size)
-    # The 80 % quantile of |x| is 1.2816 sd of a normal x. The median of |x| can be 0: the window
-    # means of a charge-balancing converter often have few distinct values.
+    # The 80 % quantile of |x| is 1.2816 sd of a normal x. The median of |x| is not used: it can be
+    # 0, because window means of a charge-balancing converter often have few distinct values.
     usual = np.quantile(size, 0.8, axis=0) / 1.2816
     size = np.minimum(size / np.maximum(usual, 1e-300), 1e3).max(axis=1)
     return np.asarray((3.0 / np.maximum(size, 3.0)) ** 2)
