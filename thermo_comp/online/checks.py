@@ -79,7 +79,7 @@ Run: TypeAlias = tuple[tuple[float, float, float, int], int, float, int, float]
 
 class StuckCheck:
     """
-    Counts consecutive equal readings of each axis; with a `timeout_s` of 0 s, nothing is stuck.
+    Counts consecutive equal readings of each axis; with a `timeout_s` of 0 s, no sample is stuck.
 
     Samples are stuck if all three axes repeat their readings for over `timeout_s`. One axis alone
     is stuck if it repeats its reading for over `timeout_s` while both other axes change by over
@@ -98,7 +98,7 @@ class StuckCheck:
         self.runs: tuple[Run, ...] = ()
 
     def again(self, stamp_ns: int, x: float, y: float, z: float) -> bool:
-        """Take a sample that repeats a reading of an axis; return whether the sample is stuck."""
+        """Return whether a sample that repeats the reading of one axis or more is stuck."""
         last = self.last
         self.last = sample = (x, y, z, stamp_ns)
         of_x, of_y, of_z = self.runs or _begun(last)
@@ -226,7 +226,7 @@ class RateCheck:
         return excess if excess > RATE_TOLERANCE else 0.0
 
     def update(self, n_seen: int, stamp_ns: int) -> None:
-        """Update the sample rate by the number of samples so far and the latest stamp [ns]."""
+        """Update the sample rate; `n_seen`: number of samples so far; latest stamp [ns]."""
         last = self._last
         self._last = (n_seen, stamp_ns)
         if last is None:
@@ -234,8 +234,8 @@ class RateCheck:
             return
         n, dt = n_seen - last[0], (stamp_ns - last[1]) * 1e-9
         level = self._level + n - LARGEST_RATE * dt / self._cycle_s
-        # Count at most twice the allowed number of excess samples, so that the alarm ends soon
-        # after a long excess.
+        # The number of excess samples is limited to twice the allowed number, so that the alarm
+        # ends soon after a long excess.
         self._level = min(max(level, 0.0), 2.0 * self._allowance)
         self.is_too_fast = self._counts_cycles and self._level > self._allowance
         n, dt = n_seen - self._window[0], (stamp_ns - self._window[1]) * 1e-9
@@ -267,8 +267,8 @@ class GravityCheck:
         self._tolerance = tolerance or math.inf
         # Whether |f| in the last still windows refutes the calibration.
         self.is_refuted = False
-        self._n_agreeing = 0
-        self._is_against = False
+        self._is_against = False  # whether |f| of the last still window was beyond the limit
+        self._n_agreeing = 0  # number of successive still windows with equal `_is_against`
         self._forces: list[Sequence[float]] = []
         #: Forces of the samples after a step of |f|, and the stamp of the first such sample [ns].
         self._off: list[Sequence[float]] = []
@@ -280,7 +280,7 @@ class GravityCheck:
         #: in which the platform accelerated; whether a window has not been still since.
         self._agreed: tuple[list[float], int] | None = None
         self._has_moved = False
-        self._weight = 0.0
+        self._weight = 0.0  # sum of the weights of the windows averaged in `result`
         # Residual of |f|, or None before the first still window.
         self.result: GravityResidual | None = None
 
@@ -392,7 +392,7 @@ class GravityCheck:
         self.result = GravityResidual(residual, sd, n + 1, is_still=True)
 
     def _is_accelerated(self, mean: Sequence[float], size: float) -> bool:
-        """Whether an acceleration of the platform along the force may explain a wrong |f|."""
+        """Whether an acceleration of the platform may explain the |f| of a window, `size`."""
         if self.is_refuted or self._agreed is None or not self._has_moved:
             return False
         agreed, agreed_ns = self._agreed
