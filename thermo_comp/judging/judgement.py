@@ -25,8 +25,8 @@ from .windows import JudgedWindows
 _WIDE_CLAIM = 1e3 * MICRO_G
 #: Smallest significant shift or change of a constant, in standard deviations.
 SIGNIFICANT_SDS = 3.0
-# Smallest sd assumed for a misalignment [rad]; smallest relative sd of a position's mean |f|, and
-# smallest claimed sd of a window [m/s^2].
+# Lower limits of sds, above 0: of a misalignment [rad]; of a position's mean |f| / g, and of a
+# window's claimed sd [m/s^2].
 _SMALLEST_MISALIGNMENT_SD, _SMALLEST_NORM_SD = 1e-5, 1e-8
 # Number of consecutive windows that count as one observation: thermal residuals are correlated.
 _CORRELATED_WINDOWS = 6.0
@@ -44,7 +44,7 @@ class AxisShift:
 
 @dataclass(frozen=True)
 class Expectation:
-    """RMS error of windows and on data left out of the fit, RMS claimed sd [m/s^2], or NaN."""
+    """RMS error of windows, RMS error on data left out of the fit, RMS claimed sd [m/s^2]."""
 
     found_rms: float
     expected_rms: float
@@ -167,7 +167,7 @@ def judge(
 def _expectations(
     windows: JudgedWindows, full: Section, provenance: Provenance
 ) -> dict[str, Expectation]:
-    """Compare |f| - g and the drift of the axes with those on data left out of the fit."""
+    """Compare |f| - g and the axes' drift with the errors of the fit on data left out of it."""
     inside = windows.select(windows.is_inside)
     drift = within_positions(inside.force, inside.position)
     found = float(np.sqrt(np.mean(drift**2))) if len(inside) else np.nan
