@@ -25,8 +25,8 @@ from .windows import JudgedWindows
 _WIDE_CLAIM = 1e3 * MICRO_G
 #: Smallest significant shift or change of a constant, in standard deviations.
 SIGNIFICANT_SDS = 3.0
-# Lower limits of sds, above 0: of a misalignment [rad]; of a position's mean |f| / g, and of a
-# window's claimed sd [m/s^2].
+# Smallest sd, to avoid a division by 0: of a misalignment [rad]; of the mean |f| / g of a
+# position, and of the |f| of a window [m/s^2].
 _SMALLEST_MISALIGNMENT_SD, _SMALLEST_NORM_SD = 1e-5, 1e-8
 # Number of consecutive windows that count as one observation: thermal residuals are correlated.
 _CORRELATED_WINDOWS = 6.0

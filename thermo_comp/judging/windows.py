@@ -135,7 +135,7 @@ def corrected_windows(
         noise = along**2 @ np.array(correction.noise)
         # The mean has no rounding noise: a converter adds the remainder to the next sample.
         white = along**2 @ np.square(calibration.noise_density_m_s2_sqrt_hz)
-        # A higher sample rate increases the noise of each sample, so the mean's noise stays.
+        # A higher sample rate raises the noise of each sample: the noise of the mean stays equal.
         covered_s = np.minimum(calibration.unit.cycle_time_s * table['count'], window_s)
         mean_white = white / covered_s
         variance = np.maximum(table['variance'] - noise, 0.0) + mean_white

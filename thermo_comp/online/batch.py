@@ -261,7 +261,7 @@ def _judge(
     # Reason for which all samples of a segment are dropped, or 0.
     reason = _REFUTED if compensator.is_refusing else 0
     for (segment, count), begin, stamp_ns, row in pieces:
-        # The check of |f| uses the first sample of a new segment, if valid, even if not published.
+        # The check of |f| uses the first sample of a new segment if it is valid, even if dropped.
         is_bad = bool(reasons[begin])
         if segment.is_too_fast:
             reason = _TOO_FAST

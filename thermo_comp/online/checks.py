@@ -22,7 +22,7 @@ from ..thermal.reading_queue import NEVER_NS
 from ..typing import Bools, Floats, Ints
 from .status import GravityResidual
 
-#: Smallest number of repeats of a reading at which, after the time-out, an axis counts as stuck.
+#: An axis counts as stuck after the time-out only if it repeated its reading this number of times.
 STUCK_SAMPLES: Final = 50
 #: Change of both other axes [m/s^2] at which an axis that repeats its reading counts as stuck: the
 #: change in a turn by 1.2 degrees, above the noise and the steps of a converter at rest.
@@ -59,7 +59,7 @@ MEMORY_WINDOWS: Final = 30.0
 #: Number of consecutive still windows that refute a calibration, and that restore it.
 REFUTING_WINDOWS: Final = 3
 RESTORING_WINDOWS: Final = 2
-#: Time at rest after a step of |f|, after which the step is judged [ns].
+#: Time at rest between a step of |f| and the judgement of the step [ns].
 STEP_NS: Final = 300_000_000
 #: An error of |f| after motion is due to the platform's acceleration, as in a coordinated turn, if
 #: the force has turned by less than this angle [rad] and at most this time [ns] has passed since
@@ -226,7 +226,7 @@ class RateCheck:
         return excess if excess > RATE_TOLERANCE else 0.0
 
     def update(self, n_seen: int, stamp_ns: int) -> None:
-        """Update the sample rate; `n_seen`: number of samples so far; latest stamp [ns]."""
+        """Update the sample rate from the number of samples so far and the latest stamp [ns]."""
         last = self._last
         self._last = (n_seen, stamp_ns)
         if last is None:

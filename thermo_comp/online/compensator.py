@@ -72,7 +72,7 @@ class CompensatorStatus:
     regime: Regime = Regime.UNKNOWN
     direction: int = 0  # temperature change: -1 cooling, +1 heating, 0 neither
     is_settled: bool = False  # whether the unknown initial lag states have decayed
-    #: Time from the last used reading of board or case to the last sample [s]; inf without one.
+    #: Time from the last used reading of board or case to the last sample [s]; inf: none used.
     board_age_s: float = math.inf
     case_age_s: float = math.inf
     is_board_stale: bool = True
@@ -82,7 +82,7 @@ class CompensatorStatus:
     #: Whether in a ramp the board temperature changes before that of the case: swapped topics.
     is_lead_reversed: bool = False
     gravity: GravityResidual | None = None  # residual at rest, or None before the first rest
-    #: Whether nothing is published, as |f| at rest is beyond the tolerance plus 5 sd from gravity.
+    #: Whether nothing is published because |f| - g at rest exceeded the tolerance plus 5 sd.
     is_refuted: bool = False
     #: Sd of the corrected angular rate's bias on each axis [rad/s]; empty without a gyroscope.
     rate_bias_sd: tuple[float, ...] = ()
@@ -132,7 +132,7 @@ class Compensator:
 
     def push(self, name: str, stamp_ns: int, celsius: float) -> None:
         """
-        Queue a reading [degC]; a thermometer that the calibration lacks has no effect.
+        Queue a reading [degC]; readings of thermometers that the calibration lacks are ignored.
 
         At most 4096 readings wait for a sample with an equal or later stamp. If more wait, the
         older half is dropped and counted as rejected.

@@ -42,8 +42,8 @@ EVEN_WIDTHS: Final = (0.375, 0.75, 1.5, 3.0, 6.0)
 PLAY_WIDTHS: Final = (0.4, 0.8, 1.6, 3.2, 6.4)
 PLAY_TAUS: Final[tuple[float, ...]] = (0.0, 450.0, 900.0, 1800.0)
 #: Kind bend: time constants [s]; smallest span of board temperatures per knee (change of slope)
-#: [K], with `parts` in `bank` a third of it; largest number of knees per lag without and with
-#: `parts`.
+#: [K]; largest number of knees per lag. With the argument `parts`, `bank` makes up to
+#: `MOST_PART_KNEES` knees, and a third of the span suffices per knee.
 BEND_TAUS: Final = (0.0, *FINE_TAUS[4:11])
 LEAST_KNEE_K, MOST_KNEES, MOST_PART_KNEES = 1.0, 20, 60
 
@@ -304,7 +304,7 @@ class ColumnTable:
         return np.asarray((numbers - self._centres) / self._widths)
 
     def held(self, raw: Floats) -> Floats:
-        """Limit the values u of the columns to the values that the correction uses."""
+        """Limit the values u of the columns to their ranges, which are extended for bends."""
         return hold(raw, *self._limits)
 
     def beyond(self, raw: Floats) -> Floats:
@@ -312,7 +312,7 @@ class ColumnTable:
         return raw - hold(raw, *self._range)
 
     def excess(self, raw: Floats) -> Floats:
-        """Return how far each u, or its root if a power, is outside its range [half ranges]."""
+        """Return how far each u (for a power: its root) is outside its range [half ranges]."""
         lower, upper = self._range
         excess = np.asarray(np.abs(self.beyond(raw)) / ((upper - lower) / 2.0))
         for order in {*self._orders.tolist()} - {1}:

@@ -48,7 +48,8 @@ VARIANCES = tuple(12 + place for place in CONSTANTS)
 #: Indices of the variances of the relative scale of the axes in a result of `Correction.line`: the
 #: coefficients of x^2 in xx, y^2 in yy, z^2 in zz.
 SCALE_VARIANCES = tuple(place + last for place, last in zip(VARIANCES, (2, 5, 9), strict=True))
-#: Number of thermal states above which a loop over the columns is faster than a sum over a table.
+#: Number of thermal states above which sums are computed in a loop over the columns, which is then
+#: faster than a sum over an array of all products.
 _FEW = 64
 #: Largest number of thermal states evaluated at once, to bound the memory.
 _CHUNK = 2048
@@ -60,7 +61,7 @@ class Excess(NamedTuple):
     temperature: float  # board temperature beyond the range of the present regime, signed [K]
     rate: float  # rate of the board temperature beyond this regime's range, signed [K/s]
     gradient: float  # excess of the gradient farthest outside its range, signed [K]
-    relative: float  # sum of the temperature's, rate's and worst column's excess [half ranges]
+    relative: float  # sum of the excesses of temperature, rate and worst column [half ranges]
 
 
 class Correction:
@@ -141,7 +142,6 @@ class Correction:
     def _weigh(self, columns: Floats, start: Floats) -> Floats:
         """Add ``W @ columns`` (W: weights) to `start`, shape (6, n), column by column."""
         if columns.shape[1] > _FEW:
-            # With many states the sums are computed without a table of intermediate values.
             total: Floats = start.copy()
             for weights, column in zip(self._W.swapaxes(0, 1), columns, strict=True):
                 total += weights * column

@@ -67,9 +67,9 @@ class CovarianceMap:
             sums[place] = products + np.tril(products, -1).T
         u, w = np.array([*_OF_AXES, *BETWEEN]).T
         factors = sums[:, u, w]
-        # Row b of an axis is twice the covariance of its constant error and its scale error.
+        # Row b of an axis is twice the covariance of the axis' constant error and scale error.
         factors[:, 1:9:3] /= 2.0
-        # Coefficients of xx, ..., zz are sums of few rows of the covariance of u: keep only these.
+        # Each coefficient of xx, ..., zz is a sum over few rows of the covariance of u.
         n = int((factors != 0.0).sum(axis=1).max())
         self._places = np.argsort(factors == 0.0, axis=1, kind='stable')[:, :n]
         self._factors = np.take_along_axis(factors, self._places, axis=1)[:, :, np.newaxis]

@@ -39,8 +39,8 @@ class SlowUncertainty:
         self._root = start_root(lags)
         edges = [edge for part in calibration.regime_sets() for edge in part.temperature_range_c]
         self._span = max(edges) - min(edges)
-        #: Value of each lag [K] / rate of the board temperature [K/s], (2, n_lags): row 0 due to
-        #: lags of the board in a long ramp, row 1 due to lags of gradients just after the onset.
+        #: Value of each lag [K] / rate of the board temperature in a ramp [K/s], (2, n_lags): row
+        #: 0 due to lags of the board in a long ramp, row 1 due to lags of gradients at the onset.
         self._behind_s = np.zeros((2, len(lags)))
         for k, lag in enumerate(lags):
             for (name, tau), weight in lag.first_order_weights.items():
