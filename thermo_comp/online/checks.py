@@ -101,7 +101,7 @@ class StuckCheck:
         """Return whether a sample that repeats the reading of one axis or more is stuck."""
         last = self.last
         self.last = sample = (x, y, z, stamp_ns)
-        of_x, of_y, of_z = self.runs or _begun(last)
+        of_x, of_y, of_z = self.runs or (_begun(last),) * 3
         new = sample, 0, 0.0, 0, math.inf
         self.runs = runs = (
             self._continued(of_x, sample, last, 1, 2) if x == last[0] else new,
@@ -147,7 +147,7 @@ class StuckCheck:
         changes = np.empty((3, n), dtype=np.bool_)
         changes[:, 0] = columns[:, 0] != self.last[:3]
         changes[:, 1:] = columns[:, 1:] != columns[:, :-1]
-        runs = list(self.runs or _begun(self.last))
+        runs = list(self.runs or (_begun(self.last),) * 3)
         are_long = np.zeros((3, n), dtype=np.bool_)
         is_stuck = np.zeros(n, dtype=np.bool_)
         for axis, run in enumerate(runs):
@@ -157,11 +157,9 @@ class StuckCheck:
             is_judged[-1] = True
             spans = zip(begins[is_judged].tolist(), ends[is_judged].tolist(), strict=True)
             for begin, end in spans:
+                begun = run
                 if begin >= 0:
-                    first = (*samples[begin].tolist(), int(stamps[begin]))
-                    begun: Run = first, 0, 0.0, 0, math.inf
-                else:
-                    begun = run
+                    begun = _begun((*samples[begin].tolist(), int(stamps[begin])))
                 here = slice(max(begin, 0), end)
                 equal = np.arange(here.start - begin, end - begin)
                 is_long = (equal >= STUCK_SAMPLES) & (stamps[here] - begun[0][3] > self.limit_ns)
@@ -169,9 +167,8 @@ class StuckCheck:
                 is_noisy = (n_noisy >= NOISY_CHANGES) & (step <= self._visible[axis])
                 are_long[axis, here] = is_long
                 is_stuck[here] |= is_long & ((moved > self.motion) | is_noisy)
-                runs[axis] = (
-                    begun[0], end - 1 - begin, moved.item(-1), n_noisy.item(-1), step.item(-1)
-                )  # fmt: skip
+                latest = moved.item(-1), n_noisy.item(-1), step.item(-1)
+                runs[axis] = (begun[0], end - 1 - begin, *latest)
         self.last, self.runs = (*samples[-1].tolist(), int(stamps[-1])), tuple(runs)
         is_stuck |= are_long.all(axis=0)
         if self.is_on:
@@ -202,9 +199,9 @@ class StuckCheck:
         return most_moved, counts, np.minimum.accumulate(np.append(step, steps))[1:]
 
 
-def _begun(sample: tuple[float, float, float, int]) -> tuple[Run, ...]:
-    """Return a new run of equal readings for each of the three axes, begun by `sample`."""
-    return ((sample, 0, 0.0, 0, math.inf),) * 3
+def _begun(sample: tuple[float, float, float, int]) -> Run:
+    """Return a new run of equal readings of an axis, begun by `sample`."""
+    return sample, 0, 0.0, 0, math.inf
 
 
 class RateCheck:

@@ -204,7 +204,7 @@ class Correction:
         ends = np.array((start, end), dtype=np.float64)
         n = ends[0, 0].size
         if n > _CHUNK:
-            columns = (*ends, np.asarray(slow), np.asarray(noise_excess))
+            columns = (*ends, np.asarray(slow), np.broadcast_to(noise_excess, n))
             cuts = range(_CHUNK, n, _CHUNK)
             parts = zip(*(np.split(column, cuts, axis=-1) for column in columns), strict=True)
             return np.hstack([self.line(*part) for part in parts])
