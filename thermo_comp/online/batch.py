@@ -108,7 +108,7 @@ def _runs(compensator: Compensator, stamps: Stamps, arrivals: _Arrivals) -> list
             compensator.reading_ns = max(compensator.reading_ns, waiting.pop()[3])
         if stamp_ns <= last_ns - TIME_JUMP_NS:
             runs.append([])
-            compensator.reading_ns = EVER_NS
+            compensator.reading_ns, compensator.leapt_ns = EVER_NS, None
         elif stamp_ns <= last_ns or compensator.is_leap(stamp_ns):
             continue
         runs[-1].append(number)

@@ -205,7 +205,7 @@ class Compensator:
         """Correct and check the first sample after a reading or the end of a segment."""
         if stamp_ns <= self.last_ns - TIME_JUMP_NS:
             self.jump_back(stamp_ns)
-            self.reading_ns = EVER_NS
+            self.reading_ns, self.leapt_ns = EVER_NS, None
         elif stamp_ns <= self.last_ns or self.is_leap(stamp_ns):
             self.counters.n_out_of_order += 1
             return None
