@@ -78,9 +78,9 @@ def open_bags(
         )
         default = {'full_scale': None if info.input == 'imu' else COUNTS_FULL_SCALE}
         source = replace(source, sha256=digest(Path(path)))
-        for other, twin in zip(bags, paths, strict=False):
+        for other, other_path in zip(bags, paths, strict=False):
             if other.source.sha256 == source.sha256:
-                raise RecordingError(f'has the same content as {twin}: give only one', path)
+                raise RecordingError(f'has the same content as {other_path}: give only one', path)
         bag = reduce_source(source, window_s=sum_length(window_s), **(default | limits))
         if 'board' in require and not len(bag.board.value):
             raise RecordingError(

@@ -148,6 +148,7 @@ def corrected_windows(
         lack_sd = np.sqrt(np.sum(along**2 * lack.T, axis=1))
         known = calibration.nonlinearity
         is_inside &= table['size'] <= (known.force_range_m_s2[1] if known else AT_REST * gravity)
+    copied = (*_ONCE, 'time', 'board', 'rate', 'size', *_TRIPLES, 'gyro')
     return JudgedWindows(
         window_s=window_s,
         gravity=gravity,
@@ -158,10 +159,7 @@ def corrected_windows(
         claimed_sd=claimed_sd,
         noise_sd=noise_sd,
         lack_sd=lack_sd,
-        **{
-            name: table[name]
-            for name in (*_ONCE, 'time', 'board', 'rate', 'size', *_TRIPLES, 'gyro')
-        },
+        **{name: table[name] for name in copied},
     )
 
 

@@ -319,8 +319,8 @@ class GravityCheck:
         rough: float,
     ) -> None:
         """Refute the calibration if, after a step, |f| at rest differs from g for `STEP_NS`."""
-        rests = self.result and self.result.is_still and self._last_mean
-        if self.is_refuted or not (self._off or rests):
+        is_still = self.result and self.result.is_still and self._last_mean
+        if self.is_refuted or not (self._off or is_still):
             self._off, self._is_resting = [], False
             return
         # Largest difference of two samples at rest: `LARGEST_CHANGE` + 4 sd of the difference.

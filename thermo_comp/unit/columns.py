@@ -265,15 +265,16 @@ class ColumnTable:
         layout = StateLayout(memory)
         self.columns = tuple(columns)
         self._reference = reference_temperature
-        lower, upper = temperature_range_c
-        self._t_range = lower - reference_temperature, upper - reference_temperature
+        coldest, hottest = temperature_range_c
+        self._t_range = coldest - reference_temperature, hottest - reference_temperature
         ranges = np.array([column.range for column in columns])
         self._range = ranges.reshape(-1, 2).T[:, :, np.newaxis]
         # Outside its range a column is constant. Curves over the board temperature continue for
         # `TANGENT_SPANS` of their range, and so do curves over a part's temperature (bends).
         is_curve = np.array([c.term.is_temperature for c in columns], bool)[:, np.newaxis]
-        reach = np.where(is_curve, TANGENT_SPANS * (self._range[1] - self._range[0]), 0.0)
-        self._limits = self._range[0] - reach, self._range[1] + reach
+        lower, upper = self._range
+        extension = np.where(is_curve, TANGENT_SPANS * (upper - lower), 0.0)
+        self._limits = lower - extension, upper + extension
         self._power = np.array([column.power for column in columns], np.int64)
         self._during = np.array([_DURING.index(column.during) for column in columns], np.int64)
         self._orders = np.array([column.term.order for column in columns], np.int64)

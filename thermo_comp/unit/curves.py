@@ -38,7 +38,7 @@ class Curves:
         regimes, (lower, upper) = np.arange(2), self._t_range[:, :, 0]
         self._leads = np.where([lower > lower.min(), upper < upper.max()], 1 - regimes, regimes)
         self._ends = lower.min(), upper.max()
-        self._reaches = TANGENT_SPANS * (upper - lower)[self._leads][:, :, np.newaxis]
+        self._tangents_k = TANGENT_SPANS * (upper - lower)[self._leads][:, :, np.newaxis]
         biases = [axis.bias for axis in calibration.axes]
         deltas = [[axis.delta for axis in part.axes()] for part in sets]
         self._levels = np.add(biases, deltas)[:, :, np.newaxis]
@@ -78,7 +78,7 @@ class Curves:
 
     def _beyond(self, t: Floats) -> tuple[Floats, Floats]:
         """Return how far t [K] is below and above the ranges, up to the tangents' ends, (2, n)."""
-        (lower, upper), (below, above) = self._ends, self._reaches
+        (lower, upper), (below, above) = self._ends, self._tangents_k
         return hold(t - lower, -below, 0.0), hold(t - upper, 0.0, above)
 
     def unexplained(self, board: Floats) -> Floats:

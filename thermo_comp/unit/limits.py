@@ -63,8 +63,8 @@ def check_limits(calibration: Calibration, layout: ParameterLayout) -> None:
             effect = sum(abs(term.scale[k]) * size for term, size, is_used in terms if is_used)
             _check_scale(f'{regime}.{name}', _extremes(axis.scale_function, ends), effect)
         for name, at, axis in zip('xyz', calibration.axes, part.axes(), strict=True):
-            reached = _extremes(axis.bias_function, ends)
-            _check_bias(f'{regime}.{name}', at.bias + axis.delta, reached, limit)
+            extremes = _extremes(axis.bias_function, ends)
+            _check_bias(f'{regime}.{name}', at.bias + axis.delta, extremes, limit)
     if calibration.posterior is None:
         return
     calibration.posterior.check_size(layout.n_parameters)
@@ -95,25 +95,25 @@ def _check_axes(calibration: Calibration, limit: float) -> None:
             )
 
 
-def _check_bias(key: str, level: float, reached: tuple[float, float], limit: float) -> None:
+def _check_bias(key: str, level: float, extremes: tuple[float, float], limit: float) -> None:
     if abs(level) > limit:
         rule = f'keep bias plus delta within {limit:g} input units'
         raise broken(f'{key}.delta', rule, float(level))
-    smallest, largest = reached
+    smallest, largest = extremes
     if not math.isfinite(largest - smallest):
         raise ValueError(f'`{key}.bias_function` must be finite over its {_AROUND}')
     if max(-smallest, largest) > limit:
         raise ValueError(
             f'`{key}.bias_function` must stay within {limit:g} input units over its {_AROUND}, '
-            f'reaches {max(reached, key=abs):g}'
+            f'reaches {max(extremes, key=abs):g}'
         )
 
 
-def _check_scale(key: str, reached: tuple[float, float], effect: float) -> None:
+def _check_scale(key: str, extremes: tuple[float, float], effect: float) -> None:
     """Refuse a scale curve that, minus or plus the `effect` of all columns, leaves the limits."""
     for word, value, is_kept, limit in (
-        ('above', reached[0] - effect, operator.gt, SMALLEST_RELATIVE_SCALE),
-        ('below', reached[1] + effect, operator.lt, LARGEST_RELATIVE_SCALE),
+        ('above', extremes[0] - effect, operator.gt, SMALLEST_RELATIVE_SCALE),
+        ('below', extremes[1] + effect, operator.lt, LARGEST_RELATIVE_SCALE),
     ):
         if not is_kept(value, limit):
             raise ValueError(
