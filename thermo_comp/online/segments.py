@@ -189,12 +189,12 @@ class ThermalSide:
                 continue
             if name == BOARD_INPUT:
                 self.counters.n_board += 1
-                decides = not tracker.is_live(reading_ns, tracker.case)
+                is_leading = not tracker.is_live(reading_ns, tracker.case)
             else:
                 self.counters.n_case += 1
-                decides = name == self.inputs[1]
+                is_leading = name == self.inputs[1]
             regime = tracker.detector.regime
-            if decides and regime is not Regime.UNKNOWN:
+            if is_leading and regime is not Regime.UNKNOWN:
                 self.flags.append((reading_ns, regime is Regime.DYNAMIC))
 
     @property
