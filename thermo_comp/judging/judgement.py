@@ -44,7 +44,7 @@ class AxisShift:
 
 @dataclass(frozen=True)
 class Expectation:
-    """RMS error of windows, RMS error on data left out of the fit, RMS claimed sd [m/s^2]."""
+    """RMS error of windows and of data left out of the fit, RMS claimed sd [m/s^2]; or NaN."""
 
     found_rms: float
     expected_rms: float

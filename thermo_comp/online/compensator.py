@@ -79,10 +79,10 @@ class CompensatorStatus:
     is_board_lost: bool = True
     is_case_lost: bool = True
     excess: Excess = Excess(0.0, 0.0, 0.0, 0.0)  # noqa: RUF009 - it is immutable
-    #: Whether in a ramp the board temperature changes before that of the case: swapped topics.
+    #: Whether the board temperature leads that of the case in a ramp, as with swapped topics.
     is_lead_reversed: bool = False
     gravity: GravityResidual | None = None  # residual at rest, or None before the first rest
-    #: Whether nothing is published because |f| - g at rest exceeded the tolerance plus 5 sd.
+    #: Whether nothing is published, as the error of |f| at rest exceeds the tolerance plus 5 sd.
     is_refuted: bool = False
     #: Sd of the corrected angular rate's bias on each axis [rad/s]; empty without a gyroscope.
     rate_bias_sd: tuple[float, ...] = ()
@@ -332,7 +332,6 @@ class Compensator:
         thermal = self.thermal
         tracker = thermal.tracker
         detector, gravity = tracker.detector, self.gravity
-        rate_correction, rate_line = thermal.rate_correction, self.rate_line
         stamp_ns = tracker.updated_ns if self.now_ns is None else self.now_ns
         ahead_s = 0.0 if stamp_ns is None else thermal.queue.ahead(stamp_ns)
         faults = {name: check.finding for name, check in tracker.checks.items()}
@@ -353,6 +352,10 @@ class Compensator:
                 faults[name] = Fault.COPY, 0.0
         if loose_k and faults[BOARD_INPUT][0] in (Fault.NONE, Fault.SHIFTED):
             faults[BOARD_INPUT] = Fault.LOOSE, loose_k
+        rate_bias_sd: tuple[float, ...] = ()
+        if thermal.rate_correction is not None and self.rate_line:
+            variances = [self.rate_line[place] for place in VARIANCES]
+            rate_bias_sd = thermal.bias_sd(thermal.rate_correction, variances)
         return CompensatorStatus(
             stamp_ns,
             faults,
@@ -370,9 +373,7 @@ class Compensator:
             tracker.lead.is_reversed,
             gravity.result,
             gravity.is_refuted,
-            thermal.bias_sd(rate_correction, [rate_line[place] for place in VARIANCES])
-            if rate_correction is not None and rate_line
-            else (),
+            rate_bias_sd,
         )
 
     @property
