@@ -183,6 +183,16 @@ def test_a_sample_with_a_stamp_20_s_ahead_is_dropped_unless_the_next_stamp_agree
         assert compensator.counters.n_time_jumps == 0
 
 
+@pytest.mark.parametrize('run', [lambda *given: stream(*given)[1], lambda *a: [*batch(*a).index]])
+def test_a_stamp_ahead_before_a_jump_back_does_not_confirm_a_stamp_ahead_after_the_jump(run):
+    # WHY: the second of two damaged stamps, with a jump back between them, reset the lags.
+    seconds = (100.0, 100.01, 3700.0, 90.0, 7300.0, 90.01)
+    samples = [('accel', round(at * 1e9), (k, 2.0, 3.0)) for k, at in enumerate(seconds)]
+    compensator = Compensator(calibration())
+    assert run(compensator, samples) == [0, 1, 3, 5]
+    assert compensator.counters.n_time_jumps == 1
+
+
 @pytest.mark.parametrize('is_read', [False, True])
 def test_a_reading_with_a_near_stamp_confirms_a_sample_20_s_ahead(is_read):
     compensator = Compensator(thermal_calibration())

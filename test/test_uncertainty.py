@@ -167,6 +167,16 @@ def sd_at(unit, board, behind=0.0, force=0.0):
     return math.sqrt(a - correction.noise[0] + b * force + c * force**2)
 
 
+def test_a_line_of_many_states_takes_one_noise_excess_for_all():
+    # `update` evaluates the states of all rests of a log at once, without an excess of noise.
+    correction = Correction(rich_calibration())
+    states = ramp_states(rich_calibration(), np.linspace(10.0, 30.0, 2049)).T
+    line = correction.line(states, states, np.zeros((N_ROWS, 2049)), 0.0)
+    last = correction.line(states[:, -1], states[:, -1], np.zeros(N_ROWS), 0.0)
+    assert line.shape == (52, 2049)
+    np.testing.assert_array_equal(line[:, -1], last)
+
+
 def test_outside_the_range_the_claimed_sd_is_that_of_curve_and_parts():
     # Outside of the range the claimed sd is that of the curve's slope, as if no lag cancelled it.
     parts = regime_set(axis_set((0.0, 0.5), residual_sd_m_s2=1e-6))

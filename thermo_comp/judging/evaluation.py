@@ -30,7 +30,7 @@ from .windows import WINDOW_S, corrected_windows, sum_length
 
 # Largest accepted ratio of a unit's scatter at rest to the noise that its calibration states.
 _LARGEST_NOISE_RATIO = 4.0
-# Calibrated noise of a sample [sd / step of the samples] above which constant samples in a rest
+# Sd of the calibrated noise of a sample / converter step, above which constant samples in a rest
 # are a fault.
 _DEAD_NOISE = 0.5
 
@@ -60,13 +60,13 @@ def open_bags(
     in kelvins, or lacks a board temperature that is needed.
     """
     require: tuple[Role, ...] = ('board',)
-    known: dict[str, Any] = {}
+    limits: dict[str, Any] = {}
     if calibrations:
         unit, require = calibrations[0].unit, needed_roles(*calibrations)
         topics = topics_for(calibrations[0], topics)
         density = max(calibrations[0].noise_density_m_s2_sqrt_hz) / STANDARD_GRAVITY
         noise = _LARGEST_NOISE_RATIO / np.sqrt(unit.cycle_time_s) * density
-        known = {'full_scale': unit.full_scale, 'still_sd': max(STILL_SD, noise)}
+        limits = {'full_scale': unit.full_scale, 'still_sd': max(STILL_SD, noise)}
     bags: list[ReducedBag] = []
     for path in paths:
 
@@ -76,12 +76,12 @@ def open_bags(
         source, info = recording_source(
             path, topics, require=require, progress=report, force=force
         )
-        usual = {'full_scale': None if info.input == 'imu' else COUNTS_FULL_SCALE}
+        default = {'full_scale': None if info.input == 'imu' else COUNTS_FULL_SCALE}
         source = replace(source, sha256=digest(Path(path)))
-        for other, twin in zip(bags, paths, strict=False):
+        for other, other_path in zip(bags, paths, strict=False):
             if other.source.sha256 == source.sha256:
-                raise RecordingError(f'has the same content as {twin}: give only one', path)
-        bag = reduce_source(source, window_s=sum_length(window_s), **(usual | known))
+                raise RecordingError(f'has the same content as {other_path}: give only one', path)
+        bag = reduce_source(source, window_s=sum_length(window_s), **(default | limits))
         if 'board' in require and not len(bag.board.value):
             raise RecordingError(
                 'no reading of the board temperature, which the calibration needs: name the topic '
@@ -97,7 +97,7 @@ def open_bags(
 
 
 def _dead_axes(bag: ReducedBag, calibration: Calibration) -> str:
-    """Describe axes with constant samples in a rest, although noise exceeds the sample's step."""
+    """Describe axes with constant samples in a rest despite noise that would change them."""
     if not any(rest.sample_sd.any() for rest in bag.intervals):
         return ''  # a converter without visible noise: its step is unknown
     unit, density = calibration.unit, np.array(calibration.noise_density_m_s2_sqrt_hz)
@@ -105,8 +105,7 @@ def _dead_axes(bag: ReducedBag, calibration: Calibration) -> str:
     if unit.input == 'counts':
         noise *= [abs(axis.scale_factor) for axis in calibration.axes]
         step = max(step, 1.0)
-    usual = noise > _DEAD_NOISE * step
-    return '; '.join(axis.text for axis in constant_axes([bag], usual))
+    return '; '.join(axis.text for axis in constant_axes([bag], noise > _DEAD_NOISE * step))
 
 
 def judge_bags(
@@ -119,8 +118,8 @@ def judge_bags(
 ) -> Judgement | None:
     """Judge a calibration on bags; return None if no window was corrected."""
     windows = corrected_windows(bags, calibration, gravity=gravity, window_s=window_s)
-    known = {source.sha256 for source in calibration.provenance.sources if source.sha256}
-    is_seen = all(source.sha256 in known for bag in bags for source in bag.sources)
+    fitted = {source.sha256 for source in calibration.provenance.sources if source.sha256}
+    is_seen = all(source.sha256 in fitted for bag in bags for source in bag.sources)
     return judge(windows, calibration, tolerance, is_seen=is_seen) if len(windows) else None
 
 
@@ -210,13 +209,13 @@ def history_of(calibrations: Sequence[Calibration]) -> tuple[Epoch, ...]:
     Sort by date the calibrations with the serial number of the first given calibration. Only the
     first of several calibrations from the same bags is kept: they show no change in time.
     """
-    known: set[tuple[Source, ...]] = set()
+    seen: set[tuple[Source, ...]] = set()
     ordered: list[Calibration] = []
     for cal in calibrations:
         sources = cal.provenance.sources
-        if cal.unit.serial == calibrations[0].unit.serial and not (sources and sources in known):
+        if cal.unit.serial == calibrations[0].unit.serial and not (sources and sources in seen):
             ordered.append(cal)
-        known.add(sources)
+        seen.add(sources)
     ordered.sort(key=lambda cal: (cal.provenance.date, cal.provenance.created))
     epochs: list[Epoch] = []
     first = np.ones(3)

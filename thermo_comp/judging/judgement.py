@@ -25,8 +25,8 @@ from .windows import JudgedWindows
 _WIDE_CLAIM = 1e3 * MICRO_G
 #: Smallest significant shift or change of a constant, in standard deviations.
 SIGNIFICANT_SDS = 3.0
-# Smallest sd assumed for a misalignment [rad]; smallest relative sd of a position's mean |f|, and
-# smallest claimed sd of a window [m/s^2].
+# Smallest sd, to avoid a division by 0: of a misalignment [rad]; of the mean |f| / g of a
+# position, and of the |f| of a window [m/s^2].
 _SMALLEST_MISALIGNMENT_SD, _SMALLEST_NORM_SD = 1e-5, 1e-8
 # Number of consecutive windows that count as one observation: thermal residuals are correlated.
 _CORRELATED_WINDOWS = 6.0
@@ -44,7 +44,7 @@ class AxisShift:
 
 @dataclass(frozen=True)
 class Expectation:
-    """RMS error of windows and on data left out of the fit, RMS claimed sd [m/s^2], or NaN."""
+    """RMS error of windows and of data left out of the fit, RMS claimed sd [m/s^2]; or NaN."""
 
     found_rms: float
     expected_rms: float
@@ -167,7 +167,7 @@ def judge(
 def _expectations(
     windows: JudgedWindows, full: Section, provenance: Provenance
 ) -> dict[str, Expectation]:
-    """Compare |f| - g and the drift of the axes with those on data left out of the fit."""
+    """Compare |f| - g and the axes' drift with the errors of the fit on data left out of it."""
     inside = windows.select(windows.is_inside)
     drift = within_positions(inside.force, inside.position)
     found = float(np.sqrt(np.mean(drift**2))) if len(inside) else np.nan
@@ -178,7 +178,7 @@ def _expectations(
 
 
 def _ranges(celsius: Floats, k_min: Floats) -> str:
-    """Return the ranges of temperatures and of their rates as text."""
+    """Return the ranges of temperatures and of their rates [K/min] as text."""
     return (
         f'{np.min(celsius):.1f} to {np.max(celsius):.1f} degC and '
         f'{np.min(k_min):+.2f} to {np.max(k_min):+.2f} K/min'
@@ -190,12 +190,9 @@ def _verdict(judgement: Judgement, claims: bool, calibration: Calibration) -> tu
     full, outside, left_out = sections['all'], sections['outside'], judgement.left_out_rms
     if not full.n:
         judged = _ranges(windows.board, windows.rate * 60.0)
-        sets = calibration.static, calibration.dynamic
-        known = _ranges(
-            np.ravel([each_set.temperature_range_c for each_set in sets]),
-            np.ravel([each_set.rate_range_k_min for each_set in sets]),
-        )
-        text = f'{_windows(outside.n, windows)}, all at {judged}; calibrated at {known}'
+        edges = [(s.temperature_range_c, s.rate_range_k_min) for s in calibration.regime_sets()]
+        calibrated = _ranges(*map(np.array, zip(*edges, strict=True)))
+        text = f'{_windows(outside.n, windows)}, all at {judged}; calibrated at {calibrated}'
         return Verdict.OUTSIDE, f'{text}; {_numbers(outside)}'
     worst = max([s.rms for s in sections.regimes or [full]] + [judgement.headline_rms])
     ratio = sections.worst_ratio
@@ -283,8 +280,8 @@ def axis_shifts(
     residuals = np.concatenate(((sizes - 1.0) / sd, np.zeros(3)))
     shift = np.linalg.lstsq(rows, residuals, rcond=None)[0]
     # If residuals exceed the claimed errors, increase the sds of the bias and scale shifts.
-    freedom, left = len(sd) - 6, float(np.sum((residuals - rows @ shift) ** 2))
-    excess = max(1.0, left / freedom) if freedom > 0 else 1.0
+    n_free, chi_square = len(sd) - 6, float(np.sum((residuals - rows @ shift) ** 2))
+    excess = max(1.0, chi_square / n_free) if n_free > 0 else 1.0
     spread = np.sqrt(np.diag(np.linalg.pinv(rows.T @ rows)) * excess)
     bias, scale = (np.stack((shift[k], spread[k]), axis=1) for k in (slice(3), slice(3, 6)))
     return tuple(AxisShift(*row) for row in np.hstack((bias * gravity, scale)).tolist())

@@ -93,11 +93,9 @@ def sections_of(
 ) -> Sections:
     """Summarise the residuals of windows, shape (n,) or (n, axes), by section."""
     inside, dynamic = windows.is_inside, windows.is_dynamic
-    sections = Sections()
     rows_of = (inside & ~dynamic, inside & dynamic, inside, ~inside)
-    for name, rows in zip(SECTIONS, rows_of, strict=True):
-        sections[name] = _section(raw, residual, claimed, rows)
-    return sections
+    pairs = zip(SECTIONS, rows_of, strict=True)
+    return Sections({name: _section(raw, residual, claimed, rows) for name, rows in pairs})
 
 
 def by_force(windows: JudgedWindows, claimed: Floats) -> dict[float, Section]:

@@ -122,9 +122,8 @@ def corrected_windows(
     Build the windows of bags, corrected if there is a calibration; raises RecordingError if the
     sample rate is too low for windows of `window_s`.
     """
-    if calibration is not None:
-        gravity = calibration.gravity_m_s2 if gravity is None else gravity
-    gravity = np.nan if gravity is None else gravity
+    if gravity is None:
+        gravity = np.nan if calibration is None else calibration.gravity_m_s2
     table = _table(bags, calibration, window_s, gravity)
     raw, claimed_sd, noise_sd, lack_sd = table['mean'], *np.full((3, len(table)), np.nan)
     is_inside = table['excess'] <= _RANGE_TOLERANCE
@@ -134,9 +133,9 @@ def corrected_windows(
         raw = constants.force(raw)
         along = force / np.linalg.norm(force, axis=1, keepdims=True) @ constants.misalignment
         noise = along**2 @ np.array(correction.noise)
-        # A mean has no rounding noise: the converter adds the remainder to the next sample.
+        # The mean has no rounding noise: a converter adds the remainder to the next sample.
         white = along**2 @ np.square(calibration.noise_density_m_s2_sqrt_hz)
-        # A higher sample rate increases the noise of a sample: the mean's noise does not decrease.
+        # A higher sample rate raises the noise of each sample: the noise of the mean stays equal.
         covered_s = np.minimum(calibration.unit.cycle_time_s * table['count'], window_s)
         mean_white = white / covered_s
         variance = np.maximum(table['variance'] - noise, 0.0) + mean_white
@@ -149,6 +148,7 @@ def corrected_windows(
         lack_sd = np.sqrt(np.sum(along**2 * lack.T, axis=1))
         known = calibration.nonlinearity
         is_inside &= table['size'] <= (known.force_range_m_s2[1] if known else AT_REST * gravity)
+    copied = (*_ONCE, 'time', 'board', 'rate', 'size', *_TRIPLES, 'gyro')
     return JudgedWindows(
         window_s=window_s,
         gravity=gravity,
@@ -159,10 +159,7 @@ def corrected_windows(
         claimed_sd=claimed_sd,
         noise_sd=noise_sd,
         lack_sd=lack_sd,
-        **{
-            name: table[name]
-            for name in (*_ONCE, 'time', 'board', 'rate', 'size', *_TRIPLES, 'gyro')
-        },
+        **{name: table[name] for name in copied},
     )
 
 
@@ -190,8 +187,8 @@ def columns_of(windows: JudgedWindows, bags: Sequence[str]) -> dict[str, npt.NDA
 
 # A structured array of partial sums of samples, or of windows.
 _Table: TypeAlias = npt.NDArray[Any]
-# Integer fields of a window: `count` is the total of the partial sums, the rest is copied from the
-# first partial sum. Fields in `_AVERAGED` and `_TRIPLES` are means over a window's partial sums.
+# Integer fields of a window: `count` is the total over the window's partial sums, the others are
+# copied from the first partial sum. Fields in `_AVERAGED` and `_TRIPLES` are means over the sums.
 _ONCE = ('bag', 'position', 'start_ns', 'count')
 _AVERAGED = (
     *('time', 'board', 'rate', 'weight', 'unknown'),
@@ -216,8 +213,8 @@ def _table(
     parts: list[_Table] = [np.zeros(0, kind)]
     n_positions = 0
     for number, bag in enumerate(bags):
-        per = max(1, round(window_s / bag.window_s))
-        if abs(per * bag.window_s - window_s) > 1e-6 * window_s:
+        per_window = max(1, round(window_s / bag.window_s))
+        if abs(per_window * bag.window_s - window_s) > 1e-6 * window_s:
             raise RecordingError(
                 f'the sample rate is too low for windows of {window_s:g} s: give --window as '
                 f'{bag.window_s:g} s or a multiple of it',
@@ -225,12 +222,12 @@ def _table(
             )
         sums: list[_Table] = [np.zeros(0, kind)]
         for rest in bag.intervals:
-            n = rest.n_whole // per * per
+            n = rest.n_whole // per_window * per_window
             rows = np.zeros(n, kind)
             rows['bag'], rows['position'] = number, n_positions
             # In a recording of several bags the grid of the windows shifts where a bag ends.
-            number_of = np.rint((rest.time[:n] - rest.begin_s) / bag.window_s - 0.5)
-            begin_s = rest.begin_s + bag.window_s * number_of
+            index = np.rint((rest.time[:n] - rest.begin_s) / bag.window_s - 0.5)
+            begin_s = rest.begin_s + bag.window_s * index
             rows['start_ns'] = bag.start_ns + np.rint(begin_s * 1e9).astype(np.int64)
             rows['count'], rows['time'] = rest.count[:n], rest.time[:n]
             rows['mean'] = rest.mean[:n]
@@ -252,10 +249,10 @@ def _table(
             whole['force'] = whole['mean']
         else:
             _correct(calibration, bag, whole)
-        # Drop partial sums with lost messages, or cut by the end of the bag.
+        # A partial sum with lost messages, or cut by the end of the bag, is not used.
         few = _LEAST_FILLED * np.median(whole['count']) if len(whole) else 0.0
         whole['excess'][whole['count'] < few] = np.nan
-        parts.append(_joined(whole.reshape(-1, per)))
+        parts.append(_joined(whole.reshape(-1, per_window)))
     return np.concatenate(parts)
 
 

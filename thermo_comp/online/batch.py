@@ -58,7 +58,7 @@ class CompensatedBlock:
 def process_block(
     compensator: Compensator, block: Block, angular_rate: Floats | None = None
 ) -> CompensatedBlock:
-    """Correct a block's samples and rates (n, 3); the result equals `process` bit for bit."""
+    """Correct a block's samples and angular rates, (n, 3), with the bits of `process`."""
     thermal = compensator.thermal
     stamps = np.asarray(block.accel_stamp_ns, dtype=np.int64)
     samples = np.asarray(block.accel, dtype=np.float64)
@@ -108,7 +108,7 @@ def _runs(compensator: Compensator, stamps: Stamps, arrivals: _Arrivals) -> list
             compensator.reading_ns = max(compensator.reading_ns, waiting.pop()[3])
         if stamp_ns <= last_ns - TIME_JUMP_NS:
             runs.append([])
-            compensator.reading_ns = EVER_NS
+            compensator.reading_ns, compensator.leapt_ns = EVER_NS, None
         elif stamp_ns <= last_ns or compensator.is_leap(stamp_ns):
             continue
         runs[-1].append(number)
@@ -126,8 +126,8 @@ def _push(
     while arrivals and arrivals[-1][0] <= place:
         _, _, name, stamp_ns, celsius = arrivals.pop()
         if len(thermal.queue) >= PENDING_LIMIT:
-            # As in the node without samples, a full queue is applied up to `DISORDER_NS` before
-            # the new reading; after a first sample it is applied up to `due_ns` at most.
+            # A full queue is applied up to `DISORDER_NS` before the new reading, as the node does
+            # while no samples come, but after the first sample not beyond `due_ns`.
             limit_ns = NEVER_NS if compensator.now_ns is None else due_ns
             thermal.flush(min(limit_ns, stamp_ns - DISORDER_NS))
         thermal.push(name, stamp_ns, celsius)
@@ -215,12 +215,11 @@ def _apply(
 
 def _lines(model: Model, segments: Segments) -> tuple[Floats, Floats, Bools]:
     """Evaluate `Model.lines`, with the slowly varying variance once for each `SlowState`."""
-    each = [segment for segment, _ in segments]
-    held = {id(segment.slow): segment.slow for segment in each}
-    places = {key: place for place, key in enumerate(held)}
-    slow = model.slow_rows([*held.values()])[:, [places[id(segment.slow)] for segment in each]]
-    start, end = (np.array([segment[at] for segment in each]).T for at in (4, 5))
-    return model.lines(start, end, slow, np.array([segment.noise_excess for segment in each]))
+    _, _, _, excess, start, end, slow = zip(*(segment for segment, _ in segments), strict=True)
+    distinct = {id(state): state for state in slow}
+    places = {key: place for place, key in enumerate(distinct)}
+    rows = model.slow_rows([*distinct.values()])[:, [places[id(state)] for state in slow]]
+    return model.lines(np.transpose(start), np.transpose(end), rows, np.array(excess))
 
 
 def _corrected(
@@ -258,23 +257,24 @@ def _judge(
     counts = np.array([count for _, count in segments])
     first = np.cumsum(counts) - counts
     rows = force[:, first][_SAMPLE].T.tolist()
-    looks = zip(segments, first.tolist(), stamps[first].tolist(), rows, strict=True)
-    held = _REFUTED if compensator.is_refusing else 0
-    for (segment, count), begin, stamp_ns, row in looks:
-        # The check of |f| uses the first sample of a new segment, if valid, even if not published.
+    pieces = zip(segments, first.tolist(), stamps[first].tolist(), rows, strict=True)
+    # Reason for which all samples of a segment are dropped, or 0.
+    reason = _REFUTED if compensator.is_refusing else 0
+    for (segment, count), begin, stamp_ns, row in pieces:
+        # The check of |f| uses the first sample of a new segment if it is valid, even if dropped.
         is_bad = bool(reasons[begin])
         if segment.is_too_fast:
-            held = _TOO_FAST
+            reason = _TOO_FAST
         elif segment.is_new:
-            held = _REFUTED if gravity.is_refuted else 0
+            reason = _REFUTED if gravity.is_refuted else 0
             if not is_bad and gravity.wants(stamp_ns):
                 before = samples[begin - 1].tolist() if begin else last
                 rough = roughness(samples[begin].tolist(), before, compensator.scales)
                 gravity.add(stamp_ns, row[:3], row[3:], trace, rough)
-        if held:
-            is_counted = is_bad and segment.is_new and held == _REFUTED
-            reasons[begin + is_counted : begin + count] = held
-    compensator.is_refusing = bool(held)
+        if reason:
+            keeps_first = is_bad and segment.is_new and reason == _REFUTED
+            reasons[begin + keeps_first : begin + count] = reason
+    compensator.is_refusing = bool(reason)
     n_out, *n_dropped = np.bincount(reasons, minlength=1 + len(DROPPED)).tolist()
     counters = compensator.counters
     counters.n_out += n_out

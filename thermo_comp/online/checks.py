@@ -22,7 +22,7 @@ from ..thermal.reading_queue import NEVER_NS
 from ..typing import Bools, Floats, Ints
 from .status import GravityResidual
 
-#: Smallest number of repeats of a reading at which, after the time-out, an axis counts as stuck.
+#: An axis counts as stuck after the time-out only if it repeated its reading this number of times.
 STUCK_SAMPLES: Final = 50
 #: Change of both other axes [m/s^2] at which an axis that repeats its reading counts as stuck: the
 #: change in a turn by 1.2 degrees, above the noise and the steps of a converter at rest.
@@ -59,7 +59,7 @@ MEMORY_WINDOWS: Final = 30.0
 #: Number of consecutive still windows that refute a calibration, and that restore it.
 REFUTING_WINDOWS: Final = 3
 RESTORING_WINDOWS: Final = 2
-#: Time at rest after a step of |f|, after which the step is judged [ns].
+#: Time at rest between a step of |f| and the judgement of the step [ns].
 STEP_NS: Final = 300_000_000
 #: An error of |f| after motion is due to the platform's acceleration, as in a coordinated turn, if
 #: the force has turned by less than this angle [rad] and at most this time [ns] has passed since
@@ -79,7 +79,7 @@ Run: TypeAlias = tuple[tuple[float, float, float, int], int, float, int, float]
 
 class StuckCheck:
     """
-    Counts consecutive equal readings of each axis; with a `timeout_s` of 0 s, nothing is stuck.
+    Counts consecutive equal readings of each axis; with a `timeout_s` of 0 s, no sample is stuck.
 
     Samples are stuck if all three axes repeat their readings for over `timeout_s`. One axis alone
     is stuck if it repeats its reading for over `timeout_s` while both other axes change by over
@@ -98,10 +98,10 @@ class StuckCheck:
         self.runs: tuple[Run, ...] = ()
 
     def again(self, stamp_ns: int, x: float, y: float, z: float) -> bool:
-        """Take a sample that repeats a reading of an axis; return whether the sample is stuck."""
+        """Return whether a sample that repeats the reading of one axis or more is stuck."""
         last = self.last
         self.last = sample = (x, y, z, stamp_ns)
-        of_x, of_y, of_z = self.runs or _begun(last)
+        of_x, of_y, of_z = self.runs or (_begun(last),) * 3
         new = sample, 0, 0.0, 0, math.inf
         self.runs = runs = (
             self._continued(of_x, sample, last, 1, 2) if x == last[0] else new,
@@ -147,7 +147,7 @@ class StuckCheck:
         changes = np.empty((3, n), dtype=np.bool_)
         changes[:, 0] = columns[:, 0] != self.last[:3]
         changes[:, 1:] = columns[:, 1:] != columns[:, :-1]
-        runs = list(self.runs or _begun(self.last))
+        runs = list(self.runs or (_begun(self.last),) * 3)
         are_long = np.zeros((3, n), dtype=np.bool_)
         is_stuck = np.zeros(n, dtype=np.bool_)
         for axis, run in enumerate(runs):
@@ -157,11 +157,9 @@ class StuckCheck:
             is_judged[-1] = True
             spans = zip(begins[is_judged].tolist(), ends[is_judged].tolist(), strict=True)
             for begin, end in spans:
+                begun = run
                 if begin >= 0:
-                    first = (*samples[begin].tolist(), int(stamps[begin]))
-                    begun: Run = first, 0, 0.0, 0, math.inf
-                else:
-                    begun = run
+                    begun = _begun((*samples[begin].tolist(), int(stamps[begin])))
                 here = slice(max(begin, 0), end)
                 equal = np.arange(here.start - begin, end - begin)
                 is_long = (equal >= STUCK_SAMPLES) & (stamps[here] - begun[0][3] > self.limit_ns)
@@ -169,9 +167,8 @@ class StuckCheck:
                 is_noisy = (n_noisy >= NOISY_CHANGES) & (step <= self._visible[axis])
                 are_long[axis, here] = is_long
                 is_stuck[here] |= is_long & ((moved > self.motion) | is_noisy)
-                runs[axis] = (
-                    begun[0], end - 1 - begin, moved.item(-1), n_noisy.item(-1), step.item(-1)
-                )  # fmt: skip
+                latest = moved.item(-1), n_noisy.item(-1), step.item(-1)
+                runs[axis] = (begun[0], end - 1 - begin, *latest)
         self.last, self.runs = (*samples[-1].tolist(), int(stamps[-1])), tuple(runs)
         is_stuck |= are_long.all(axis=0)
         if self.is_on:
@@ -202,9 +199,9 @@ class StuckCheck:
         return most_moved, counts, np.minimum.accumulate(np.append(step, steps))[1:]
 
 
-def _begun(sample: tuple[float, float, float, int]) -> tuple[Run, ...]:
-    """Return a new run of equal readings for each of the three axes, begun by `sample`."""
-    return ((sample, 0, 0.0, 0, math.inf),) * 3
+def _begun(sample: tuple[float, float, float, int]) -> Run:
+    """Return a new run of equal readings of an axis, begun by `sample`."""
+    return sample, 0, 0.0, 0, math.inf
 
 
 class RateCheck:
@@ -226,7 +223,7 @@ class RateCheck:
         return excess if excess > RATE_TOLERANCE else 0.0
 
     def update(self, n_seen: int, stamp_ns: int) -> None:
-        """Update the sample rate by the number of samples so far and the latest stamp [ns]."""
+        """Update the sample rate from the number of samples so far and the latest stamp [ns]."""
         last = self._last
         self._last = (n_seen, stamp_ns)
         if last is None:
@@ -234,8 +231,8 @@ class RateCheck:
             return
         n, dt = n_seen - last[0], (stamp_ns - last[1]) * 1e-9
         level = self._level + n - LARGEST_RATE * dt / self._cycle_s
-        # Count at most twice the allowed number of excess samples, so that the alarm ends soon
-        # after a long excess.
+        # The number of excess samples is limited to twice the allowed number, so that the alarm
+        # ends soon after a long excess.
         self._level = min(max(level, 0.0), 2.0 * self._allowance)
         self.is_too_fast = self._counts_cycles and self._level > self._allowance
         n, dt = n_seen - self._window[0], (stamp_ns - self._window[1]) * 1e-9
@@ -267,8 +264,8 @@ class GravityCheck:
         self._tolerance = tolerance or math.inf
         # Whether |f| in the last still windows refutes the calibration.
         self.is_refuted = False
-        self._n_agreeing = 0
-        self._is_against = False
+        self._is_against = False  # whether |f| of the last still window was beyond the limit
+        self._n_agreeing = 0  # number of successive still windows with equal `_is_against`
         self._forces: list[Sequence[float]] = []
         #: Forces of the samples after a step of |f|, and the stamp of the first such sample [ns].
         self._off: list[Sequence[float]] = []
@@ -280,7 +277,7 @@ class GravityCheck:
         #: in which the platform accelerated; whether a window has not been still since.
         self._agreed: tuple[list[float], int] | None = None
         self._has_moved = False
-        self._weight = 0.0
+        self._weight = 0.0  # sum of the weights of the windows averaged in `result`
         # Residual of |f|, or None before the first still window.
         self.result: GravityResidual | None = None
 
@@ -322,8 +319,8 @@ class GravityCheck:
         rough: float,
     ) -> None:
         """Refute the calibration if, after a step, |f| at rest differs from g for `STEP_NS`."""
-        rests = self.result and self.result.is_still and self._last_mean
-        if self.is_refuted or not (self._off or rests):
+        is_still = self.result and self.result.is_still and self._last_mean
+        if self.is_refuted or not (self._off or is_still):
             self._off, self._is_resting = [], False
             return
         # Largest difference of two samples at rest: `LARGEST_CHANGE` + 4 sd of the difference.
@@ -392,7 +389,7 @@ class GravityCheck:
         self.result = GravityResidual(residual, sd, n + 1, is_still=True)
 
     def _is_accelerated(self, mean: Sequence[float], size: float) -> bool:
-        """Whether an acceleration of the platform along the force may explain a wrong |f|."""
+        """Whether an acceleration of the platform may explain the |f| of a window, `size`."""
         if self.is_refuted or self._agreed is None or not self._has_moved:
             return False
         agreed, agreed_ns = self._agreed

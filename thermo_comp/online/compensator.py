@@ -63,7 +63,7 @@ class CompensatorStatus:
     """State of a compensator at the stamp of its last sample."""
 
     stamp_ns: int | None
-    #: Fault of each thermometer; size of a rejected step, or excess of a loose thermometer [K].
+    #: Fault of each thermometer, and size of a rejected step or excess of a loose thermometer [K].
     faults: Mapping[str, tuple[Fault, float]]
     #: Time from the last sample to the latest queued temperature reading [s].
     pending_ahead_s: float
@@ -72,17 +72,17 @@ class CompensatorStatus:
     regime: Regime = Regime.UNKNOWN
     direction: int = 0  # temperature change: -1 cooling, +1 heating, 0 neither
     is_settled: bool = False  # whether the unknown initial lag states have decayed
-    #: Time from the last used reading of board or case to the last sample [s]; inf without one.
+    #: Time from the last used reading of board or case to the last sample [s]; inf: none used.
     board_age_s: float = math.inf
     case_age_s: float = math.inf
     is_board_stale: bool = True
     is_board_lost: bool = True
     is_case_lost: bool = True
     excess: Excess = Excess(0.0, 0.0, 0.0, 0.0)  # noqa: RUF009 - it is immutable
-    #: Whether the board temperature changes before that of the case in a ramp: topics swapped?
+    #: Whether the board temperature leads that of the case in a ramp, as with swapped topics.
     is_lead_reversed: bool = False
     gravity: GravityResidual | None = None  # residual at rest, or None before the first rest
-    #: Whether |f| at rest misses gravity by over tolerance plus 5 sd: then nothing is published.
+    #: Whether nothing is published, as the error of |f| at rest exceeds the tolerance plus 5 sd.
     is_refuted: bool = False
     #: Sd of the corrected angular rate's bias on each axis [rad/s]; empty without a gyroscope.
     rate_bias_sd: tuple[float, ...] = ()
@@ -119,24 +119,20 @@ class Compensator:
         self.leap_ns = max(LEAP_NS, round(LEAP_CYCLES * 1e9 * calibration.unit.cycle_time_s))
 
     def _stuck_check(self) -> StuckCheck:
-        scales = [abs(axis.scale_factor) for axis in self.calibration.axes]
-        noise_sds = [
-            scale * density / math.sqrt(self.calibration.unit.cycle_time_s)
-            for scale, density in zip(
-                scales, self.calibration.noise_density_m_s2_sqrt_hz, strict=True
-            )
-        ]
+        scales, root_s = list(map(abs, self.scales)), math.sqrt(self.calibration.unit.cycle_time_s)
+        pairs = zip(scales, self.calibration.noise_density_m_s2_sqrt_hz, strict=True)
+        noise_sds = [scale * density / root_s for scale, density in pairs]
         return StuckCheck(self.config.stuck_timeout_s, MOTION * max(scales), noise_sds)
 
     @property
     def _gravity_settings(self) -> tuple[float, float]:
-        """Gravity and the tolerance of |f| [m/s^2]."""
+        """Gravity, and the tolerance of |f| about gravity [m/s^2]."""
         gravity = self.config.local_gravity_m_s2 or self.calibration.gravity_m_s2
         return gravity, self.config.gravity_tolerance_m_s2
 
     def push(self, name: str, stamp_ns: int, celsius: float) -> None:
         """
-        Queue a reading [degC]; a thermometer that the calibration lacks has no effect.
+        Queue a reading [degC]; readings of thermometers that the calibration lacks are ignored.
 
         At most 4096 readings wait for a sample with an equal or later stamp. If more wait, the
         older half is dropped and counted as rejected.
@@ -209,7 +205,7 @@ class Compensator:
         """Correct and check the first sample after a reading or the end of a segment."""
         if stamp_ns <= self.last_ns - TIME_JUMP_NS:
             self.jump_back(stamp_ns)
-            self.reading_ns = EVER_NS
+            self.reading_ns, self.leapt_ns = EVER_NS, None
         elif stamp_ns <= self.last_ns or self.is_leap(stamp_ns):
             self.counters.n_out_of_order += 1
             return None
@@ -218,7 +214,7 @@ class Compensator:
         fresh_ns = thermal.fresh_until_ns
         if stamp_ns > fresh_ns:
             thermal.count_unmeasured(1)
-            # Until a board temperature arrives, every sample is counted as dropped by this branch.
+            # This branch drops and counts every sample until a fresh board temperature is used.
             self.event_ns = EVER_NS
             self.last_ns = stamp_ns
             return None
@@ -230,7 +226,7 @@ class Compensator:
         line, rate_line, is_good = thermal.model.lines(start, end, slow, excess)
         self.rate_line = rate_line.tolist()
         if not is_good:
-            # Each sample is dropped here while the correction is not finite.
+            # This branch drops and counts every sample while the correction is not finite.
             counters.n_unsound += 1
             self.event_ns, self.last_ns = EVER_NS, stamp_ns
             return None
@@ -242,7 +238,7 @@ class Compensator:
         if not is_new:
             return row
         if self.gravity.is_refuted and not is_too_fast:
-            # The check of |f| uses dropped samples, too: output resumes if |f| is gravity again.
+            # Dropped samples are checked, too: output resumes when |f| agrees with gravity.
             self.is_refusing = True
             if row is not None:
                 counters.n_out -= 1
@@ -356,6 +352,10 @@ class Compensator:
                 faults[name] = Fault.COPY, 0.0
         if loose_k and faults[BOARD_INPUT][0] in (Fault.NONE, Fault.SHIFTED):
             faults[BOARD_INPUT] = Fault.LOOSE, loose_k
+        rate_bias_sd: tuple[float, ...] = ()
+        if thermal.rate_correction is not None and self.rate_line:
+            variances = [self.rate_line[place] for place in VARIANCES]
+            rate_bias_sd = thermal.bias_sd(thermal.rate_correction, variances)
         return CompensatorStatus(
             stamp_ns,
             faults,
@@ -373,7 +373,7 @@ class Compensator:
             tracker.lead.is_reversed,
             gravity.result,
             gravity.is_refuted,
-            self._rate_bias_sd(),
+            rate_bias_sd,
         )
 
     @property
@@ -381,12 +381,6 @@ class Compensator:
         """Relative sd of each scale factor in the present segment; () before the first segment."""
         line = self._segment[1]
         return tuple(math.sqrt(max(0.0, line[place])) for place in SCALE_VARIANCES if line)
-
-    def _rate_bias_sd(self) -> tuple[float, ...]:
-        correction, line = self.thermal.rate_correction, self.rate_line
-        if correction is None or not line:
-            return ()
-        return self.thermal.bias_sd(correction, [line[place] for place in VARIANCES])
 
 
 def corrected(

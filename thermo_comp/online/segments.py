@@ -83,9 +83,9 @@ class Model:
             self.uncertainty.append(SlowUncertainty(triad, self.rate_correction))
         self.inputs = (BOARD_INPUT, *calibration.sensors)
 
-    def slow_rows(self, held: Sequence[SlowState]) -> Floats:
+    def slow_rows(self, slow: Sequence[SlowState]) -> Floats:
         """Return the slowly varying variances: `n_slow` rows of force, then those of the rate."""
-        states, shares, rates = (np.array(part).T for part in zip(*held, strict=True))
+        states, shares, rates = (np.array(part).T for part in zip(*slow, strict=True))
         return np.concatenate([part.at(states, shares, rates) for part in self.uncertainty])
 
     def lines(
@@ -140,8 +140,8 @@ class ThermalSide:
     def _tracker_config(self) -> tuple[ThermalConfig, float, tuple[float, float]]:
         gentle_s = self.correction.gentle_transition(self.config.transition_time_s)
         config = replace(self.config, transition_time_s=gentle_s)
-        unit = self.calibration
-        return config, unit.board_lag_s, unit.rest_gradient_range_k or ANY_RANGE
+        calibration = self.calibration
+        return config, calibration.board_lag_s, calibration.rest_gradient_range_k or ANY_RANGE
 
     def take_over(self, model: Model, config: CompensatorConfig, now_ns: int | None) -> None:
         """Use `model` and `config` from now on; copy objects shared with another compensator."""
@@ -149,11 +149,10 @@ class ThermalSide:
         unit, rate = self.calibration.unit, copy(self.rate)
         self._use(model, config)
         if self.calibration.unit == unit:
-            # With a new calibration of the same unit, output stopped by the rate check stays off.
+            # A new calibration of the same unit does not resume output stopped by the rate check.
             self.rate = rate
         self.queue.keep(lambda entry: entry[2] in self.inputs)
-        is_same = self.calibration.detector == old.settings
-        if is_same and self.correction.memory == old.spec:
+        if (model.calibration.detector, model.correction.memory) == (old.settings, old.spec):
             self.tracker = copy(old)
             self.tracker.reconfigure(*self._tracker_config(), now_ns)
             return
@@ -174,22 +173,6 @@ class ThermalSide:
             for dropped in self.queue.push(name, stamp_ns, celsius):
                 self._count_rejected(dropped)
 
-    def _apply(self, name: str, stamp_ns: int, celsius: float) -> None:
-        self._n_applied += 1
-        tracker = self.tracker
-        if not tracker.read(name, stamp_ns, celsius):
-            self._count_rejected(name)
-            return
-        if name == BOARD_INPUT:
-            self.counters.n_board += 1
-            decides = not tracker.is_live(stamp_ns, tracker.case)
-        else:
-            self.counters.n_case += 1
-            decides = name == self.inputs[1]
-        regime = tracker.detector.regime
-        if decides and regime is not Regime.UNKNOWN:
-            self.flags.append((stamp_ns, regime is Regime.DYNAMIC))
-
     def _count_rejected(self, name: str) -> None:
         if name == BOARD_INPUT:
             self.counters.n_board_rejected += 1
@@ -198,8 +181,21 @@ class ThermalSide:
 
     def flush(self, stamp_ns: int) -> None:
         """Apply the waiting temperature readings up to a stamp."""
+        tracker = self.tracker
         for reading_ns, _, name, _, celsius in self.queue.due(stamp_ns):
-            self._apply(name, reading_ns, celsius)
+            self._n_applied += 1
+            if not tracker.read(name, reading_ns, celsius):
+                self._count_rejected(name)
+                continue
+            if name == BOARD_INPUT:
+                self.counters.n_board += 1
+                is_leading = not tracker.is_live(reading_ns, tracker.case)
+            else:
+                self.counters.n_case += 1
+                is_leading = name == self.inputs[1]
+            regime = tracker.detector.regime
+            if is_leading and regime is not Regime.UNKNOWN:
+                self.flags.append((reading_ns, regime is Regime.DYNAMIC))
 
     @property
     def is_unmeasured(self) -> bool:
@@ -239,8 +235,7 @@ class ThermalSide:
             self._segment_key = key
             self.rate.update(n_seen, stamp_ns)
         end_ns, last = start_ns + SEGMENT_NS, self._last_end
-        is_next = last is not None and last[:2] == key
-        start = last[2] if last is not None and is_next else self.sample(start_ns)
+        start = last[2] if last and last[:2] == key else self.sample(start_ns)
         end = self.sample(end_ns)
         self._last_end = (self._n_applied, end_ns, end)
         slow, rate = self._slow_at(start_ns, end), self.rate

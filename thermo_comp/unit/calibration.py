@@ -3,9 +3,11 @@
 """
 Owns the calibration of one unit: immutable dataclasses with the keys of the calibration file.
 
-Measurement model of axis i (equations 6 to 9 of Golovach 2016, which has no phi_j): N_i is the raw
-sample, ``t = T_board - T_ref``, w the weight of the dynamic regime (0..1), phi_j column j of the
-thermal response (`columns`), M the misalignment matrix, f the specific force::
+Measurement model of axis i (equations 6 to 9 of Golovach 2016, extended by the columns phi_j): N_i
+is the raw sample, ``t = T_board - T_ref``, w the weight of the dynamic set (0..1), phi_j column j
+of the thermal response (`columns`), M the misalignment matrix, f the specific force. delta and Fs
+are the offset and the curve of the bias, Fc is the curve of the scale; the index s marks the
+static set, d the dynamic set::
 
     bias  = bias_i + (1 - w) (delta_s + Fs_s(t)) + w (delta_d + Fs_d(t)) + sum_j bias_ji phi_j
     scale = K_i ((1 - w) Fc_s(t) + w Fc_d(t) + sum_j scale_ji phi_j)
@@ -103,8 +105,8 @@ class Axes:
 class AxisSet:
     """The curves of bias and scale of one axis in one regime."""
 
-    bias_function: Annotated[TemperatureFunction, 'Fs(t), input units; Fs(0) = 0.']
-    scale_function: Annotated[TemperatureFunction, 'Fc(t), dimensionless; Fc(0) = 1.']
+    bias_function: Annotated[TemperatureFunction, 'Fs(t): bias curve [input units]; Fs(0) = 0.']
+    scale_function: Annotated[TemperatureFunction, 'Fc(t): curve of relative scale; Fc(0) = 1.']
     delta: Annotated[float, 'Bias of this regime less `axes.bias`, at T_ref, input units.'] = 0.0
     residual_sd_m_s2: Annotated[
         float,
@@ -119,7 +121,7 @@ class AxisSet:
 
 @dataclass(frozen=True)
 class LackOfFit:
-    """Sd of the error of a regime's curves at a board temperature, besides the posterior's sd."""
+    """Sd of a regime's error at a board temperature, beyond the error that `posterior` states."""
 
     temperature_c: Annotated[Celsius, 'Board temperature of the entry [degC].']
     sd_m_s2: Annotated[
@@ -185,7 +187,7 @@ class Calibration:
     reference_temperature_c: Annotated[Celsius, 'Reference temperature T_ref; paper: 20 degC.']
     gravity_m_s2: Annotated[float, QUANTITIES['gravity'], 'Local gravity used by the fit.']
     gravity_sd_m_s2: Annotated[
-        float, QUANTITIES['deviation'], 'Sd of local gravity that `posterior` includes.'
+        float, QUANTITIES['deviation'], 'Sd of local gravity; `posterior` includes its effect.'
     ] = field(default=0.0, kw_only=True)
     axes: Axes
     static: Annotated[RegimeSet, 'Curves of the static regime (S = 0 in the paper).']
@@ -208,7 +210,7 @@ class Calibration:
         'Standard deviations of M[1][0], M[2][0], M[2][1], used if `posterior` is null.',
     ] = (0.0, 0.0, 0.0)
     sensors: Annotated[
-        tuple[str, ...], "Thermometers beside the board's; in a ramp the first leads the board."
+        tuple[str, ...], "Thermometers except the board's; in a ramp the board lags the first."
     ] = ('case',)
     response: Annotated[
         tuple[ResponseTerm, ...], QUANTITIES['columns'], 'Columns of the thermal response.'
@@ -226,8 +228,8 @@ class Calibration:
     ] = None
     soak_gradient_k: Annotated[
         tuple[_Kelvin, _Kelvin] | None,
-        'T_s - T_board of the first sensor s in a soak, due to self-heating, and its sd; null: '
-        'unknown, taken as 0. Certificates and exported files include this self-heating.',
+        'T_s - T_board of the first sensor s in a soak, due to self-heating, and the sd of this '
+        'difference; null: unknown, taken as 0. Certificates and exported files include it.',
     ] = None
     detector: Annotated[
         DetectorSettings, 'Settings of the thermometers and of the regime detector.'

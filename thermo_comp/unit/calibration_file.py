@@ -3,8 +3,8 @@
 """
 Owns the calibration file, from YAML to a validated Calibration and back.
 
-Any bytes give a Calibration or a CalibrationError, which names the key of a wrong value: size,
-nesting and YAML features are limited before parsing ends (no aliases, tags or duplicate keys).
+Any bytes give a Calibration, or a CalibrationError that names the key of a wrong value. The size
+and nesting of a file are limited; YAML aliases, tags and duplicate keys are refused.
 """
 
 from pathlib import Path
@@ -27,7 +27,7 @@ SIZE_LIMIT = 1 << 23
 _HEADER = '# written by thermo_comp: the last line of a complete file is "..."'
 _END = '...'
 
-#: Former names of groups and kinds of columns, which files of version 0.2.0 may have.
+#: Names of groups and kinds of columns: name in files of version 0.2.0, and present name.
 _FORMER = {
     'now': 'gradient',
     'neighbour': 'gradient_lag',
@@ -35,7 +35,7 @@ _FORMER = {
     'even': 'gradient_even',
     'change': 'gradient_even_about_rest',
 }
-#: By section of a calibration file: name of a key in version 0.2.0, and its present name.
+#: For each section of a calibration file: a key's name in version 0.2.0, and its present name.
 _FORMER_KEYS = {'detector': ('closes', 'end_condition'), 'posterior': ('rest', 'diagonal')}
 
 
@@ -44,7 +44,7 @@ def load_calibration(path: str | Path) -> Calibration:
     Read and validate a calibration file.
 
     Raises CalibrationError, which names the file, if the file cannot be read, is not YAML of the
-    accepted kind, or has a wrong value; then the message also names key, value and expected value.
+    accepted kind, or has a wrong value, whose key the message names with the expected value.
     """
     try:
         content = read_bounded(path, SIZE_LIMIT)
@@ -87,19 +87,16 @@ def parse_calibration(content: bytes, path: str | Path | None = None) -> Calibra
 def _rename(data: dict[str, Any]) -> None:
     """Replace former keys and former names of columns in the values of a calibration file."""
     gyroscope = data.get('gyroscope')
-    for holder in (data, gyroscope):
+    for holder in (data, gyroscope) if isinstance(gyroscope, dict) else (data,):
         for name, (former, key) in _FORMER_KEYS.items():
-            section = holder.get(name) if isinstance(holder, dict) else None
+            section = holder.get(name)
             if isinstance(section, dict) and former in section and key not in section:
                 section[key] = section.pop(former)
-    lists = [data.get('response'), data.get('evidence')]
-    lists += [gyroscope.get('response')] if isinstance(gyroscope, dict) else []
-    for entries in lists:
-        for entry in entries if isinstance(entries, list) else ():
-            for key in ('group', 'kind') if isinstance(entry, dict) else ():
-                name = entry.get(key)
-                if isinstance(name, str) and name in _FORMER:
-                    entry[key] = _FORMER[name]
+        for entries in (holder.get('response'), holder.get('evidence')):
+            for entry in entries if isinstance(entries, list) else ():
+                for key in ('group', 'kind') if isinstance(entry, dict) else ():
+                    if isinstance(name := entry.get(key), str):
+                        entry[key] = _FORMER.get(name, name)
 
 
 def dump_calibration(calibration: Calibration) -> str:

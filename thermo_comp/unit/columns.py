@@ -5,13 +5,12 @@ Owns the columns of the thermal response: the regressors of bias and scale.
 
 A column is ``phi = u t^power r``. The value u is computed by the column's kind (`unit.terms`), t
 is the board temperature less the reference, and r is 1, 1 - w or w, with w the weight of the
-dynamic regime. u is limited to the column's range, and t to the calibrated temperatures. Outside
-the calibrated temperatures t^power is constant, though the curves over temperature first follow
-tangents: no recording determines the weights of columns there.
+dynamic set. u is limited to the column's range, and t to the calibrated temperatures, because no
+recording determines the weights of columns beyond them.
 
-The function `bank` makes the columns in groups of one kind or more. The group *part* has columns
-of the kinds board, square and cube, whose sum with a curve over the board temperature is a curve
-over the temperature of a part.
+The function `bank` makes the candidate columns of a fit. The group *part* has columns of the kinds
+board, square and cube, whose sum with a curve over the board temperature is a curve over the
+temperature of a part.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -42,8 +41,9 @@ BANK_TAUS: Final = FINE_TAUS[::2]
 EVEN_WIDTHS: Final = (0.375, 0.75, 1.5, 3.0, 6.0)
 PLAY_WIDTHS: Final = (0.4, 0.8, 1.6, 3.2, 6.4)
 PLAY_TAUS: Final[tuple[float, ...]] = (0.0, 450.0, 900.0, 1800.0)
-#: Kind bend: time constants [s]; least span of board temperatures per knee (change of slope) [K],
-#: or a third of it if `bank` gets `parts`; most knees per lag without and with `parts`.
+#: Kind bend: time constants [s]; smallest span of board temperatures per knee (change of slope)
+#: [K]; largest number of knees per lag. With the argument `parts`, `bank` makes up to
+#: `MOST_PART_KNEES` knees, and a third of the span suffices per knee.
 BEND_TAUS: Final = (0.0, *FINE_TAUS[4:11])
 LEAST_KNEE_K, MOST_KNEES, MOST_PART_KNEES = 1.0, 20, 60
 
@@ -125,7 +125,7 @@ class Column:
     ] = 'always'
     range: Annotated[
         tuple[_Value, _Value],
-        'Limits of the value of the formula of `kind`, before factors `power` and `during`.',
+        'Limits of the value of the formula in `kind`, without the factors `power` and `during`.',
     ] = field(kw_only=True)
 
     def __post_init__(self) -> None:
@@ -265,15 +265,16 @@ class ColumnTable:
         layout = StateLayout(memory)
         self.columns = tuple(columns)
         self._reference = reference_temperature
-        lower, upper = temperature_range_c
-        self._t_range = lower - reference_temperature, upper - reference_temperature
+        coldest, hottest = temperature_range_c
+        self._t_range = coldest - reference_temperature, hottest - reference_temperature
         ranges = np.array([column.range for column in columns])
         self._range = ranges.reshape(-1, 2).T[:, :, np.newaxis]
-        # Beyond their ranges columns are constant, but curves go on for a part of their width:
-        # a curve over the temperature of a part, which is a sum of bends, does so, too.
+        # Outside its range a column is constant. Curves over the board temperature continue for
+        # `TANGENT_SPANS` of their range, and so do curves over a part's temperature (bends).
         is_curve = np.array([c.term.is_temperature for c in columns], bool)[:, np.newaxis]
-        reach = np.where(is_curve, TANGENT_SPANS * (self._range[1] - self._range[0]), 0.0)
-        self._limits = self._range[0] - reach, self._range[1] + reach
+        lower, upper = self._range
+        extension = np.where(is_curve, TANGENT_SPANS * (upper - lower), 0.0)
+        self._limits = lower - extension, upper + extension
         self._power = np.array([column.power for column in columns], np.int64)
         self._during = np.array([_DURING.index(column.during) for column in columns], np.int64)
         self._orders = np.array([column.term.order for column in columns], np.int64)
@@ -304,7 +305,7 @@ class ColumnTable:
         return np.asarray((numbers - self._centres) / self._widths)
 
     def held(self, raw: Floats) -> Floats:
-        """Limit the values u of the columns to the values that the correction uses."""
+        """Limit the values u of the columns to their ranges, which are extended for bends."""
         return hold(raw, *self._limits)
 
     def beyond(self, raw: Floats) -> Floats:
@@ -312,7 +313,7 @@ class ColumnTable:
         return raw - hold(raw, *self._range)
 
     def excess(self, raw: Floats) -> Floats:
-        """Return how far each column is outside its range [half ranges], as if linear in T."""
+        """Return how far each u (for a power: its root) is outside its range [half ranges]."""
         lower, upper = self._range
         excess = np.asarray(np.abs(self.beyond(raw)) / ((upper - lower) / 2.0))
         for order in {*self._orders.tolist()} - {1}:
@@ -336,7 +337,7 @@ class ColumnTable:
 
     def slopes(self, states: Floats) -> tuple[Floats, Floats | None]:
         """
-        Differentiate each column's u, without limits, w.r.t. the state quantity of the column and,
+        Differentiate the unlimited u of each column w.r.t. the column's quantity of the state and,
         at constant lag, w.r.t. T_board (None if no column is a function of t - lag).
         """
         slopes, scaled = np.ones((len(self._places), states.shape[1])), self._scaled(states)

@@ -22,7 +22,7 @@ from ..thermal.state import BOARD, UNKNOWN, VAR_BOARD, WEIGHT, StateLayout
 from ..typing import Floats
 from .calibration import Calibration
 from .columns import ColumnTable, memory_of
-from .covariance import CONSTANTS, N_ROWS, CovarianceMap, grown, misalignment_variances
+from .covariance import CONSTANTS, N_ROWS, OF_MISALIGNMENT, CovarianceMap, grown
 from .curves import Curves
 from .functions import hold, in_order
 from .gravity import MICRO_G
@@ -48,7 +48,8 @@ VARIANCES = tuple(12 + place for place in CONSTANTS)
 #: Indices of the variances of the relative scale of the axes in a result of `Correction.line`: the
 #: coefficients of x^2 in xx, y^2 in yy, z^2 in zz.
 SCALE_VARIANCES = tuple(place + last for place, last in zip(VARIANCES, (2, 5, 9), strict=True))
-#: Number of thermal states above which a loop over the columns is faster than a sum over a table.
+#: Number of thermal states above which sums are computed in a loop over the columns, which is then
+#: faster than a sum over an array of all products.
 _FEW = 64
 #: Largest number of thermal states evaluated at once, to bound the memory.
 _CHUNK = 2048
@@ -60,7 +61,7 @@ class Excess(NamedTuple):
     temperature: float  # board temperature beyond the range of the present regime, signed [K]
     rate: float  # rate of the board temperature beyond this regime's range, signed [K/s]
     gradient: float  # excess of the gradient farthest outside its range, signed [K]
-    relative: float  # sum of the temperature's, rate's and worst column's excess [half ranges]
+    relative: float  # sum of the excesses of temperature, rate and worst column [half ranges]
 
 
 class Correction:
@@ -71,7 +72,7 @@ class Correction:
     noise: noise variance of one sample per axis, rounding of counts included [m^2/s^4]
     noise_trace: the sum of `noise`
     misalignment: elements yx, zx, zy of the misalignment matrix M
-    beyond: additional variance at forces beyond those of the fit
+    beyond: additional variance at forces above the largest force of the fit
     """
 
     def __init__(self, calibration: Calibration, memory: MemorySpec | None = None) -> None:
@@ -89,11 +90,15 @@ class Correction:
         self._W = weights.reshape(-1, 6).T[:, :, np.newaxis]
         self._is_present = (self._W[:3] != 0.0) | (self._W[3:] != 0.0)
         self._find_columns_of_pairs()
-        slopes = self.curves.slopes(settled := np.linspace(*self._span, _GAP_TEMPERATURES))
-        slopes += self._slopes_of_bends(settled)
+        settled = np.zeros((self.layout.width, _GAP_TEMPERATURES))
+        settled[BOARD] = np.linspace(*self._span, _GAP_TEMPERATURES)
+        slopes, (_, of_bends) = self.curves.slopes(settled[BOARD]), self.table.slopes(settled)
+        if of_bends is not None:
+            slopes += self._weigh(of_bends, np.zeros(slopes.shape[1:]))
+        # Sd of each set's slopes over temperature: rows for the bias, then rows for the scale.
         of_bias = np.arange(6)[:, np.newaxis] < 3
-        bends = slopes.std(axis=2, keepdims=True)
-        self._bends = np.concatenate((bends * of_bias, bends * ~of_bias))
+        sds = slopes.std(axis=2, keepdims=True)
+        self._slope_sds = np.concatenate((sds * of_bias, sds * ~of_bias))
         rounding = ROUNDING_VARIANCE if calibration.unit.input == 'counts' else 0.0
         cycle_s, densities = calibration.unit.cycle_time_s, calibration.noise_density_m_s2_sqrt_hz
         pairs = zip(densities, K, strict=True)
@@ -108,7 +113,7 @@ class Correction:
         self.of_force: ForceCorrection | None = None
         if calibration.nonlinearity is not None:
             self.of_force = ForceCorrection(calibration, calibration.nonlinearity, self._span)
-        #: Number of rows of the slowly varying error variance that `SlowUncertainty.at` returns.
+        #: Number of rows of the slowly varying error covariance that `SlowUncertainty.at` returns.
         self.n_slow = N_ROWS if self.of_force is None else N_ROWS + 15
 
     def _find_columns_of_pairs(self) -> None:
@@ -122,14 +127,6 @@ class Correction:
         self._signs = by_board[:, np.newaxis, np.newaxis]
         self._has_lags = any(isinstance(column.source, Lag) for column in self.table.columns)
         self._lagged = [layout.places[lag] for lag in layout.lags if lag.input == BOARD_INPUT]
-
-    def _slopes_of_bends(self, board: Floats) -> Floats:
-        """Differentiate the sums of bends w.r.t. settled board temperatures, shape (6, n)."""
-        states = np.zeros((self.layout.width, len(board)))
-        states[BOARD] = board
-        _, direct = self.table.slopes(states)
-        none = np.zeros((6, len(board)))
-        return none if direct is None else self._weigh(direct, none)
 
     def bias_scale(self, states: Floats) -> Floats:
         """Evaluate bias and scale of the three axes, shape (2, 3, n)."""
@@ -145,7 +142,6 @@ class Correction:
     def _weigh(self, columns: Floats, start: Floats) -> Floats:
         """Add ``W @ columns`` (W: weights) to `start`, shape (6, n), column by column."""
         if columns.shape[1] > _FEW:
-            # With many states the sums are computed without a table of intermediate values.
             total: Floats = start.copy()
             for weights, column in zip(self._W.swapaxes(0, 1), columns, strict=True):
                 total += weights * column
@@ -164,8 +160,8 @@ class Correction:
     def excess(self, state: Sequence[float], *, is_dynamic: bool) -> Excess:
         """Return how far a thermal state is outside the calibrated ranges."""
         states = np.array(state)[:, np.newaxis]
-        excess = (row[:, 0].tolist() for row in self.curves.excess(states))
-        over, too_fast, relative, by_rate = excess
+        rows = self.curves.excess(states)
+        over, too_fast, relative, by_rate = (row[:, 0].tolist() for row in rows)
         shares = 1.0 - state[WEIGHT], state[WEIGHT]
         curves = sum(w * (a + b) for w, a, b in zip(shares, relative, by_rate, strict=True))
         raw = self.table.raw(states)
@@ -198,16 +194,17 @@ class Correction:
         """
         Evaluate the correction in segments, linear in time between the states `start` and `end`.
 
-        `slow` is the slowly varying error covariance, shape (n_slow, n), see
-        `SlowUncertainty.at`. Returns (52,) or (52, n): for each axis bias, its change over the
-        segment, scale and its change; then the coefficients for `covariance.covariance_at`, noise
-        of a sample included. With a nonlinearity `slow` has 15 more rows, and the result ends with
-        K2, Kq, K3 of each axis and the coefficients of x^3 to x^6 in the variance of each axis.
+        `slow`: slowly varying error covariance, (n_slow, n), see `SlowUncertainty.at`;
+        `noise_excess`: relative increase of a sample's noise variance. Returns (52,) or (52, n):
+        for each axis bias, its change over the segment, scale and its change; then the
+        coefficients for `covariance.covariance_at`, noise of a sample included. With a
+        nonlinearity `slow` has 15 more rows, and the result ends with K2, Kq, K3 of each axis and
+        the coefficients of x^3 to x^6 in the variance of each axis.
         """
         ends = np.array((start, end), dtype=np.float64)
         n = ends[0, 0].size
         if n > _CHUNK:
-            columns = (*ends, np.asarray(slow), np.asarray(noise_excess))
+            columns = (*ends, np.asarray(slow), np.broadcast_to(noise_excess, n))
             cuts = range(_CHUNK, n, _CHUNK)
             parts = zip(*(np.split(column, cuts, axis=-1) for column in columns), strict=True)
             return np.hstack([self.line(*part) for part in parts])
@@ -229,7 +226,7 @@ class Correction:
         between = grown(slow[9:N_ROWS], growth)
         # The largest force that each axis can measure [m/s^2], and the error variance there.
         largest_force = (self._full_scale + np.abs(both[0, :, 0])) / np.abs(both[1, :, 0])
-        tilts = misalignment_variances(between).max(axis=0)
+        tilts = between[OF_MISALIGNMENT].max(axis=0)
         variance = v[:, 0] + largest_force * (np.abs(v[:, 1]) + largest_force * (v[:, 2] + tilts))
         smallest = _LEAST_SHARE * variance.max(axis=0)
         v[:, 0] += np.maximum(self._noise * (1.0 + np.asarray(noise_excess)), smallest)
@@ -255,22 +252,22 @@ class Correction:
         Evaluate a, b, c of each axis' error variance ``a + b x + c x^2``, (3, 3, n), without
         sample noise, and the factor (3, n) of this variance outside the calibrated ranges.
 
-        The difference of dynamic and static set (`gap`) is added as an error while the sets are
-        blended, outside the calibrated ranges, and while the regime is unknown. In an unknown
-        regime the variances due to T_board, residual and lack of fit are sums over both sets.
+        `gap`, the dynamic less the static set, is added as an error while the sets are blended,
+        outside the calibrated ranges, and while the regime is unknown. In an unknown regime the
+        variances due to T_board, residual and lack of fit are sums over both sets.
         """
         board, weight, unknown = states[BOARD], states[WEIGHT], states[UNKNOWN]
         static_weight, beyond_range = 1.0 - weight, self.table.beyond(raw)
         excess, _, relative, by_rate = self.curves.excess(states)
         if not self._has_lags:
-            # Lags contain the effect of the rate: its range counts only if no column has a lag.
+            # Lags describe the effect of the rate: without lags, the range of the rate counts.
             relative = relative + by_rate
         outside = static_weight * relative[0] + weight * relative[1]
         shares = np.array([static_weight + unknown * weight, weight + unknown * static_weight])
         variances = (shares * states[VAR_BOARD], states[self.layout.variances])
         by_source, direct = self.table.slopes(states)
         by_pair = self.by_pairs(by_source * factors[0])
-        # Columns depend on T_board by t^power, by gradients (T_s - T_board) and by lags.
+        # Columns depend on T_board through t^power, gradients (T_s - T_board) and lags.
         on_board = raw * factors[1]
         if direct is not None:
             on_board = on_board + direct * factors[0]
@@ -291,9 +288,9 @@ class Correction:
             # the curves at the edge of the range times the board's distance from the edge; sd of
             # the slopes in the range times the largest distance of board or part from the range.
             v += self._spread(shares * excess * excess, slopes)
-            bent = shares * np.maximum(excess * excess, parts_out * parts_out)
-            bends = np.broadcast_to(self._bends, (4, *slopes.shape[1:]))
-            v += self._spread(np.concatenate((bent, bent)), bends)
+            squares = shares * np.maximum(excess * excess, parts_out * parts_out)
+            slope_sds = np.broadcast_to(self._slope_sds, (4, *slopes.shape[1:]))
+            v += self._spread(np.concatenate((squares, squares)), slope_sds)
             # The posterior is valid within the calibrated ranges: outside, increase the variance
             # with the distance from the ranges.
             growth = 1.0 + (outside + columns_out) ** 2
@@ -305,16 +302,17 @@ class Correction:
             both = (np.full_like(weight, w) for w in (0.0, 1.0))
             of_static, of_dynamic = (self.table.factors(board, w)[0] for w in both)
             gap = self._weigh(held * (of_dynamic - of_static), gap)
-        held_back = self._weigh(beyond_range * factors[0], np.zeros_like(gap))
-        of_gaps = np.array([of_gap, np.ones_like(of_gap)])
-        return v + self._spread(of_gaps, np.array([gap, held_back])), growth
+        # The effect that each column loses by the limits of its range is an error, too.
+        cut_off = self._weigh(beyond_range * factors[0], np.zeros_like(gap))
+        variances_of_both = np.array([of_gap, np.ones_like(of_gap)])
+        return v + self._spread(variances_of_both, np.array([gap, cut_off])), growth
 
-    def _spread(self, variances: Floats, moved: Floats) -> Floats:
+    def _spread(self, variances: Floats, effects: Floats) -> Floats:
         """
         Return a, b, c of each axis' variance ``a + b x + c x^2``, (3, 3, n), due to p independent
-        errors with `variances` (p, n); `moved`, (p, 6, n): bias and relative scale per unit error.
+        errors of `variances`, (p, n); `effects`, (p, 6, n): bias, relative scale per unit error.
         """
-        variance, bias, scale = variances[:, np.newaxis], moved[:, :3] / self.K, moved[:, 3:]
+        variance, bias, scale = variances[:, np.newaxis], effects[:, :3] / self.K, effects[:, 3:]
         parts = np.empty((*bias.shape[:2], 3, bias.shape[2]))
         parts[:, :, 0] = variance * bias * bias
         parts[:, :, 1] = 2.0 * variance * bias * scale

@@ -36,7 +36,8 @@ BETWEEN: Final = [pair for pair in _PAIRS if pair not in _OF_AXES]
 #: Number of rows of a covariance of the nine errors u.
 N_ROWS: Final = len(_PAIRS)
 _FIRST, _SECOND = np.array(BETWEEN).T
-_OF_M: Final = [BETWEEN.index((u, u)) for u in (6, 7, 8)]
+#: Rows of `BETWEEN` with the variances of the misalignment's elements.
+OF_MISALIGNMENT: Final = [BETWEEN.index((u, u)) for u in (6, 7, 8)]
 #: Terms of the polynomials xx, xy, xz, yy, yz, zz: pairs of indices in (1, x, y, z).
 _TERMS: Final = [
     [(i, j) for i, j in combinations_with_replacement(range(4), 2) if i < first and j < second]
@@ -66,9 +67,9 @@ class CovarianceMap:
             sums[place] = products + np.tril(products, -1).T
         u, w = np.array([*_OF_AXES, *BETWEEN]).T
         factors = sums[:, u, w]
-        # Row b of an axis is twice the covariance of its constant error and its scale error.
+        # Row b of an axis is twice the covariance of the axis' constant error and scale error.
         factors[:, 1:9:3] /= 2.0
-        # Coefficients of xx, ..., zz are sums of few rows of the covariance of u: keep only these.
+        # Each coefficient of xx, ..., zz is a sum over few rows of the covariance of u.
         n = int((factors != 0.0).sum(axis=1).max())
         self._places = np.argsort(factors == 0.0, axis=1, kind='stable')[:, :n]
         self._factors = np.take_along_axis(factors, self._places, axis=1)[:, :, np.newaxis]
@@ -79,7 +80,7 @@ class CovarianceMap:
 
 
 def grown(between: Floats, growth: Floats) -> Floats:
-    """Increase the covariances `BETWEEN`, (36, n), by growth factors of axis variances, (3, n)."""
+    """Return covariances `BETWEEN`, (36, n), if the axis variances grow by `growth`, (3, n)."""
     # The misalignment does not depend on the temperature, so its errors do not grow.
     roots = np.concatenate((np.repeat(np.sqrt(growth), 2, 0), np.ones_like(growth)))
     return np.asarray(between * roots[_FIRST] * roots[_SECOND])
@@ -92,13 +93,8 @@ def rows_between(errors: Floats, misalignment_variances: Floats) -> Floats:
     """
     # The sums do not use BLAS, whose results depend on the arrays' alignment.
     result = in_order(errors[_FIRST] * errors[_SECOND], 1)
-    result[_OF_M] += misalignment_variances[:, np.newaxis]
+    result[OF_MISALIGNMENT] += misalignment_variances[:, np.newaxis]
     return result
-
-
-def misalignment_variances(between: Floats) -> Floats:
-    """Return the variances of the misalignment's elements, (3, n), from the rows `BETWEEN`."""
-    return between[_OF_M]
 
 
 def covariance_at(

@@ -16,7 +16,7 @@ from .functions import TANGENT_SPANS, basis_slopes, hold
 
 class Curves:
     """
-    Bias and scale of the static set (row 0) and the dynamic set over the board temperature.
+    Bias and scale of the static set (row 0) and the dynamic set (row 1) over board temperature.
 
     Where only one set is within its range, the curves of the other set run parallel to it. Beyond
     both ranges the set whose range extends farther follows tangents for `TANGENT_SPANS` times the
@@ -30,15 +30,15 @@ class Curves:
         # Edges of the fitted ranges of both regimes, (2, 2, 1): lower edges, then upper edges.
         self._t_range = (edges[:, 0].T - self._reference)[:, :, np.newaxis]
         self._rate_range = (edges[:, 1].T / 60.0)[:, :, np.newaxis]
-        self._rows = [
+        self._functions = [
             [axis.bias_function for axis in axes] + [axis.scale_function for axis in axes]
             for axes in (part.axes() for part in sets)
         ]
-        # Index of the regime whose tangent each regime follows, below and above the ranges.
+        # Index of the set whose tangent each set follows, below and above the ranges.
         regimes, (lower, upper) = np.arange(2), self._t_range[:, :, 0]
         self._leads = np.where([lower > lower.min(), upper < upper.max()], 1 - regimes, regimes)
         self._ends = lower.min(), upper.max()
-        self._reaches = TANGENT_SPANS * (upper - lower)[self._leads][:, :, np.newaxis]
+        self._tangents_k = TANGENT_SPANS * (upper - lower)[self._leads][:, :, np.newaxis]
         biases = [axis.bias for axis in calibration.axes]
         deltas = [[axis.delta for axis in part.axes()] for part in sets]
         self._levels = np.add(biases, deltas)[:, :, np.newaxis]
@@ -51,7 +51,7 @@ class Curves:
         self._lacks = {regime: np.array(rows).T for regime, rows in enumerate(lacks) if rows}
 
     def excess(self, states: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Return excess of T_board [K] and rate [K/s] over fitted ranges, also in half ranges."""
+        """Return excess of T_board [K] and rate [K/s] by set, then both in half ranges, (2, n)."""
         t, rate = states[BOARD] - self._reference, states[RATE]
         over, too_fast = t - hold(t, *self._t_range), rate - hold(rate, *self._rate_range)
         span, rate_span = (edges[1] - edges[0] for edges in (self._t_range, self._rate_range))
@@ -73,12 +73,12 @@ class Curves:
 
     def _evaluate(self, t: Floats, what: str = 'value') -> Floats:
         """Evaluate curves or slopes; row k of `t`, (2, n) [K from T_ref], is for regime k."""
-        pairs = zip(self._rows, t, strict=True)
+        pairs = zip(self._functions, t, strict=True)
         return np.array([[getattr(function, what)(at) for function in row] for row, at in pairs])
 
     def _beyond(self, t: Floats) -> tuple[Floats, Floats]:
-        """Return how far t is below and above the ranges, at most the tangents [K], (2, n)."""
-        (lower, upper), (below, above) = self._ends, self._reaches
+        """Return how far t [K] is below and above the ranges, up to the tangents' ends, (2, n)."""
+        (lower, upper), (below, above) = self._ends, self._tangents_k
         return hold(t - lower, -below, 0.0), hold(t - upper, 0.0, above)
 
     def unexplained(self, board: Floats) -> Floats:
@@ -105,7 +105,7 @@ class Curves:
         result = []
         for place in range(6):
             derivatives = []
-            for regime, row in enumerate(self._rows):
+            for regime, row in enumerate(self._functions):
                 basis = row[place].basis(held[regime])
                 basis = shares[regime] * np.reshape(basis, (-1, len(t)))
                 if is_outside:
@@ -116,8 +116,8 @@ class Curves:
 
     def _followed(self, regime: int, place: int, t: Floats, shares: Floats) -> Floats:
         """Differentiate bias or scale beyond the ranges w.r.t. free coefficients, (n_free, n)."""
-        # Beyond its range a curve is a constant plus a tangent, or plus the other regime's curve.
-        function = self._rows[regime][place]
+        # Outside its range a curve is a constant plus a tangent, or plus the other set's curve.
+        function = self._functions[regime][place]
         own_range, other_range = self._t_range[:, regime], self._t_range[:, 1 - regime]
         bases = (function.basis(hold(at, *own_range)) for at in (t, hold(t, *other_range)))
         here, edge = (np.reshape(basis, (-1, len(t))) for basis in bases)

@@ -29,7 +29,7 @@ from .schema import broken
 Kelvins: TypeAlias = float | Floats
 
 #: Length of the tangent that continues a curve beyond its range / width of the range. A parabola
-#: differs from its tangent 16 times less at the tangent's outer end than at the range's other end.
+#: departs from its tangent at an edge by 1/16 as much over this length as over the whole range.
 TANGENT_SPANS = 0.25
 #: Largest accepted error of a function's value at the reference temperature.
 NORMALISATION_TOLERANCE = 1e-9
@@ -232,13 +232,13 @@ def check_reference(name: str, function: TemperatureFunction, expected: float) -
 
 
 def basis_slopes(function: TemperatureFunction, t: float) -> list[float]:
-    """Return the slope at `t` [K] of each function that `basis` evaluates [per K]."""
+    """Return the derivatives [per K] of the functions that `basis` evaluates, at `t` [K]."""
     units = np.eye(function.n_free).tolist()
     return [float(function.with_free(tuple(unit), 0.0).slope(t)) for unit in units]
 
 
 def _natural_pieces(knots: npt.ArrayLike, values: npt.ArrayLike) -> Floats:
-    """Return ``a, b, c, d`` of a spline's ``a + b h + c h^2 + d h^3``, h from the left knot."""
+    """Return ``a, b, c, d`` of a spline's ``a + b h + c h^2 + d h^3``, h: t less the left knot."""
     # The tridiagonal system of the spline is solved with numpy: the node must not import scipy.
     y, h = np.asarray(values), np.diff(np.asarray(knots))
     slopes = np.diff(y) / h

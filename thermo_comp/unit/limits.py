@@ -5,7 +5,7 @@ Owns the limits of a calibration's bias and scale over its temperatures.
 
 The bias at the reference temperature, and its change over temperature, are each at most twice the
 full scale. The effect of a column on the bias, and of a parameter's sd on bias or scale, is at
-most a million times the limit of bias or scale: no instrument reaches this, no float overflows.
+most a million times the limit of bias or scale: no instrument needs more, and no float overflows.
 """
 
 from __future__ import annotations
@@ -57,14 +57,14 @@ def check_limits(calibration: Calibration, layout: ParameterLayout) -> None:
             rule = f'keep the largest effect of the column within {WORST * limit:g} input units'
             raise broken(f'response[{k}].bias', rule, effect)
     for regime, part, ends in zip(('static', 'dynamic'), sets, edges, strict=True):
-        at_work = [term.during in ('always', regime) for term in response]
+        is_active = [term.during in ('always', regime) for term in response]
         for k, (name, axis) in enumerate(zip('xyz', part.axes(), strict=True)):
-            terms = zip(response, sizes, at_work, strict=True)
-            gain = sum(abs(term.scale[k]) * size for term, size, is_at_work in terms if is_at_work)
-            _check_scale(f'{regime}.{name}', _extremes(axis.scale_function, ends), gain)
+            terms = zip(response, sizes, is_active, strict=True)
+            effect = sum(abs(term.scale[k]) * size for term, size, is_used in terms if is_used)
+            _check_scale(f'{regime}.{name}', _extremes(axis.scale_function, ends), effect)
         for name, at, axis in zip('xyz', calibration.axes, part.axes(), strict=True):
-            reached = _extremes(axis.bias_function, ends)
-            _check_bias(f'{regime}.{name}', at.bias + axis.delta, reached, limit)
+            extremes = _extremes(axis.bias_function, ends)
+            _check_bias(f'{regime}.{name}', at.bias + axis.delta, extremes, limit)
     if calibration.posterior is None:
         return
     calibration.posterior.check_size(layout.n_parameters)
@@ -95,25 +95,25 @@ def _check_axes(calibration: Calibration, limit: float) -> None:
             )
 
 
-def _check_bias(key: str, level: float, reached: tuple[float, float], limit: float) -> None:
+def _check_bias(key: str, level: float, extremes: tuple[float, float], limit: float) -> None:
     if abs(level) > limit:
         rule = f'keep bias plus delta within {limit:g} input units'
         raise broken(f'{key}.delta', rule, float(level))
-    smallest, largest = reached
+    smallest, largest = extremes
     if not math.isfinite(largest - smallest):
         raise ValueError(f'`{key}.bias_function` must be finite over its {_AROUND}')
     if max(-smallest, largest) > limit:
         raise ValueError(
             f'`{key}.bias_function` must stay within {limit:g} input units over its {_AROUND}, '
-            f'reaches {max(reached, key=abs):g}'
+            f'reaches {max(extremes, key=abs):g}'
         )
 
 
-def _check_scale(key: str, reached: tuple[float, float], gain: float) -> None:
-    """Refuse a curve of the relative scale that leaves the limits with the columns' `gain`."""
+def _check_scale(key: str, extremes: tuple[float, float], effect: float) -> None:
+    """Refuse a scale curve that, minus or plus the `effect` of all columns, leaves the limits."""
     for word, value, is_kept, limit in (
-        ('above', reached[0] - gain, operator.gt, SMALLEST_RELATIVE_SCALE),
-        ('below', reached[1] + gain, operator.lt, LARGEST_RELATIVE_SCALE),
+        ('above', extremes[0] - effect, operator.gt, SMALLEST_RELATIVE_SCALE),
+        ('below', extremes[1] + effect, operator.lt, LARGEST_RELATIVE_SCALE),
     ):
         if not is_kept(value, limit):
             raise ValueError(
@@ -123,7 +123,7 @@ def _check_scale(key: str, reached: tuple[float, float], gain: float) -> None:
 
 
 def _extremes(function: TemperatureFunction, edges: Sequence[float]) -> tuple[float, float]:
-    """Return the smallest and largest value of a function in its range and on its tangents."""
+    """Return a function's smallest and largest value between `edges` and on the tangents there."""
     lower, upper = edges
     t = np.linspace(lower, upper, _GRID)
     beyond_k = TANGENT_SPANS * (upper - lower)

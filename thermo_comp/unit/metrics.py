@@ -35,7 +35,7 @@ def norm_residual(specific_force: Floats, gravity: float | Floats) -> Floats:
 
 
 def means_by(labels: Ints, values: Floats, weight: Floats | None = None) -> Floats:
-    """Return the weighted mean of the values of each label, in ascending order of labels."""
+    """Return the weighted mean of `values`, (n, ...), of each label in ascending order."""
     weight = np.ones(len(labels)) if weight is None else weight
     _, place = np.unique(labels, return_inverse=True)
     count = np.bincount(place, weight)

@@ -37,8 +37,8 @@ POWERS: dict[Kind, int] = {'square': 1, 'odd_square': 1, 'cube': 2}
 K2_SD = 1e-4
 #: Largest |f| / gravity at which |f| counts as gravity.
 AT_REST = 1.01
-#: Largest slope of the nonlinear terms within full scale, for which one step of Halley's method is
-#: sufficient.
+#: Largest accepted slope of the nonlinear terms up to full scale: up to this slope one step of
+#: Halley's method is accurate enough.
 LARGEST_SLOPE = 0.2
 
 #: Index of the first coefficient of the nonlinearity in a result of `Correction.line`.
@@ -196,9 +196,9 @@ class BeyondForce(NamedTuple):
 
 def beyond_force(calibration: Calibration) -> BeyondForce:
     """Return the variance of an unknown square term beyond the largest |f| of the fit."""
-    known = calibration.nonlinearity
-    edge = known.force_range_m_s2[1] if known else AT_REST * calibration.gravity_m_s2
-    sd = (known.beyond_sd_g_g2 if known else K2_SD) / STANDARD_GRAVITY
+    fitted = calibration.nonlinearity
+    edge = fitted.force_range_m_s2[1] if fitted else AT_REST * calibration.gravity_m_s2
+    sd = (fitted.beyond_sd_g_g2 if fitted else K2_SD) / STANDARD_GRAVITY
     return BeyondForce(edge, sd * sd / 16.0)
 
 
@@ -208,7 +208,7 @@ class ForceCorrection:
     def __init__(
         self, calibration: Calibration, nonlinearity: Nonlinearity, span: tuple[float, float]
     ) -> None:
-        self._of = nonlinearity
+        self._nonlinearity = nonlinearity
         self._reference, self._span = calibration.reference_temperature_c, span
 
     def held(self, board: Floats) -> Floats:
@@ -217,14 +217,14 @@ class ForceCorrection:
 
     def linearise(self, x: Floats, board: Floats) -> Floats:
         """Subtract the nonlinear terms from readings (n, 3) at board temperatures (n,)."""
-        k2, kq, k3 = self._of.coefficients(self.held(board))
+        k2, kq, k3 = self._nonlinearity.coefficients(self.held(board))
         return np.asarray(linearised(x.T, k2, kq, k3).T)
 
     def regressors(self, force: Floats, board: Floats) -> Floats:
         """Differentiate readings w.r.t. k coefficients, then their slopes in T, (n, 3, 2 k)."""
         size = np.abs(force)
         each = {'square': force**2, 'odd_square': size * force, 'cube': force**3}
-        values = [each[term.kind] / unit_of(term.kind) for term in self._of.terms]
+        values = [each[term.kind] / unit_of(term.kind) for term in self._nonlinearity.terms]
         both = [*values, *(self.held(board)[:, np.newaxis] * value for value in values)]
         return np.stack(both, axis=2) if both else np.zeros((*force.shape, 0))
 
@@ -233,29 +233,29 @@ class ForceCorrection:
         Return K2, Kq, K3 of each axis, then the coefficients of x^3 to x^6 in the variance of each
         axis, (21, n). `slow`: coefficients of x^2 to x^6 in the variance of each axis, (15, n).
         """
-        k = self._of.coefficients(self.held(board)).swapaxes(0, 1)
+        k = self._nonlinearity.coefficients(self.held(board)).swapaxes(0, 1)
         higher = slow.reshape(3, 5, -1)[:, 1:]
         return np.concatenate((k.reshape(9, -1), higher.reshape(12, -1)))
 
     def variance(
-        self, t: Floats, rows: Floats, rest: Floats, on_bias: Floats, on_scale: Floats
+        self, t: Floats, factor: Floats, diagonal: Floats, on_bias: Floats, on_scale: Floats
     ) -> Floats:
         """
         Return the contribution of the nonlinear terms to the coefficients of x^2 to x^6 in the
         error variance of an axis, (5, n); `t`: T_board - T_ref, (n,) [K].
 
-        The covariance of the coefficients of the k terms is ``rows @ rows.T + diag(rest)``, with
-        the shape (2 k, rank) of `rows`; `on_bias`, `on_scale`, (rank, n): bias and relative scale
-        due to each column of `rows`. The covariances of Kq with other parameters are omitted: most
-        of them are negative, so in most cases the result is too large.
+        The covariance of the coefficients of the k terms is ``factor @ factor.T + diag(diagonal)``
+        with `factor` of shape (2 k, rank); `on_bias`, `on_scale`, (rank, n): bias and relative
+        scale due to each column of `factor`. The covariances of Kq with other parameters are
+        omitted: most of them are negative, so in most cases the result is too large.
         """
-        k = len(self._of.terms)
-        kinds = [list(POWERS).index(term.kind) for term in self._of.terms]
-        units = np.array([unit_of(term.kind) for term in self._of.terms]).reshape(-1, 1)
-        along, alone = np.zeros((3, *on_bias.shape)), np.zeros((3, len(t)))
-        along[kinds] = (rows[:k, :, np.newaxis] + t * rows[k:, :, np.newaxis]) / units[:, :, None]
-        alone[kinds] = (rest[:k, np.newaxis] + t * t * rest[k:, np.newaxis]) / (units * units)
-        (n2, nq, n3), (v2, vq, v3) = along, alone
+        terms = self._nonlinearity.terms
+        k, kinds = len(terms), [list(POWERS).index(term.kind) for term in terms]
+        units = np.array([unit_of(term.kind) for term in terms])[:, np.newaxis]
+        by_column, alone = np.zeros((3, *on_bias.shape)), np.zeros((3, len(t)))
+        by_column[kinds] = (factor[:k, :, None] + t * factor[k:, :, None]) / units[:, :, None]
+        alone[kinds] = (diagonal[:k, None] + t * t * diagonal[k:, None]) / (units * units)
+        (n2, nq, n3), (v2, vq, v3) = by_column, alone
         # The sums do not use BLAS, whose results depend on the arrays' alignment.
         products = (
             2.0 * on_bias * n2,

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the covariance of all parameters: factor @ factor.T + diag(diagonal), float32 in base64."""
+"""Owns the covariance of all parameters, and the order of the parameters in this covariance."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ _FLOAT32 = np.dtype('<f4')
 @dataclass(frozen=True)
 class Posterior:
     """
-    Covariance of all parameters, in the order that docs/calibration_file.md states: factor @
-    factor.T + diag(diagonal).
+    Covariance of all parameters, ``factor @ factor.T + diag(diagonal)``, in the order that
+    docs/calibration_file.md states.
     """
 
     rank: Annotated[int, QUANTITIES['number'], 'Number of columns of the factor.']
@@ -83,7 +83,7 @@ class Posterior:
 class Block(NamedTuple):
     """
     Indices of the parameters of an axis' bias or scale in the posterior. `static`, `dynamic`:
-    index of the value at T_ref in the regime, before the other coefficients of the regime.
+    index of the value at T_ref in the regime; the other coefficients of the regime follow it.
     `response`: index of the first weight of the columns; `end`: index after the last weight.
     """
 
@@ -101,7 +101,7 @@ class Block(NamedTuple):
 def lay_out(
     pairs: Iterable[tuple[TemperatureFunction, TemperatureFunction]], n_columns: int
 ) -> list[Block]:
-    """Return parameter indices of each bias or scale, a static and a dynamic curve."""
+    """Return the parameter indices of each pair of a static and a dynamic curve."""
     blocks = [Block(0, 0, 0, 0)]
     for static, dynamic in pairs:
         begin = blocks[-1].end
@@ -137,7 +137,7 @@ def posterior_of(covariance: Floats) -> Posterior:
     if not np.all(diagonal >= 0.0):
         raise ValueError('`covariance` must not have a negative variance')
     # The covariance is scaled to correlations: entries in counts^2 and relative^2 differ by 10
-    # decades.
+    # orders of magnitude.
     scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     with np.errstate(over='ignore'):
         correlation = (covariance + covariance.T) / 2.0 / scale / scale[:, np.newaxis]
@@ -147,13 +147,13 @@ def posterior_of(covariance: Floats) -> Posterior:
     if not eigenvalues[0] > _MOST_NEGATIVE:
         raise ValueError('`covariance` must be positive semidefinite')
     columns = vectors[:, ::-1] * np.sqrt(np.maximum(eigenvalues[::-1], 0.0))
-    share = np.where(diagonal > 0.0, 1.0, 0.0)
-    left_out = share[:, np.newaxis] - np.cumsum(columns**2, axis=1)
-    enough = np.all(left_out <= _TOLERANCE, axis=0)
-    rank = int(np.argmax(enough)) + 1 if diagonal.any() else 0
+    whole = np.where(diagonal > 0.0, 1.0, 0.0)
+    remaining = whole[:, np.newaxis] - np.cumsum(columns**2, axis=1)
+    is_enough = np.all(remaining <= _TOLERANCE, axis=0)
+    rank = int(np.argmax(is_enough)) + 1 if diagonal.any() else 0
     factor = _single(columns[:, :rank] * scale[:, np.newaxis])
-    held = np.sum(factor.astype(np.float64) ** 2, axis=1)
-    return Posterior.of(factor, np.maximum(diagonal - held, 0.0))
+    of_factor = np.sum(factor.astype(np.float64) ** 2, axis=1)
+    return Posterior.of(factor, np.maximum(diagonal - of_factor, 0.0))
 
 
 def _encoded(numbers: npt.NDArray[np.floating[Any]]) -> str:

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the slowly varying error covariance of thermal states, due to the parameters and the unknown
-initial lag states, and the thermal states of a soak and of a ramp.
+Owns the covariance of the slowly varying errors at thermal states, due to the parameters and the
+unknown initial lag states, and the thermal states of a soak and of a ramp.
 
 After s seconds of a ramp of rate q each gradient is ``board_lag_s q``, a part of time constant tau
 lags the board by ``tau q (1 - exp(-s / tau))``, and the output of a play lags its input by the
@@ -39,26 +39,20 @@ class SlowUncertainty:
         self._root = start_root(lags)
         edges = [edge for part in calibration.regime_sets() for edge in part.temperature_range_c]
         self._span = max(edges) - min(edges)
-        #: Lag [K] / rate of the board temperature [K/s], (2, n_lags): lags of the board in a long
-        #: ramp; lags of gradients after the gradients' change at the onset of a ramp.
-        self._behind_s = np.array([
-            [
-                sum(
-                    w * (tau if is_of_board else calibration.board_lag_s)
-                    for (of, tau), w in lag.first_order_weights.items()
-                    if (of == BOARD_INPUT) is is_of_board
-                )
-                for lag in lags
-            ]
-            for is_of_board in (True, False)
-        ])  # fmt: skip
+        #: Value of each lag [K] / rate of the board temperature in a ramp [K/s], (2, n_lags): row
+        #: 0 due to lags of the board in a long ramp, row 1 due to lags of gradients at the onset.
+        self._behind_s = np.zeros((2, len(lags)))
+        for k, lag in enumerate(lags):
+            for (name, tau), weight in lag.first_order_weights.items():
+                row, behind_s = (0, tau) if name == BOARD_INPUT else (1, calibration.board_lag_s)
+                self._behind_s[row, k] += weight * behind_s
         layout, posterior = parameter_layout(calibration), calibration.posterior
         matrix, diagonal = np.zeros((layout.n_parameters, 0)), np.zeros(layout.n_parameters)
         diagonal[layout.misalignment :] = np.square(calibration.misalignment_sd)
         if posterior is not None:
             matrix, diagonal = posterior.matrix, posterior.variances
-        #: Factor and diagonal of the covariance of the parameters of bias, scale and nonlinear
-        #: terms, for each axis; then factor and diagonal for the misalignment.
+        #: For each axis: factor and diagonal of the covariance of the parameters of the bias, of
+        #: the scale, and of the nonlinear terms. Below: factor and diagonal for the misalignment.
         self._blocks = [
             [(matrix[part], diagonal[part]) for part in (bias.rows, scale.rows, force)]
             for bias, scale, force in zip(layout.bias, layout.scale, layout.force, strict=True)
@@ -85,18 +79,18 @@ class SlowUncertainty:
     def of_start(self, states: Floats, start_shares: Floats, rates: Floats) -> Floats:
         """
         Differentiate bias [input units] and scale [relative] w.r.t. the unknown initial lag
-        states, as variables of unit variance, shape (n_unknown, 6, n). `rates`: assumed
-        rate of the board temperature at the start, as in a ramp, (n,) [K/s].
+        states, as variables of unit variance, shape (n_unknown, 6, n). `rates`: rate of the board
+        temperature in a ramp that is assumed at the start, (n,) [K/s].
         """
         table = self._correction.table
         factors, _ = table.factors(states[BOARD], states[WEIGHT])
         by_pair = self._correction.by_pairs(table.slopes(states)[0] * factors)
-        moved = by_pair[self._correction.layout.lag_pairs] * start_shares[:, np.newaxis]
+        by_lag = by_pair[self._correction.layout.lag_pairs] * start_shares[:, np.newaxis]
         # The unit may have been switched on in a ramp: the sd of a lag at the start is the lag in
         # a ramp of this rate, limited to the calibrated span of temperatures.
         behind = hold(self._behind_s[:, :, np.newaxis] * rates, -self._span, self._span)
-        in_ramp = in_order(moved * behind[:, :, np.newaxis], 1)
-        by_root = in_order(self._root[:, :, np.newaxis, np.newaxis] * moved[:, np.newaxis], 0)
+        in_ramp = in_order(by_lag * behind[:, :, np.newaxis], 1)
+        by_root = in_order(self._root[:, :, np.newaxis, np.newaxis] * by_lag[:, np.newaxis], 0)
         return np.concatenate((by_root, in_ramp))
 
     def _at(self, states: Floats, start_shares: Floats, rates: Floats) -> Floats:
@@ -109,32 +103,32 @@ class SlowUncertainty:
         # A larger element of the misalignment increases the corrected force; a larger bias or
         # scale factor decreases the corrected force.
         errors[6:, n_start:] = -of_misalignment[:, :, np.newaxis]
-        added = np.zeros((3, 3, n))
-        beyond: list[Floats] = []
+        variance = np.zeros((3, 3, n))
+        of_nonlinearity: list[Floats] = []
         nonlinear = self._correction.of_force
         for axis, K in enumerate(self._K):
-            on_bias, on_scale = errors[2 * axis : 2 * axis + 2]
-            on_bias[:n_start], on_scale[:n_start] = of_start[:, axis] / K, of_start[:, axis + 3]
-            (of_bias, var_bias), (of_scale, var_scale), of_force = self._blocks[axis]
-            by_bias, by_scale = regressors[axis] / K, regressors[axis + 3]
-            on_bias[n_start:] = _combined(of_bias, by_bias)
-            on_scale[n_start:] = _combined(of_scale, by_scale)
-            added[axis, 0] = in_order(var_bias[:, np.newaxis] * by_bias**2, 0)
-            added[axis, 2] = in_order(var_scale[:, np.newaxis] * by_scale**2, 0)
+            *of_curves, of_force = self._blocks[axis]
+            on_bias, on_scale = both = errors[2 * axis : 2 * axis + 2]
+            # k = 0: the bias [input units] is divided by K; k = 1: the scale is relative.
+            for k, ((factor, diagonal), unit) in enumerate(zip(of_curves, (K, 1.0), strict=True)):
+                by = regressors[axis + 3 * k] / unit
+                both[k, :n_start] = of_start[:, axis + 3 * k] / unit
+                both[k, n_start:] = in_order(factor[:, :, np.newaxis] * by[:, np.newaxis], 0)
+                variance[axis, 2 * k] = in_order(diagonal[:, np.newaxis] * by**2, 0)
             if nonlinear is not None:
-                t, both = nonlinear.held(states[BOARD]), (on_bias[n_start:], on_scale[n_start:])
-                beyond.append(nonlinear.variance(t, *of_force, *both))
+                t = nonlinear.held(states[BOARD])
+                of_nonlinearity.append(nonlinear.variance(t, *of_force, *both[:, n_start:]))
             products = on_bias * on_bias, 2.0 * (on_bias * on_scale), on_scale * on_scale
-            added[axis] += in_order(np.array(products), 1)
+            variance[axis] += in_order(np.array(products), 1)
         between = rows_between(errors, var_misalignment)
-        return np.concatenate((added.reshape(9, n), between, *beyond))
+        return np.concatenate((variance.reshape(9, n), between, *of_nonlinearity))
 
     def of_bias(
         self, states: Floats, mean_of: Callable[[Floats], Floats]
     ) -> tuple[Floats, Floats]:
         """
-        Return variances due to the parameters at thermal states (n, width), shape (n, 3)
-        [m^2/s^4]: of the bias, and of the bias less its mean (function `mean_of`).
+        Return two variances due to the parameters at thermal states (n, width), shapes (n, 3)
+        [m^2/s^4]: of the bias, and of the bias less the mean that `mean_of` computes.
         """
         columns = states.T
         phi = self._correction.table.values(columns)
@@ -145,11 +139,6 @@ class SlowUncertainty:
             for result, design in ((of_state, terms), (of_difference, terms - mean_of(terms))):
                 result[:, axis] = ((design @ rows) ** 2).sum(axis=1) + design**2 @ variances
         return of_state, of_difference
-
-
-def _combined(rows: Floats, by: Floats) -> Floats:
-    """Return ``rows.T @ by``, (rank, n), for a factor (p, rank) and derivatives (p, n)."""
-    return in_order(rows[:, :, np.newaxis] * by[:, np.newaxis], 0)
 
 
 def in_a_soak(
@@ -211,8 +200,8 @@ def bias_scale_and_sd(
     """
     correction = Correction(calibration)
     slow = SlowUncertainty(calibration, correction)
-    forgotten = np.zeros((len(correction.memory.lags), len(states)))
-    variance = slow.at(states.T, forgotten)[:9].T.reshape(-1, 3, 3)
+    start_shares = np.zeros((len(correction.memory.lags), len(states)))
+    variance = slow.at(states.T, start_shares)[:9].T.reshape(-1, 3, 3)
     board, each = states[:, BOARD], np.arange(len(states))
     regime = np.rint(states[:, WEIGHT]).astype(np.int64)
     unexplained = correction.curves.unexplained(board)[regime, :, each]
@@ -252,7 +241,7 @@ def ramp_states(
 
 
 def _add_gradient(states: Floats, calibration: Calibration, change_k: float) -> None:
-    """Add `change_k` in thermal states to the first sensor's gradient and the gradient's lags."""
+    """Add `change_k` [K] to the gradient of the first sensor, and to its lags, in `states`."""
     layout = StateLayout(memory_of_unit(calibration))
     for quantity, place in layout.places.items():
         if isinstance(quantity, Gradient) and quantity.input == calibration.sensors[0]:

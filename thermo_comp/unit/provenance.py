@@ -43,9 +43,7 @@ class Source:
 
 @dataclass(frozen=True)
 class ResidualSummary:
-    """
-    ``|f| - g`` of fitted data in one regime or both; raw: with bias and scale at T_ref only.
-    """
+    """``|f| - g`` of fitted data in one regime or both; raw: with bias and scale at T_ref only."""
 
     section: str
     n_windows: _Number
@@ -54,8 +52,8 @@ class ResidualSummary:
     max_m_s2: _Error
     left_out_rms_m_s2: Annotated[
         _Error | None,
-        'RMS error of the magnitude of the force in positions that the fit leaves out in turn; '
-        'null if the other positions do not determine this magnitude in each of them.',
+        'RMS of |f| - g in positions, each corrected by a fit to the others; null if the others '
+        'do not determine |f| in each position.',
     ] = None
     left_out_drift_m_s2: Annotated[
         _Error | None,

@@ -15,7 +15,7 @@ from .schema import Vector
 #: One millidegree per second, a unit of gyroscope errors [rad/s].
 MILLIDEGREE = math.radians(1e-3)
 NIL = (0.0, 0.0, 0.0)
-#: The largest angular rate of a gyroscope, which is also its largest bias [rad/s].
+#: Largest angular rate of a gyroscope, and its largest bias [rad/s].
 LARGEST_RATE = QUANTITIES['angular rate'].at_most or 0.0
 
 _Rate = Annotated[float, QUANTITIES['angular rate']]
@@ -28,7 +28,7 @@ _Deviation = Annotated[float, QUANTITIES['rate deviation']]
 class RateCurve:
     """The bias of one axis of the gyroscope over temperature in one regime."""
 
-    bias_function: Annotated[TemperatureFunction, 'Fs(t) [rad/s]; Fs(0) = 0.']
+    bias_function: Annotated[TemperatureFunction, 'Fs(t): bias curve [rad/s]; Fs(0) = 0.']
     delta: Annotated[float, 'Bias of this regime less `bias_rad_s`, at T_ref [rad/s].'] = 0.0
 
     def __post_init__(self) -> None:
@@ -62,7 +62,7 @@ class Gyroscope:
     """
     Bias of the angular rate over temperature: ``w = measured - bias``. The scale factor is 1.
 
-    Order of the posterior, for each axis: coefficients of each regime, then weights of columns.
+    Parameters of `posterior`, for each axis: coefficients of each regime, then column weights.
     """
 
     bias_rad_s: Annotated[

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class Form(NamedTuple):
-    """A function of x and its derivative; a result has the same bits in any array of x."""
+    """A function of x and its derivative; the result of an x has the same bits in any array."""
 
     value: Callable[[Floats], Floats]
     slope: Callable[[Floats], Floats]
@@ -90,7 +90,7 @@ class Term:
         return (column.source.largest + abs(self.centre(column))) ** self.order
 
     def steepest(self, column: Column, raw: Floats, flow_k: float) -> float:
-        """Return the largest slope of u [1/K]; of bounded u, 1 / `flow_k`, the RMS gradient."""
+        """Return the largest slope of u [1/K]; for bounded u, 1 / the RMS gradient `flow_k`."""
         if self.bounds is not None:
             return 1.0 / flow_k
         largest = float(np.abs(raw).max(initial=0.0)) ** (1.0 / self.order)
@@ -129,7 +129,7 @@ _ALL: Final = (
     # `gradient`: heat flow from a thermometer to the board; `rate`: a fit never uses this kind.
     Term('gradient', 'g_s', _gradient),
     Term('rate', 'dT_board/dt [K/s]', lambda _: state.Rate()),
-    # `board`: for a part that lags the board; `gradient_lag`: for a part between thermometers.
+    # `board`: of a part that lags the board; `gradient_lag`: of a part between thermometers.
     Term('board', 'T_board - lagged T_board', _part, positive=('tau_s',)),
     Term('gradient_lag', 'lagged g_s', _lagged_gradient, positive=('tau_s',)),
     # `square` with a lag is for a curve over a part's temperature; q_s is a heat flow.
