@@ -82,8 +82,7 @@ def unit(**changes):
 def force_at(seconds):
     """Return the true specific force [m/s^2], shape (n, 3), in a slow turn and then at rest."""
     angle = 0.02 * np.minimum(seconds, STANDS_S)
-    up = np.array([np.sin(angle) * 0.6, np.sin(angle) * 0.8, np.cos(angle)]).T
-    return GRAVITY * up
+    return GRAVITY * np.array([np.sin(angle) * 0.6, np.sin(angle) * 0.8, np.cos(angle)]).T
 
 
 @dataclass(frozen=True)

@@ -177,8 +177,7 @@ def begin(windows, up):
 
 def mode_of(regression, state, prior):
     """Find the mode to full precision by Newton steps from the result of a fit."""
-    solution = regression.solve(state, prior, n_steps=12)
-    point = regression.at(solution.state, prior)
+    point = regression.at(regression.solve(state, prior, n_steps=12).state, prior)
     for _ in range(6):
         step, _ = point.solution
         point = point.with_step(step)

@@ -53,8 +53,7 @@ class Rest:
         return self.warm - self.fall * (1.0 - np.exp(-time / self.pace_s))
 
     def add(self, vector, from_s, to_s=np.inf):
-        rows = (self.time >= from_s) & (self.time < to_s)
-        self.accel[rows] += np.asarray(vector)
+        self.accel[(self.time >= from_s) & (self.time < to_s)] += np.asarray(vector)
 
     def source(self, n_blocks=1, with_gyro=False, name='rest'):
         stamp_ns = START_NS + np.rint(self.time * 1e9).astype(np.int64)

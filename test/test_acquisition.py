@@ -116,8 +116,7 @@ def test_faults_of_a_position_are_reported(stream):
     assert account.positions[-1].n_rests == 2
     test = Acquisition(1, 30.0)
     stamp_ns = START_NS + np.arange(3000) * 20_000_000
-    zeros = Block(stamp_ns, np.zeros((3000, 3)), '', None, {}, {'accel': stamp_ns})
-    assert test.add(zeros) == []
+    assert test.add(Block(stamp_ns, np.zeros((3000, 3)), '', None, {}, {'accel': stamp_ns})) == []
     account = test.account()
     assert [position.reason for position in account.positions] == ['all axes read zero']
     assert (account.n_good, account.farthest_deg) == (0, 180.0)

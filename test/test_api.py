@@ -118,8 +118,7 @@ def test_unusable_samples_give_rows_of_nan_and_empty_arrays_give_empty_arrays(ar
     assert late.dynamic.any()
     assert np.argmax(late.dynamic) >= np.argmax(out.dynamic)
     out = thermal_calibration().correct([], np.empty((0, 3)), board=[])
-    assert out.specific_force.shape == (0, 3)
-    assert out.covariance.shape == (0, 3, 3)
+    assert (out.specific_force.shape, out.covariance.shape) == ((0, 3), (0, 3, 3))
     assert out.dynamic.shape == (0,)
     dates = np.array(['2026-01-01T00:00:00', '2026-01-01T00:00:10'], 'M8[ns]')
     unread = thermal_calibration().correct(dates, np.ones((2, 3)), board=([], []))
@@ -152,8 +151,7 @@ def test_wrong_arguments_are_named(change, text):
 
 
 def test_a_fit_of_arrays_equals_the_fit_of_their_bags(root, tmp_path, fitted):
-    bags = sorted((root / 'bags' / 'fit').glob('*.mcap'))[:3]
-    recordings = [tc.read(bag) for bag in bags]
+    recordings = [tc.read(bag) for bag in sorted((root / 'bags' / 'fit').glob('*.mcap'))[:3]]
     again = tc.fit(recordings, gravity=9.80665, model='golovach')
     assert again.unit.serial == 'demo-0007'
     assert replace(again, provenance=fitted.provenance) == fitted

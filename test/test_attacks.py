@@ -32,8 +32,7 @@ def test_a_clock_topic_that_goes_back_or_pauses_does_not_change_samples(peer, tm
     from ros_helpers import Samples, node_arguments, node_in_thread, stamp_of
     from rosgraph_msgs.msg import Clock
 
-    path = saved(tmp_path / 'unit.yaml')
-    with node_in_thread(*node_arguments(path)) as node:
+    with node_in_thread(*node_arguments(saved(tmp_path / 'unit.yaml'))) as node:
         samples = Samples(peer, node)
         assert peer.set_parameters(use_sim_time=True)[0].successful
         clock = peer.publisher(Clock, '/clock')
@@ -168,8 +167,7 @@ def test_a_write_killed_at_any_line_leaves_the_old_or_the_new_calibration(tmp_pa
     for path, serial in ((old, 'old'), (new, 'new'), (target, 'old')):
         saved(path, serial)
     done = ran(sys.executable, '-c', SAVING, new, target, old, check=True)
-    lines = [line.split() for line in done.stdout.splitlines()]
-    *killed, last = lines
+    *killed, last = [line.split() for line in done.stdout.splitlines()]
     assert last == ['0', 'new']
     assert len(killed) > 30
     assert {code for code, _ in killed} == {str(signal.SIGKILL.value)}

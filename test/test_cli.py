@@ -58,8 +58,7 @@ class TestOutput:
     def test_a_closed_pipe_gives_no_error(self, bag):
         command = f'{sys.executable} -m thermo_comp info {bag} | head -n 1'
         finished = ran('bash', '-c', f'set -o pipefail; {command}')
-        assert finished.stderr == ''
-        assert len(finished.stdout.splitlines()) == 1
+        assert (finished.stderr, len(finished.stdout.splitlines())) == ('', 1)
 
     def test_progress_is_shown_only_on_a_terminal_and_colour_only_without_no_color(self, bag, cli):
         for no_color in (False, True):
@@ -123,8 +122,7 @@ class TestPlay:
         data = parsed(finished.stdout)
         info = inspect_recording(bag)
         counts = {f'/here{name}': count for name, (_, count) in info.topics.items()}
-        assert data['messages'] == counts
-        assert data['unheard'] == sorted(data['unheard'])
+        assert (data['messages'], data['unheard']) == (counts, sorted(data['unheard']))
         assert '/here/accel/counts had no subscriber' in finished.stderr
 
     def test_ros_arguments_end_at_two_dashes(self):

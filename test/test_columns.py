@@ -108,8 +108,7 @@ def test_the_value_of_each_kind_of_column_agrees_with_hand_numbers():
     assert values == pytest.approx(expected)
     # A factor t of a column is limited to calibrated temperatures; the column `board` has no t.
     at_edge = ColumnTable(columns, spec, 20.0, (-10.0, 22.0)).values(state)[:, 0]
-    assert at_edge[4] == pytest.approx(-0.6)
-    assert at_edge[2] == 0.5
+    assert (at_edge[4], at_edge[2]) == (pytest.approx(-0.6), 0.5)
 
 
 def test_bends_have_slopes_and_go_on_along_their_tangent_beyond_the_range():

@@ -50,10 +50,8 @@ def test_a_bag_converted_from_a_table_has_the_values_of_the_table(tmp_path):
     report = write_log(table_log(path, column_map(gyro=gyro)), tmp_path / 'bag')
     recording = read_recording(tmp_path / 'bag')
     block = recording.columns
-    assert recording.info.input == 'imu'
-    assert recording.info.metadata['serial'] == 'unit7'
-    assert recording.info.metadata['converted_from'] == 'log.csv'
-    assert block.frame_id == 'here'
+    assert (recording.info.input, recording.info.metadata['serial']) == ('imu', 'unit7')
+    assert (recording.info.metadata['converted_from'], block.frame_id) == ('log.csv', 'here')
     assert block.accel_stamp_ns.tolist() == (columns['ms'] * 10**6).tolist()
     expected = np.column_stack([columns[k] for k in ['ax', 'ay', 'az']]) * STANDARD_GRAVITY
     np.testing.assert_array_equal(block.accel, expected)
@@ -71,8 +69,7 @@ def test_a_bag_converted_from_a_table_has_the_values_of_the_table(tmp_path):
     assert len(board.celsius) == report.messages['board'] == 10
     assert case.after.tolist() == [0, 100, 200, 300]
     assert (report.rows, report.messages['accel']) == (400, 400)
-    assert report.rate_hz == pytest.approx(100.0)
-    assert report.duration_s == pytest.approx(3.99)
+    assert (report.rate_hz, report.duration_s) == (pytest.approx(100.0), pytest.approx(3.99))
     assert 'gravity is 1 g' in report.inferred_unit
 
 
@@ -114,8 +111,7 @@ def test_times_of_a_counter_of_32_bits_continue_after_its_overflow(tmp_path, uni
     rows = [f'{at},{row.partition(",")[2]}' for at, row in zip(ticks, lines[1:], strict=True)]
     path.write_text('\n'.join([lines[0], *rows]))
     log = table_log(path, column_map(stamp={'column': 'ms', 'unit': unit}))
-    step_ns = 10 * {'ms': 10**6, 'us': 10**3}[unit]
-    assert np.diff(log.stamp_ns).tolist() == [step_ns] * 399
+    assert np.diff(log.stamp_ns).tolist() == [10 * {'ms': 10**6, 'us': 10**3}[unit]] * 399
     report = write_log(log, tmp_path / 'bag')
     assert (report.findings['continued'].count, report.findings['continued'].lines) == (1, (202,))
     assert report.findings['backwards'].count == 0
@@ -172,8 +168,7 @@ def test_rows_with_faults_are_counted_and_readings_of_minus_127_degc_left_out(tm
     path.write_text('\n'.join(lines))
     report = write_log(table_log(path, column_map()), tmp_path / 'cold')
     assert report.findings['impossible'].count == 2  # a reading repeated in two rows counts once
-    board = read_recording(tmp_path / 'cold').columns.temperatures['board']
-    assert board.celsius.min() == 25.0
+    assert read_recording(tmp_path / 'cold').columns.temperatures['board'].celsius.min() == 25.0
 
 
 def test_stamps_of_a_fixed_rate_do_not_accumulate_rounding(tmp_path):
@@ -314,8 +309,7 @@ def test_convert_reports_rows_rate_and_topics(tmp_path, cli):
     text = f'thermo_comp: error: {tmp_path}/bag: exists already; --force overwrites it\n'
     assert cli(*arguments, code=1).stderr == text
     data = json.loads(cli(*arguments, '--force', '--json').stdout)
-    assert data['accel_messages'] == 400
-    assert data['stillness']['moving_ns'] == []
+    assert (data['accel_messages'], data['stillness']['moving_ns']) == (400, [])
     assert cli(*arguments, '--force', '-q').stdout == ''
 
 
@@ -344,7 +338,6 @@ class TestFreezer:
         assert block.temperatures['case'].celsius.min() == pytest.approx(-17.8, abs=0.1)
         assert block.temperatures['board'].celsius.min() == pytest.approx(3.6, abs=0.5)
         assert block.temperatures['barometer'].celsius.min() == pytest.approx(-17.0, abs=0.1)
-        n_barometer = len(block.temperatures['barometer'].celsius)
-        assert report.messages['barometer'] == n_barometer
+        assert report.messages['barometer'] == len(block.temperatures['barometer'].celsius)
         assert report.messages.keys() == {'accel', 'board', 'case', 'barometer'}
         assert report.messages['case'] < 0.75 * report.rows

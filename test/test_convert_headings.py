@@ -59,8 +59,7 @@ PHONE = ','.join(f'{name} {axis} ({unit})' for name, unit in QUANTITIES for axis
 def times(kind):
     ticks = [START + timedelta(microseconds=k * 10**4) for k in range(N)]
     if kind == 'pandas':
-        zone = timezone(timedelta(hours=2))
-        return [str(tick.astimezone(zone)) for tick in ticks]
+        return [str(tick.astimezone(timezone(timedelta(hours=2)))) for tick in ticks]
     if kind == 'actipy':
         return [f'{tick:%Y-%m-%d %H:%M:%S.%f}'[:-3] + '+0000 [Europe/London]' for tick in ticks]
     if kind == 'epoch':
@@ -87,16 +86,14 @@ def test_a_table_is_read_by_its_headings(tmp_path, rng, kind, headings, unit, on
     ]
     path.write_text('\n'.join([headings, *rows]) + '\n')
     columns = guess_columns(path)
-    assert columns.stamp.unit == unit
-    assert columns.accel.unit == ('g' if one_g == 1.0 else 'm/s^2')
+    assert (columns.stamp.unit, columns.accel.unit) == (unit, 'g' if one_g == 1.0 else 'm/s^2')
     (tmp_path / 'map.yaml').write_text('\n'.join(map_lines(columns)))
     assert load_column_map(tmp_path / 'map.yaml') == columns
     log = table_log(path, columns)
     assert log.stamp_ns.tolist() == (START_NS + STEP_NS * np.arange(N)).tolist()
     np.testing.assert_allclose(log.accel, accel, atol=1e-6)
     np.testing.assert_allclose(log.gyro, rate, atol=1e-6)
-    assert set(log.temperatures) == {'board'}
-    assert log.temperatures['board'].celsius[0] == 20.0
+    assert (set(log.temperatures), log.temperatures['board'].celsius[0]) == ({'board'}, 20.0)
 
 
 @pytest.mark.parametrize('kind', ['dates', 'text', 'numbers'])

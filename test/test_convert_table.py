@@ -76,8 +76,7 @@ def test_lines_before_the_table_of_a_logger_are_left_out(tmp_path, separator):
     table = read_text(write(tmp_path / 'log.csv', text), ['t', 'az'], ROWS_ALONE)
     assert np.isnan(table.values['t'][0])
     np.testing.assert_array_equal(table.values['az'][1:], np.arange(60.0))
-    assert table.line[1] == 9
-    assert [*table.short] == [70]
+    assert (table.line[1], [*table.short]) == (9, [70])
 
 
 def test_stamps_of_a_table_are_exact():
@@ -265,8 +264,7 @@ def test_ambiguous_topics_must_be_named():
         find_topics(present(['/imu/data'], ['/imu/t1', '/imu/t2']), None, None, None)
     with pytest.raises(RecordingError, match='holds no sensor_msgs/msg/Imu'):
         find_topics(present([], ['/t']), None, None, None)
-    both = present(['/imu/data'], ['/imu/t1', '/imu/t2'])
-    chosen = find_topics(both, None, '/imu/t2', None)
+    chosen = find_topics(present(['/imu/data'], ['/imu/t1', '/imu/t2']), None, '/imu/t2', None)
     assert (chosen['board'], chosen['case']) == ('/imu/t2', '/imu/t1')
 
 
@@ -340,8 +338,7 @@ def test_steps_of_a_coarse_sensor_are_no_motion_and_five_samples_no_rest(rng):
     accel = np.tile([0.0, 0.0, 1.0], (1000, 1))
     accel[::97, 0] = 0.1
     stillness = find_stillness(np.arange(1000) * 10_000_000, accel)
-    assert stillness.moving_ns == ()
-    assert stillness.magnitude == pytest.approx(1.0, rel=1e-3)
+    assert (stillness.moving_ns, stillness.magnitude) == ((), pytest.approx(1.0, rel=1e-3))
     stillness = find_stillness(np.arange(5), np.ones((5, 3)))
     assert np.isnan(stillness.magnitude)
     assert stillness.moving_ns == ()

@@ -118,8 +118,7 @@ def test_the_gyroscope_of_an_instance_is_in_its_bag_unless_it_is_sparsely_logged
 
 def test_logs_without_sample_times_or_a_thermometer_are_read(tmp_path, rng):
     force = still(rng)
-    path = write_old(tmp_path / 'old.ulg', force, STEP_US)
-    read = read_autopilot(path)
+    read = read_autopilot(write_old(tmp_path / 'old.ulg', force, STEP_US))
     np.testing.assert_array_equal(read.accel, force)
     assert 'case' not in read.temperatures
     # A constant temperature is written every 10 s, so once in this log of 6 s.

@@ -70,8 +70,7 @@ def run_of(rng, seconds=240, rate=4, swing_k=12.0):
                     celsius = 22.0 + wave * (1.0 + 0.1 * ahead) + ahead
                     noise = 0.005 * rng.standard_normal()
                     events.append((name, max(stamp + late, 0), celsius + noise))
-        sample = (rng.normal(0, 900), rng.normal(0, 900), 2900.0)
-        events.append(('accel', stamp, sample))
+        events.append(('accel', stamp, (rng.normal(0, 900), rng.normal(0, 900), 2900.0)))
     return events
 
 
@@ -119,8 +118,7 @@ def test_corrections_drawn_from_the_posterior_scatter_by_the_claimed_sd(rng):
         sd[block.static : block.end] = 1e-6
     sd[layout.misalignment :] = 2e-6
     root = rng.standard_normal((n, 5)) * sd[:, np.newaxis]
-    covariance = root @ root.T + np.diag(0.3 * sd**2)
-    posterior = posterior_of(covariance)
+    posterior = posterior_of(root @ root.T + np.diag(0.3 * sd**2))
     judged = replace(unit, posterior=posterior)
     states = states_of(unit, rng)
     slow = SlowUncertainty(judged, Correction(judged))
@@ -168,8 +166,7 @@ def test_corrections_with_random_initial_lag_states_scatter_by_the_claimed_sd(rn
     unit = full_bank(rng)
     correction = Correction(unit)
     lags = correction.memory.lags
-    states = states_of(unit, rng)
-    _, state, shares = states[0]
+    _, state, shares = states_of(unit, rng)[0]
     state = (*state[:RATE], 0.0, *state[RATE + 1 :])
     column, of_start = np.array([state]).T, np.array([shares]).T
     slow = SlowUncertainty(unit, correction).at(column, of_start)

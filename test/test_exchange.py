@@ -117,13 +117,11 @@ def test_the_bias_of_a_gyroscope_is_exported_and_imported(cubic):
     gyroscope = Gyroscope((0.02, -0.01, 0.03), rates, rates, (1e-4,) * 3)
     unit = replace(cubic, gyroscope=gyroscope)
     celsius = np.linspace(*unit.static.temperature_range_c, 7)
-    t = celsius - unit.reference_temperature_c
-    changes = [Polynomial(curve).value(t) for curve in curves]
+    changes = [Polynomial(curve).value(celsius - unit.reference_temperature_c) for curve in curves]
     true = np.array(gyroscope.bias_rad_s) + np.column_stack(changes)
 
     def again(text):
-        imported = import_calibration(text, serial='7')
-        triad = rate_triad(imported)
+        triad = rate_triad(import_calibration(text, serial='7'))
         return bias_and_scale(triad, ramp_states(triad, celsius))[0]
 
     px4 = export_calibration(unit, 'px4')
@@ -333,8 +331,7 @@ def test_imported_matrices_become_a_triangular_matrix_and_a_rotation():
     x = (RAW - [33124.2, 33275.2, 32364.4]) * [0.00241278, 0.00242712, 0.00241168]
     theirs = x @ np.array([[1.0, -0.00354989, -0.00890444], [0.0, 1.0, -0.0213032],
                            [0.0, 0.0, 1.0]]).T  # fmt: skip
-    rotation = turn(back.provenance.notes)
-    np.testing.assert_allclose(ours(back, RAW) @ rotation.T, theirs, atol=1e-4)
+    np.testing.assert_allclose(ours(back, RAW) @ turn(back.provenance.notes).T, theirs, atol=1e-4)
     SM = np.array([[1.02, 0.03, -0.01], [-0.02, 0.99, 0.02], [0.01, -0.03, 1.01]])
     text = f'SM: {SM.ravel().tolist()}\nbias: [0.12, -0.05, 0.2]\n'
     back = import_calibration(text, serial='7')

@@ -42,8 +42,7 @@ def folder(tmp_path):
 @pytest.mark.parametrize('name', COMMANDS)
 def test_a_command_on_a_full_disk_fails_in_one_line(small_disk, folder, cli, name):
     output = small_disk / name
-    finished = cli(*COMMANDS[name], output, code=1, cwd=folder)
-    (line,) = finished.stderr.strip().splitlines()[-1:]
+    (line,) = cli(*COMMANDS[name], output, code=1, cwd=folder).stderr.strip().splitlines()[-1:]
     assert line.startswith('thermo_comp: error: ')
     assert str(output) in line
     assert line.endswith('No space left on device')
@@ -71,8 +70,7 @@ def test_a_recording_on_a_full_disk_keeps_what_was_written(small_disk, cli):
     with BagWriter(bag) as writer:
         writer.write_counts('accel/counts', stamps, samples)
     options = ('--positions', '1', '--soak', '30min', '-o', small_disk)
-    finished = cli('record', bag, *options, '-q', code=1)
-    (line,) = finished.stderr.strip().splitlines()
+    (line,) = cli('record', bag, *options, '-q', code=1).stderr.strip().splitlines()
     reason = 'cannot be written: No space left on device; the part written is in'
     match = re.fullmatch(rf'thermo_comp: error: {small_disk}/01.mcap: {reason} (\S+)', line)
     assert match, line

@@ -66,8 +66,7 @@ def test_a_node_killed_in_a_ramp_restarts_with_larger_covariance(path):
         node.is_ended = True
     with bench(path) as node:
         first = node.play([e for e in events if 90.0 <= seconds_of(e[1]) < 91.0])
-        assert first.values['regime'] == 'unknown'
-        assert first.values['memory settled'] == 'False'
+        assert (first.values['regime'], first.values['memory settled']) == ('unknown', 'False')
         rest = node.play([e for e in events if seconds_of(e[1]) >= 91.0])
     n = len(first.force)
     # Unknown lag states after a start make the covariance larger than without a restart.
@@ -156,8 +155,7 @@ def test_bad_calibration_files_leave_the_running_calibration(path, tmp_path):
 @pytest.mark.slow
 def test_many_reloads_at_1_khz_lose_no_sample(tmp_path):
     path = tmp_path / 'fast.yaml'
-    fast = unit(unit=Unit('F-1', 'counts', 8388607.0, 1e-3))
-    save_calibration(fast, path)
+    save_calibration(unit(unit=Unit('F-1', 'counts', 8388607.0, 1e-3)), path)
     # Sending ends at the answer to the last reload, before all 60 s of samples have been sent.
     events = bag(rate_hz=1000.0, duration_s=60.0)
     n_reloads = 100

@@ -76,8 +76,7 @@ def turned(rng, ups, rest_s=20.0):
         still = GRAVITY * up + (0.1, -0.2, 0.3) + 0.02 * rng.standard_normal((n, 3))
         parts += [still, GRAVITY * rng.standard_normal((100, 3))]
     accel = np.concatenate(parts)
-    stamp_ns = START_NS + np.arange(len(accel)) * 10_000_000
-    return source_of(stamp_ns, accel, name='turned')
+    return source_of(START_NS + np.arange(len(accel)) * 10_000_000, accel, name='turned')
 
 
 @cache
@@ -314,8 +313,7 @@ def test_two_bags_without_a_pause_between_them_count_as_one_turn_on(rng):
     source = turned(rng, positions(9, 3))
     whole = tumbled(9)
     parts, others = (fit(cut(source, 9400, pause_s), OPTIONS) for pause_s in (0.0, 60.0))
-    n_turn_ons = [done.fit.windows.data.n_turn_ons for done in (whole, parts, others)]
-    assert n_turn_ons == [1, 1, 2]
+    assert [done.fit.windows.data.n_turn_ons for done in (whole, parts, others)] == [1, 1, 2]
     n_mountings = [len(done.fit.selected.score.norms.square) for done in (whole, parts, others)]
     assert n_mountings == [9, 9, 10]
     sd, sd_cut = (done.calibration.static.x.residual_sd_m_s2 for done in (whole, parts))
@@ -444,5 +442,4 @@ def test_rests_of_5_s_determine_the_white_noise_which_is_never_0(rng):
     np.testing.assert_allclose(calibration.noise_density_m_s2_sqrt_hz, 0.002, rtol=0.3)
     rest = Rest(rng)
     rest.accel[:] = GRAVITY * UP
-    noise = fit([rest.source()], OPTIONS).calibration.noise_density_m_s2_sqrt_hz
-    assert min(noise) > 0.0
+    assert min(fit([rest.source()], OPTIONS).calibration.noise_density_m_s2_sqrt_hz) > 0.0

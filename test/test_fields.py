@@ -189,8 +189,7 @@ def test_two_fields_of_a_message_are_two_inputs_and_info_names_further_fields(tm
         open_recording(tmp_path / 'bag', Topics.named({'board': f'{topic}:temp'}), require=())
     with pytest.raises(ValueError, match='`imu` takes whole messages'):
         Topics.named({'imu': '/imu/data:linear_acceleration'})
-    topics = Topics.named({'board': '/case'})
-    findings = survey_recording(tmp_path / 'bag', topics).findings
+    findings = survey_recording(tmp_path / 'bag', Topics.named({'board': '/case'})).findings
     message = next(text for text in findings if 'no case' in text)
     assert message.endswith('with --topic case=TOPIC: /fmu/out/sensor_accel:temperature')
     both = Topics.named({'board': '/case', 'case': '/fmu/out/sensor_accel:temperature'})

@@ -87,8 +87,7 @@ def test_a_thermometer_on_two_topics_is_used_once():
         records = [recording(up, rng) for up in UPS[:3]]
         bags.append([columns(each, f'rest{k}', copies) for k, each in enumerate(records)])
     first, second = (tc.fit(each, gravity=G, input='m/s^2', groups=('curve',)) for each in bags)
-    assert first.static == second.static
-    assert first.axes == second.axes
+    assert (first.static, first.axes) == (second.static, second.axes)
     assert any('temperature/case repeats' in note for note in second.provenance.notes)
     assert not any('repeats' in note for note in first.provenance.notes)
 

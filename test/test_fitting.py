@@ -30,8 +30,7 @@ FACES = np.vstack((np.eye(3), -np.eye(3)))
 
 
 def records_of(unit, ups, seed, program=PROGRAM):
-    plan = [Position(program, up) for up in ups]
-    return arrays(unit, plan, seed, rate_hz=RATE_HZ)
+    return arrays(unit, [Position(program, up) for up in ups], seed, rate_hz=RATE_HZ)
 
 
 def sources_of(records, has_temperature=True, first=0):
@@ -109,8 +108,7 @@ def test_the_residual_of_a_fitted_response_is_the_noise(response):
 @pytest.mark.slow
 def test_the_paper_s_model_fits_a_unit_of_the_paper_s_physics(golovach):
     calibration = golovach.calibration
-    assert calibration.response == ()
-    assert calibration.provenance.model == 'golovach'
+    assert (calibration.response, calibration.provenance.model) == ((), 'golovach')
     for row in golovach.residuals[1:]:
         # Golovach's model has a curve per regime; residuals of a single curve are not computed.
         assert not row.one_set.n
@@ -144,8 +142,7 @@ def test_a_fit_has_all_positions_sources_sections_and_groups(response):
 
 
 def test_the_error_of_the_compensator_is_that_stated_by_the_fit(response):
-    up = np.array([[0.48, -0.6, 0.64]])
-    (record,) = records_of(OWN_LAGS, up, 77)
+    (record,) = records_of(OWN_LAGS, np.array([[0.48, -0.6, 0.64]]), 77)
     compensator = Compensator(response.calibration)
     after = process_block(compensator, ArrayBlock(*arrays_of(record)))
     per_window = round(60.0 * RATE_HZ)
@@ -172,8 +169,7 @@ def test_slow_noise_for_an_unmodelled_drift_leaves_the_white_noise():
 
 
 def test_six_faces_leave_misalignment_at_its_prior():
-    repeats = 1e-6 * STANDARD_GRAVITY
-    result = fitted(PLAIN, FACES, 2, groups=('curve', 'set'), mounting_sd=repeats)
+    result = fitted(PLAIN, FACES, 2, groups=('curve', 'set'), mounting_sd=1e-6 * STANDARD_GRAVITY)
     _, _, M = constants(result.calibration)
     _, scale_sd, M_sd = claimed(result.calibration)
     # Six faces do not determine M, which keeps its prior mean 0 and sd 1 mrad.
@@ -189,8 +185,7 @@ def test_six_faces_leave_misalignment_at_its_prior():
 def test_the_claimed_sd_of_nine_positions_includes_turn_on_offsets(rng):
     # WHY: nine constants fit nine |f| exactly: the claimed sd was too small by a factor of 3 to 5.
     turn_ons = PLAIN.scale_factor * rng.normal(0.0, 50e-6 * STANDARD_GRAVITY, (9, 3))
-    records = records_of(PLAIN, positions(9, 1), 1)
-    pairs = zip(records, turn_ons, strict=True)
+    pairs = zip(records_of(PLAIN, positions(9, 1), 1), turn_ons, strict=True)
     switched_on = [replace(record, counts=record.counts + by) for record, by in pairs]
     options = FitOptions(gravity=STANDARD_GRAVITY, groups=('curve', 'set'))
     found = fit(sources_of(switched_on), options)

@@ -58,8 +58,7 @@ def test_the_evidence_selects_the_condition_that_ends_the_dynamic_regime(end_con
     # A reading every four seconds suffices: the case changes by at most 0.1 K in 4 s.
     unit = triad('plain', 1).with_thermometers(rate_hz=0.25)
     records = []
-    plan = [Position(PROGRAM, up) for up in FACES[:4]]
-    for record in arrays(unit, plan, 11, rate_hz=2.0):
+    for record in arrays(unit, [Position(PROGRAM, up) for up in FACES[:4]], 11, rate_hz=2.0):
         step = np.outer(weight(record, end_condition), STEP * unit.scale_factor)
         records.append(replace(record, counts=record.counts + step))
     result = fit(sources_of(records), FitOptions(gravity=STANDARD_GRAVITY, **options))

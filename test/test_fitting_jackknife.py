@@ -85,8 +85,7 @@ def ratio(path):
     K = np.array([axis.scale_factor for axis in calibration.axes])
     collected = []
     for p in range(data.n_positions):
-        kept = np.flatnonzero(data.position != p)
-        rows = fitting_truth.rows_of(data, kept)
+        rows = fitting_truth.rows_of(data, np.flatnonzero(data.position != p))
         rest = Regression(rows, STANDARD_GRAVITY, K / posterior.state.kappa)
         others = np.arange(data.n_positions) != p
         local = {name: getattr(posterior.state, name)[others] for name in ('up', 'offset', 'tilt')}

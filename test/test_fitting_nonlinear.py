@@ -236,8 +236,7 @@ def test_runs_of_a_centrifuge_determine_nonlinear_terms_that_a_later_fit_keeps()
     stations = []
     for inward in positions(9, 1):
         up = np.cross(inward, np.roll(inward, 1) + 0.1)
-        spin = Spin(time, rate, 1.0, inward)
-        stations.append(Position(program, up / np.linalg.norm(up), spin))
+        stations.append(Position(program, up / np.linalg.norm(up), Spin(time, rate, 1.0, inward)))
     runs = arrays(unit, stations, 3, rate_hz=2.0)
     pairs = enumerate(zip(runs, stations, strict=True))
     sources = [source(run, station.spin, f'run{k}') for k, (run, station) in pairs]

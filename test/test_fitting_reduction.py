@@ -104,8 +104,7 @@ def test_the_estimated_interval_between_samples_is_right_to_0_1_percent(rng, cyc
 def test_windows_are_means_of_their_samples_without_the_bad_samples(rng):
     samples = still(rng, 60.0, UP)
     (interval,) = reduced([block(samples)]).intervals
-    assert interval.count.sum() == len(samples)
-    assert len(interval.time) == 6
+    assert (interval.count.sum(), len(interval.time)) == (len(samples), 6)
     np.testing.assert_allclose(interval.mean[2], samples[2000:3000].mean(axis=0), atol=1e-10)
     assert interval.time[2] == pytest.approx(24.995, abs=1e-9)
     np.testing.assert_allclose(interval.sample_sd, 0.3, rtol=0.1)
@@ -180,8 +179,7 @@ def test_samples_in_bursts_are_a_rest_and_several_with_one_stamp_are_reported(rn
         # The mean rate is 100 Hz; within a burst the stamps are 0.3 ms apart.
         stamps = (number // size * size + size) * 10_000_000 + number % size * 300_000
         bag = reduced([replace(whole, accel_stamp_ns=whole.accel_stamp_ns[0] + stamps)])
-        assert len(bag.intervals) == 1
-        assert bag.cycle_s == pytest.approx(0.01, rel=0.1)
+        assert (len(bag.intervals), bag.cycle_s) == (1, pytest.approx(0.01, rel=0.1))
         assert bag.n_dropped == 0
     whole = block(still(rng, 600.0, UP))
     stamps = whole.accel_stamp_ns[np.arange(len(whole.accel)) // 10 * 10]
@@ -216,8 +214,7 @@ def test_windows_of_a_fit_have_the_stated_length(rate_hz, cell_s, window_s, rng)
     accel = np.array(UP) + 0.3 * rng.standard_normal((n, 3))
     bag = reduced([ArrayBlock(stamps(n, rate_hz), accel)])
     (interval,) = bag.intervals
-    assert bag.window_s == window_s
-    assert bag.n_cells == pytest.approx(150 / cell_s)
+    assert (bag.window_s, bag.n_cells) == (window_s, pytest.approx(150 / cell_s))
     assert interval.n_whole == len(interval.time) == 150 / window_s
     np.testing.assert_allclose(interval.count, window_s * rate_hz, atol=1.0)
     np.testing.assert_allclose(np.diff(interval.time), window_s, atol=1.0 / rate_hz)
@@ -233,8 +230,7 @@ def test_a_last_window_is_kept_if_it_is_at_least_half_full(seconds, left, rng):
 def test_fast_readings_are_averaged_but_each_change_of_a_wide_quantum_is_kept(rng):
     n = 60 * RATE_HZ
     at, celsius = stamps(n), 20.0 + 0.1 * rng.standard_normal(n)
-    accel = still(rng, 60.0, UP)
-    board = reduced([ArrayBlock(at, accel, at, celsius, at, celsius)]).board
+    board = reduced([ArrayBlock(at, still(rng, 60.0, UP), at, celsius, at, celsius)]).board
     assert len(board.value) <= n / 19
     assert board.value.mean() == pytest.approx(celsius.mean(), abs=1e-3)
     bag, noise = dense(rng, 0.05), ThermometerSettings(noise_sd_c=0.05)
@@ -327,8 +323,7 @@ def test_the_detector_settings_follow_the_slowest_ramp(rng):
     n = 9 * 3600
     time = np.arange(0.0, n)
     celsius = np.interp(time, [0.0, 7200.0, 25200.0], [10.0, 10.0, 55.0])
-    celsius = celsius + 0.005 * rng.standard_normal(n)
-    readings = Readings(stamps(n, 1.0), celsius)
+    readings = Readings(stamps(n, 1.0), celsius + 0.005 * rng.standard_normal(n))
     bag = reduced([block(still(rng, 30.0, UP))])
     slow = learn_detector([replace(bag, temperatures={'board': readings, 'case': readings})])
     # The setting `smallest_ramp_k_min` is 0.7 times the rate of the slowest ramp (0.15 K/min).
@@ -341,8 +336,7 @@ def test_a_rest_is_found_at_any_quantum_of_the_samples(step, rng):
     slow = 0.6 * np.sin(np.arange(60 * RATE_HZ) / 900.0)
     accel = 2900.0 + slow[:, None] + 0.05 * rng.standard_normal((len(slow), 3))
     bag = reduced([block(np.round(accel) * step)], full_scale=None)
-    assert len(bag.intervals) == 1
-    assert bag.n_still_cells == bag.n_cells
+    assert (len(bag.intervals), bag.n_still_cells) == (1, bag.n_cells)
 
 
 def test_the_rounding_sd_is_that_of_simulated_rounding_and_smaller_with_a_drift(rng):
@@ -365,8 +359,7 @@ def test_steps_of_a_converter_after_a_constant_soak_do_not_divide_a_rest_but_a_t
     rest = Rest(rng, duration_s=3600.0, sd=0.0)
     ramp = np.maximum(rest.time - 1800.0, 0.0) / 1800.0
     rest.accel = np.rint(rest.accel / 0.04 + 6.0 * np.outer(ramp, (1.0, -1.3, 0.7))) * step
-    bag = reduce_source(rest.source(), full_scale=None)
-    assert len(bag.intervals) == 1
+    assert len(reduce_source(rest.source(), full_scale=None).intervals) == 1
     # WHY: if samples changed only as the unit was turned, this change counted as an ADC step.
     rest = Rest(rng, sd=0.0)
     rest.accel[rest.time > 300.0] = (GRAVITY, 0.0, 0.0)

@@ -146,8 +146,7 @@ def solved(request):
     up = None if pose is None else returned(pose, rng)
     windows, up = table_of(truth, 10, rng, n_windows=12, step_s=400.0, up=up)
     weight = rng.uniform(0.3, 1.0, len(windows.time))
-    bag = windows.position // n_positions
-    windows = replace(windows, weight=weight, bag=bag, pose=pose)
+    windows = replace(windows, weight=weight, bag=windows.position // n_positions, pose=pose)
     regression, state = begin(windows, up)
     # In one or two poses bias, scale and M are undetermined: narrow priors limit their changes.
     narrow = {'scale_sd': 1e-5, 'misalignment_sd': 1e-5, 'bias_sd': np.full(3, 1e-4)}
@@ -281,8 +280,7 @@ def test_a_position_that_alone_determines_a_parameter_has_no_left_out_norm(rng):
     truth = Truth(misalignment=np.zeros(3))
     windows, up = table_of(truth, 6, rng, up=np.vstack((np.eye(3), -np.eye(3))))
     regression, state = begin(windows, up)
-    prior = prior_of(truth, misalignment_sd=1e-3)
-    mode = mode_of(regression, state, prior)
+    mode = mode_of(regression, state, prior_of(truth, misalignment_sd=1e-3))
     score = score_of(regression, mode)
     assert np.isnan(score.force).all()
     assert np.isnan(score.norms.square).all()
@@ -299,8 +297,7 @@ def test_no_step_of_the_solver_increases_the_objective(seed):
     rng = np.random.default_rng(seed)
     truth = Truth(start_sd=5.0, sigma=np.full(3, 5.0 * MICRO))
     windows, up = table_of(truth, 4, rng, n_windows=12, step_s=400.0)
-    windows = replace(windows, start_covariance=100.0 * START)
-    regression, state = begin(windows, up)
+    regression, state = begin(replace(windows, start_covariance=100.0 * START), up)
     prior, sizes = prior_of(truth), []
     for _ in range(10):
         solution = regression.solve(state, prior, n_steps=1)
@@ -332,8 +329,7 @@ def test_published_huygens_coefficients_come_back(rng):
     regression, state = begin(table, up)
     regression = Regression(table, GRAVITY, np.full(3, K0))
     sd, sigma = np.repeat([[1e-2], [1e-3]], 4, axis=1), np.full(3, 1e-6 * MICRO)
-    prior = prior_of(Truth(), column_sd=sd, sigma=sigma)
-    mode = mode_of(regression, state, prior).state
+    mode = mode_of(regression, state, prior_of(Truth(), column_sd=sd, sigma=sigma)).state
     for axis in range(3):
         relative = np.append(1.0, mode.weights[1, axis] / regression.rms)
         scale = K0 * mode.kappa[axis] * relative

@@ -110,8 +110,7 @@ def test_a_group_that_explains_one_bag_or_section_is_not_chosen(where):
         'all': np.ones(len(windows.time), dtype=bool),
     }[where]  # fmt: skip
     added = np.outer(windows.columns[:, 4] * rows, [20.0, -30.0, 25.0]) * MICRO
-    table = replace(windows, mean=windows.mean + NOMINAL * added)
-    _, chosen = selected_of(truth, table, up)
+    _, chosen = selected_of(truth, replace(windows, mean=windows.mean + NOMINAL * added), up)
     assert any('idle' in trial.groups for trial in chosen.trials)
     assert ('idle' in chosen_groups(chosen)) == (where == 'all')
 
@@ -201,8 +200,7 @@ def test_the_prior_sd_of_columns_is_that_of_true_weights_below_the_steepest_plau
     prior = replace(constants(truth), column_sd=candidates.typical)
     settled = settle(regression, state, prior, candidates).prior
     assert (settled.column_sd <= candidates.largest).all()
-    per_kelvin = settled.column_sd[0, 0] / windows.kelvins[0]
-    assert per_kelvin == pytest.approx(STEEPEST[0])
+    assert settled.column_sd[0, 0] / windows.kelvins[0] == pytest.approx(STEEPEST[0])
 
 
 def test_bends_have_one_prior_sd_of_the_change_of_slope():

@@ -50,8 +50,7 @@ def bags(all_bags):
 
 
 def windows_of(bags):
-    sets = sets_of(OPTIONS, bags)
-    model = Model('response', sets, bank(), ('case',), DetectorSettings(), 20.0)
+    model = Model('response', sets_of(OPTIONS, bags), bank(), ('case',), DetectorSettings(), 20.0)
     return thermal_windows(bags, model)
 
 
@@ -158,8 +157,7 @@ def test_windows_with_a_silent_or_stuck_thermometer_are_left_out(bags, name, is_
         readings = Readings(readings.stamp_ns, value)
     else:
         readings = Readings(readings.stamp_ns[~lost], readings.value[~lost])
-    message = replace(bag, temperatures={**bag.temperatures, name: readings})
-    windows = windows_of([message])
+    windows = windows_of([replace(bag, temperatures={**bag.temperatures, name: readings})])
     # Windows are left out from 120 s after the last reading of a silent thermometer (time-out of
     # 60 s, 5 reading intervals, a window) or 600 s after the last change of a stuck thermometer.
     seen_s = 600.0 if is_stuck else 120.0
@@ -207,8 +205,7 @@ def test_curve_columns_of_a_fit_are_powers_of_temperature(
     assert sets.is_shared == is_shared
     assert dynamic is None or sets.dynamic.n_free == dynamic
     t = np.linspace(-5.0, 15.0, 9)
-    weight = np.linspace(0.0, 1.0, 9)
-    columns = sets.columns(t, weight)
+    columns = sets.columns(t, np.linspace(0.0, 1.0, 9))
     assert len(columns) == len(sets.groups) == sets.static.n_free + 1 + sets.dynamic.n_free
     nothing = sets.columns(np.zeros(3), np.array([0.0, 0.5, 1.0]))
     for k, column in enumerate(nothing):

@@ -99,8 +99,7 @@ def test_recordings_that_are_not_parts_of_one_are_not_joined(rng):
     short = recorded(rng, 2.0)
     assert len(joined(reduced([short, short]))) == 2
     # Two recordings have equal stamps: each is joined only with its own second part.
-    other = replace(whole, accel=-whole.accel)
-    parts = [*cut(whole, (200.0,)), *cut(other, (200.0,))[::-1]]
+    parts = [*cut(whole, (200.0,)), *cut(replace(whole, accel=-whole.accel), (200.0,))[::-1]]
     first, second = joined(reduced(parts))
     assert len(first.intervals) == len(second.intervals) == 1
     before, after = cut(whole, (200.0,))
@@ -113,16 +112,14 @@ def test_a_move_between_parts_gives_two_rests_and_parts_without_a_rest_are_joine
     parts = reduced([before, shaken])
     assert not parts[1].intervals
     (bag,) = joined(parts)
-    assert len(bag.intervals) == 1
-    assert bag.n_samples == 60_000
+    assert (len(bag.intervals), bag.n_samples) == (1, 60_000)
     assert parts[1].restless
     assert not bag.restless
     sources = [part.source for part in parts]
     assert len(fit(sources, FitOptions(gravity=9.80665, groups=('curve',))).positions) == 1
     with pytest.raises(FitError, match='part1: '):
         fit(sources[1:], FitOptions(gravity=9.80665))
-    whole = recorded(rng, 600.0)
-    before, after = cut(whole, (300.0,))
+    before, after = cut(recorded(rng, 600.0), (300.0,))
     moved = replace(after, accel=after.accel + np.array([0.0, 1.0, 0.0]))
     (bag,) = joined(reduced([before, moved]))
     first, second = bag.intervals
@@ -196,8 +193,7 @@ def bag(rng, tmp_path):
 
 
 def part_of(path, begin=None, end=None, **options):
-    topics = Topics(part=BagPart(begin, end))
-    with open_recording(path, topics, require=('accel',)) as reader:
+    with open_recording(path, Topics(part=BagPart(begin, end)), require=('accel',)) as reader:
         return list(reader.blocks(**options)), reader.since_s
 
 
@@ -269,8 +265,7 @@ def test_the_part_before_a_jump_is_fitted(rng, tmp_path):
 
 def test_a_jump_of_the_clock_does_not_change_a_part(rng, tmp_path):
     rest = Rest(rng, duration_s=120.0)
-    path = bag_of(tmp_path / 'bag.mcap', rest)
-    block = read_recording(path, require=()).columns
+    block = read_recording(bag_of(tmp_path / 'bag.mcap', rest), require=()).columns
     with BagWriter(tmp_path / 'set.mcap') as writer:
         set_ns = block.accel_stamp_ns + np.where(rest.time >= 60.0, 10**17, 0)
         writer.write_imu('/imu/uncompensated', set_ns, block.accel, np.zeros((len(set_ns), 9)))

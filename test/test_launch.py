@@ -94,8 +94,7 @@ def test_a_parameter_is_set_only_where_its_argument_was_given(tmp_path):
     other = tmp_path / 'counts.yaml'
     save_calibration(calibration(unit=Unit('0042', 'counts', 32767.0, 0.01)), other)
     counts = {'input': 'counts', 'calibration_file': str(other)}
-    some = [{}, {'frame_id': 'body'}, {'serial': '0042', **counts}]
-    for arguments in some:
+    for arguments in [{}, {'frame_id': 'body'}, {'serial': '0042', **counts}]:
         files = []
         # ros2 launch passes the user's file first, then the values of the launch file.
         for name, values in (('mine', mine), ('launch', parameters_set(arguments))):
@@ -121,8 +120,7 @@ def test_executable_parameters_topics_and_drivers_of_a_launch_file_exist():
 
     (node,) = parse(OURS).findall('node')
     assert (node.get('pkg'), node.get('name')) == ('thermo_comp', 'thermo_comp')
-    scripts = re.findall(r"'(\w+) = thermo_comp", (ROOT / 'setup.py').read_text())
-    assert node.get('exec') in scripts
+    assert node.get('exec') in re.findall(r"'(\w+) = thermo_comp", (ROOT / 'setup.py').read_text())
     config = configparser.ConfigParser()
     config.read(ROOT / 'setup.cfg')
     assert config['install']['install_scripts'].endswith('lib/thermo_comp')
@@ -138,8 +136,7 @@ def test_executable_parameters_topics_and_drivers_of_a_launch_file_exist():
         assert topic in topics or topic.startswith('temperature/'), topic
         argument = re.fullmatch(r'\$\(var (\w+)\)', remap.get('to', ''))
         assert defaults[argument[1]] == topic
-    parameters = parameters_set({'driver': 'xsens'})
-    assert parameters['topics'] == str(ROOT / 'config/drivers/xsens.yaml')
+    assert parameters_set({'driver': 'xsens'})['topics'] == str(ROOT / 'config/drivers/xsens.yaml')
     assert 'topics' not in parameters_set({})
 
 

@@ -54,8 +54,7 @@ def test_bags_of_one_environment_do_not_separate_lags_of_board_and_gradient():
 def test_a_bag_without_fan_separates_lags_of_board_and_gradient():
     unit, bags = chamber()
     rng = rng_of('alike', 'still')
-    still = record(unit, HALF, spread(1, rng)[0], rng, environment=STILL_AIR)
-    result = fitted((*bags, still))
+    result = fitted((*bags, record(unit, HALF, spread(1, rng)[0], rng, environment=STILL_AIR)))
     assert all(finding.name != 'environment' for finding in result.findings)
     assert not advice_of(result)
     # Without fan the gradient of a ramp is 1 / 0.7 = 1.43 times as large. One such bag in ten

@@ -74,10 +74,8 @@ def test_any_request_is_answered_and_samples_go_on(peer, unit, together):
         samples.go_on()
         good = Parameter('frame_id', value='body').to_parameter_msg()
         answer = peer.call(kind, name, kind.Request(parameters=[STRANGE[1], good]))
-        config = node._relay.running.config
-        assert config.frame_id == ('' if together else 'body')
-        many = kind.Request(parameters=[good] * (PARAMETERS_LIMIT + 1))
-        answer = peer.call(kind, name, many)
+        assert node._relay.running.config.frame_id == ('' if together else 'body')
+        answer = peer.call(kind, name, kind.Request(parameters=[good] * (PARAMETERS_LIMIT + 1)))
         result = answer.result if together else answer.results[0]
         assert f'at most {PARAMETERS_LIMIT}' in result.reason
         samples.go_on()

@@ -91,8 +91,7 @@ def assert_same(live, offline):
     expected, expected_flags, expected_stamped = output_of(offline)
     assert out.frame_id == expected.frame_id
     assert out.accel_stamp_ns.tolist() == expected.accel_stamp_ns.tolist()
-    different = np.flatnonzero((out.accel != expected.accel).any(axis=1))
-    assert different.tolist() == []
+    assert np.flatnonzero((out.accel != expected.accel).any(axis=1)).tolist() == []
     for name in ImuColumns._fields:
         assert getattr(out.imu, name).tobytes() == getattr(expected.imu, name).tobytes(), name
     # There is one regime flag for each case reading, so equal flags mean equal switching times.

@@ -48,8 +48,7 @@ def test_samples_of_a_second_publisher_are_never_published(peer, unit):
             other.publish(strange)
 
         status = contested(peer, samples.reports, '/accel/counts', both)
-        values = {value.key: value.value for value in status.values}
-        assert values['sample publishers'] == '2'
+        assert {value.key: value.value for value in status.values}['sample publishers'] == '2'
         peer.node.destroy_publisher(other)
         peer.poll(lambda: node._relay.samples.count_publishers() == 1, 'one left')
         # After one of two drivers has ended, samples that it sent before may still arrive.

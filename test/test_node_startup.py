@@ -60,8 +60,7 @@ def test_a_node_that_cannot_start_prints_one_line(overrides, text, unit, tmp_pat
     save_calibration(calibration(unit=Unit('T-1', 'm/s^2', 160.0, 0.01)), tmp_path / 'imu.yaml')
     code = main(arguments(*(override.format(tmp=tmp_path, unit=unit) for override in overrides)))
     printed = capfd.readouterr()
-    assert code == 1
-    assert without_middleware(printed.out) == ''
+    assert (code, without_middleware(printed.out)) == (1, '')
     (line,) = printed.err.splitlines()
     assert line.startswith('thermo_comp_node: ')
     assert text in line
@@ -134,8 +133,7 @@ def test_the_node_needs_only_ros_numpy_and_yaml(unit, peer, tmp_path, monkeypatc
     monkeypatch.setenv('PYTHONPATH', str(tmp_path))
     check = f'from importlib.util import find_spec\nfor name in {ABSENT!r}:\n'
     check += '    try: find_spec(name)\n    except ModuleNotFoundError: print(name)'
-    finished = ran(sys.executable, '-c', check)
-    assert tuple(finished.stdout.split()) == ABSENT
+    assert tuple(ran(sys.executable, '-c', check).stdout.split()) == ABSENT
     heard = peer.listen(Imu, 'imu/data_raw')
     with NodeProcess('-p', f'calibration_file:={unit}') as node:
         driver = Driver(peer)

@@ -30,16 +30,13 @@ def test_version_and_dependencies_are_equal_wherever_they_are_stated():
     assert re.fullmatch(r'\d+\.\d+\.\d+', thermo_comp.__version__)
     finished = ran(sys.executable, 'setup.py', '--version', check=True)
     assert finished.stdout.split()[-1] == thermo_comp.__version__
-    assert MANIFEST.get('format') == '3'
-    assert MANIFEST.findtext('name') == 'thermo_comp'
+    assert (MANIFEST.get('format'), MANIFEST.findtext('name')) == ('3', 'thermo_comp')
     assert MANIFEST.findtext('export/build_type') == 'ament_python'
     tags = ('depend', 'exec_depend', 'build_depend', 'test_depend')
-    keys = {node.text for tag in tags for node in MANIFEST.iter(tag)}
-    assert keys == KNOWN_KEYS
+    assert {node.text for tag in tags for node in MANIFEST.iter(tag)} == KNOWN_KEYS
     # Commands have further dependencies, which come from PyPI.
     keys = {node.text for node in MANIFEST.iter('exec_depend')}
-    libraries = {key for key in keys if key.startswith('python3-')}
-    assert libraries == {'python3-numpy', 'python3-yaml'}
+    assert {key for key in keys if key.startswith('python3-')} == {'python3-numpy', 'python3-yaml'}
     install = re.search(r'^INSTALL = (\[.*?^\])', (ROOT / 'setup.py').read_text(), re.M | re.S)[1]
     install = ast.literal_eval(install)
     assert isinstance(install, list)

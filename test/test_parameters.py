@@ -30,8 +30,7 @@ def test_parameters_are_described_and_overrides_are_applied():
             assert bool(shown.floating_point_range) == isinstance(entry.default, float)
             assert bool(shown.integer_range) == isinstance(entry.default, int)
     assert parameters.descriptor('input').additional_constraints == 'one of: counts, imu'
-    assert config == NodeConfig()
-    assert config.compensator_config() == CompensatorConfig()
+    assert (config, config.compensator_config()) == (NodeConfig(), CompensatorConfig())
     table, text = parameters_table(), parameters.parameters_help()
     for entry in fields(NodeConfig):
         assert f'| `{entry.name}` |' in table

@@ -152,8 +152,7 @@ def test_lags_of_a_noisy_sensor_are_fitted_to_bags_of_one_warm_up():
     unit = cases.navigation(rng, part_s=np.array([657.0, 797.0, 1389.0]))
     unit = replace(unit, density=30.0, bias_curve=5.0 * unit.bias_curve, counts=0.0)
     bags = cases.positions(unit, thaw, spread(12, rng), rng)
-    study = cases.Study('', bags, {}, {'input': 'm/s^2'})
-    taus = np.array(taus_of(strangers.fitted(study)))
+    taus = np.array(taus_of(strangers.fitted(cases.Study('', bags, {}, {'input': 'm/s^2'}))))
     assert taus == pytest.approx(unit.part_s[:, None], rel=0.03)
 
 
@@ -208,8 +207,7 @@ def test_the_lags_of_parts_are_found_beside_an_effect_of_the_gradient():
 def test_a_bump_of_the_bias_over_temperature_is_fitted_by_knees():
     # The bump of the bias lasts for 2 min, and must not be taken for motion.
     _, study = study_of('bump', bump=np.array([450.0, -400.0, 500.0]), bump_c=17.0)
-    calibration = strangers.fitted(study, groups=('curve', 'part', 'bend'))
-    judgement = judged(calibration, study)
+    judgement = judged(strangers.fitted(study, groups=('curve', 'part', 'bend')), study)
     # The bump of the bias, a bell curve (sd 0.85 K), is fitted by straight lines of 0.5 K each.
     assert judgement.norm < 60.0
     assert judgement.norm_ratio < 1.5
@@ -264,8 +262,7 @@ def test_six_faces_in_three_soaks_determine_the_curve_at_other_temperatures():
     )  # fmt: skip
     for stated in ({}, {'mounting_sd': 3e-4}):
         # Means over 25 min have a noise of 4 ug; rounding to 0.5 mg adds errors of some 40 ug.
-        calibration = strangers.fitted(study, **stated)
-        assert judged(calibration, study).vector < 100.0
+        assert judged(strangers.fitted(study, **stated), study).vector < 100.0
 
 
 @pytest.mark.slow
@@ -343,11 +340,9 @@ def test_units_of_a_type_share_the_lags_of_the_bank(parts):
 
     def sibling(k, ratio):
         terms = tuple(replace(term, tau_s=ratio * term.tau_s) for term in calibration.response)
-        unit = replace(calibration.unit, serial=f'u{k}')
-        return replace(calibration, unit=unit, response=terms)
+        return replace(calibration, unit=replace(calibration.unit, serial=f'u{k}'), response=terms)
 
-    units = [sibling(k, ratio) for k, ratio in enumerate((0.93, 0.98, 1.02, 1.07))]
-    mean = population(units)
+    mean = population([sibling(k, ratio) for k, ratio in enumerate((0.93, 0.98, 1.02, 1.07))])
     assert {term.tau_s for term in mean.response if term.tau_s} <= {*FINE_TAUS}
     bag = slow(study.tests[''][0])
     off = strangers.corrected(mean, bag).force - strangers.corrected(calibration, bag).force

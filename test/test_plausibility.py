@@ -256,6 +256,5 @@ def test_two_thermometers_at_one_temperature_are_not_taken_for_one(quantum):
     for second in range(20_000):
         true = 20.0 + 10.0 * math.sin(second / 1000.0)
         for name in ('board', 'case'):
-            reading = rounded(true + 0.02 * rng.standard_normal())
-            tracker.read(name, second * SECOND_NS, reading)
+            tracker.read(name, second * SECOND_NS, rounded(true + 0.02 * rng.standard_normal()))
         assert not tracker.copies['case'].is_copy

@@ -34,15 +34,13 @@ OPTIONS = FitOptions(STANDARD_GRAVITY, groups=('curve', 'board', 'product'))
 def source(record):
     # A reading every 8 s is sufficient in ramps of 1 K/min, and saves most of the time of a fit.
     arrays = arrays_of(record, 8)
-    later = [array + 10**18 if array.dtype == np.int64 else array for array in arrays]
-    return source_of(*later)
+    return source_of(*[array + 10**18 if array.dtype == np.int64 else array for array in arrays])
 
 
 @cache
 def test_of(number, first, last):
     """Record positions `first` to `last` - 1 (of twelve) of sibling `number`."""
-    ups = positions(12, number)[first:last]
-    stations = [Position(PROGRAM, up) for up in ups]
+    stations = [Position(PROGRAM, up) for up in positions(12, number)[first:last]]
     return tuple(arrays(sibling(KIND, number, 0.15), stations, 100 * number + first))
 
 
@@ -63,8 +61,7 @@ def siblings():
 def sd_of_levels(calibration):
     variance = np.diag(calibration.posterior.covariance())
     places = [block.static for block in parameter_layout(calibration).bias]
-    K = [axis.scale_factor for axis in calibration.axes]
-    return np.sqrt(variance[places]) / np.abs(K)
+    return np.sqrt(variance[places]) / np.abs([axis.scale_factor for axis in calibration.axes])
 
 
 @pytest.mark.slow
@@ -124,8 +121,7 @@ def test_chance_correlations_between_parameters_of_twelve_units_are_reduced(rng)
     assert share_left(independent, level) == pytest.approx(1.0 - pair**2)
     assert share_left(independent, bias) > 0.5
     # The prior keeps a correlation that all twelve units show.
-    common = rng.standard_normal((12, 1)) + 0.01 * independent
-    assert share_left(common, bias) < 0.1
+    assert share_left(rng.standard_normal((12, 1)) + 0.01 * independent, bias) < 0.1
 
 
 @pytest.mark.slow
@@ -170,8 +166,7 @@ def test_a_fit_begins_with_the_widest_of_its_priors():
     assert len(tried) > 2
     root = np.sqrt(np.diag(widest))
     for precision in tried:
-        narrower = (precision - widest) / np.outer(root, root)
-        assert np.linalg.eigvalsh(narrower).min() > -1e-6
+        assert np.linalg.eigvalsh((precision - widest) / np.outer(root, root)).min() > -1e-6
 
 
 @pytest.mark.slow

@@ -133,8 +133,7 @@ def test_messages_overwritten_by_zeros_are_not_returned(tmp_path):
             result = outcome(path)
             if isinstance(result, Recording):
                 assert result.info.truncated is not None
-                n = result.columns.n_messages
-                assert_columns(result.columns, messages[:n])
+                assert_columns(result.columns, messages[: result.columns.n_messages])
 
 
 def test_the_message_names_the_cut_file_of_a_directory(tmp_path):

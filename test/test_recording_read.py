@@ -111,8 +111,7 @@ def test_directories_written_by_rosbags_are_read(messages, storage, compression)
         rec.write_rosbag2(path, messages, storage=storage, compression=compression)
         recording = read(path)
         rec.assert_columns(recording.columns, messages)
-        assert recording.info.storage == storage
-        assert recording.info.n_messages == len(messages)
+        assert (recording.info.storage, recording.info.n_messages) == (storage, len(messages))
 
 
 @settings(max_examples=10, deadline=None)

@@ -60,8 +60,7 @@ def test_ros_1_messages_in_an_mcap_file_are_read(tmp_path):
     with open_recording(path, require=('accel',)) as reader:
         (block,) = reader.blocks(raw=True)
     assert block.accel.tolist() == [[1.5, -2.5, 3.5]]
-    assert block.accel_stamp_ns.tolist() == [12 * 10**9 + 34]
-    assert block.frame_id == 'link'
+    assert (block.accel_stamp_ns.tolist(), block.frame_id) == ([12 * 10**9 + 34], 'link')
     message = rec.Message(rec.ACCEL, 1, 12 * 10**9 + 34, 'link', (1.5, -2.5, 3.5))
     assert block.raw['accel'].data.tobytes() == rec.serialize(message)
 

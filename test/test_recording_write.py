@@ -114,10 +114,8 @@ def test_a_written_directory_equals_that_of_rosbag2_and_a_file_contains_its_name
     assert {p.name for p in (tmp_path / 'bag').iterdir()} == {'metadata.yaml', 'bag_0.mcap'}
     content = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
     content = content['rosbag2_bagfile_information']
-    assert content['version'] == 9
-    assert content['storage_identifier'] == 'mcap'
-    assert content['relative_file_paths'] == ['bag_0.mcap']
-    assert content['message_count'] == 5
+    assert (content['version'], content['storage_identifier']) == (9, 'mcap')
+    assert (content['relative_file_paths'], content['message_count']) == (['bag_0.mcap'], 5)
     assert content['starting_time'] == {'nanoseconds_since_epoch': rec.START_NS}
     assert content['duration'] == {'nanoseconds': 4 * STEP_NS}
     assert content['custom_data'] == {'serial': '7'}
@@ -168,8 +166,7 @@ def test_an_existing_output_stays_until_the_new_output_is_complete(tmp_path, nam
     assert value() == 1.0
     assert [p.name for p in tmp_path.iterdir()] == [name]  # no temporary file remains
     small(path, 3.0, overwrite=True)
-    assert value() == 3.0
-    assert [p.name for p in tmp_path.iterdir()] == [name]
+    assert (value(), [p.name for p in tmp_path.iterdir()]) == (3.0, [name])
 
 
 def test_an_output_may_be_a_link_but_never_replaces_a_file_or_folder_that_is_no_bag(tmp_path):

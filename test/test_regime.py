@@ -96,8 +96,7 @@ def test_the_onset_delay_is_below_twice_that_of_a_cusum_test(sensor, threshold):
         x = signature + rng.normal(0.0, noise, len(k))
         ratio = np.cumsum(signature * x - 0.5 * signature**2) / noise**2
         delays.append(k[np.argmax(ratio > threshold)])
-    ours = np.median([each[0][0] for each in headline(sensor)[0]])
-    assert ours <= 2.0 * np.median(delays)
+    assert np.median([each[0][0] for each in headline(sensor)[0]]) <= 2.0 * np.median(delays)
 
 
 @pytest.mark.parametrize(
@@ -212,8 +211,7 @@ def run_once(corners, *, quantum=0.0, begin=-1800.0, end=8000.0, **parts):
     readings = dict(zip(('case', 'board'), both, strict=True))
     for name, change in parts.items():
         readings[name] = change(t, readings[name])
-    settings = detector_settings(0.001, quantum)
-    return switches(settings, t, readings['case'], readings['board'])
+    return switches(detector_settings(0.001, quantum), t, readings['case'], readings['board'])
 
 
 def gone(t, readings):

@@ -139,13 +139,11 @@ def test_a_page_without_calibration_shows_temperatures_derivatives_and_regime(op
     known = truth.grid_s > 10 * 60
     assert np.mean(dynamic[known] == ideal[known]) > 0.9
     directions = [s.direction for s in shown.stretches if s.direction]
-    assert directions[0] == 1
-    assert directions[-1] == -1
+    assert (directions[0], directions[-1]) == (1, -1)
     page = page_of(seen, tmp_path)
     assert 'no calibration was judged' in page.text
     assert 'means over 60 s at rest' in page.text
-    without = replace(seen, windows=None)
-    assert 'means over' not in page_of(without, tmp_path / 'without').text
+    assert 'means over' not in page_of(replace(seen, windows=None), tmp_path / 'without').text
     assert [figure.name for figure in figures_of(seen)] == ['temperatures', 'dynamics']
     assert all(figure.question in page.text for figure in figures_of(seen))
 

@@ -170,12 +170,10 @@ def test_the_uncertainty_budget_adds_up_to_the_claimed_sd_or_a_larger_residual(t
     parts = [standards[name] for name in ('noise', 'attitude', LACK, 'model')]
     assert float(np.linalg.norm(parts)) == pytest.approx(claim)
     assert standards['repeatability'] == 0.0
-    info = load_certificate_info(lab(tmp_path))
-    stated = budget(evidence(), info)
+    stated = budget(evidence(), load_certificate_info(lab(tmp_path)))
     by_name = {contribution.name: contribution.standard for contribution in stated}
     assert by_name['gravity'] == 2e-5
-    expected = math.hypot(claim, 2e-5, by_name['thermometers'])
-    assert combined(stated) == pytest.approx(expected)
+    assert combined(stated) == pytest.approx(math.hypot(claim, 2e-5, by_name['thermometers']))
     judgement, claim = evidence().judgement, combined(budget(evidence(), CertificateInfo()))
     doubtful = replace(evidence(), judgement=replace(judgement, left_out_rms=3.0 * claim))
     standards = {source.name: source.standard for source in budget(doubtful, CertificateInfo())}
@@ -247,8 +245,7 @@ def test_without_a_stated_uncertainty_of_gravity_that_of_scale_factors_is_withhe
     assert 'withheld' not in render_report(evidence(), info)
     # WHY: the file of the calibration did not store gravity's sd, so U was withheld after a fit.
     unit = replace(evidence().calibration, gravity_sd_m_s2=2e-5)
-    read = parse_calibration(dump_calibration(unit).encode())
-    stated = replace(evidence(), calibration=read)
+    stated = replace(evidence(), calibration=parse_calibration(dump_calibration(unit).encode()))
     page = render_report(stated)
     assert 'withheld' not in page
     # WHY: gravity's sd was in all expanded uncertainties, but its line in the page was blank.
@@ -261,8 +258,7 @@ def float_of(cell):
 
 
 def test_the_table_over_temperature_agrees_with_the_calibration(tmp_path):
-    info = load_certificate_info(lab(tmp_path))
-    tables = over_temperature(evidence(), info)
+    tables = over_temperature(evidence(), load_certificate_info(lab(tmp_path)))
     assert [table.axis for table in tables] == ['x', 'y', 'z']
     calibration = fitted().calibration
     for k, table in enumerate(tables):

@@ -137,8 +137,7 @@ def below_a_step(rng, _):
 def test_no_sample_of_a_working_sensor_at_rest_is_stuck(draw, size, noise, rng):
     compensator, table = Compensator(noisy_unit(noise)), draw(rng, size)
     stream(compensator, recording(len(table), 100.0, lambda k: tuple(table[k].tolist())))
-    assert compensator.counters.n_stuck == 0
-    assert compensator.counters.n_out == len(table)
+    assert (compensator.counters.n_stuck, compensator.counters.n_out) == (0, len(table))
 
 
 def test_the_variance_of_samples_in_m_s2_is_proportional_to_their_rate(rng):
@@ -289,8 +288,7 @@ def test_the_residual_of_a_good_calibration_is_near_0_and_motion_gives_no_verdic
     assert watch(rng, motion=0.05) is None
     monitor = GravityCheck(GRAVITY)
     watch(rng, seconds=10, monitor=monitor)
-    result = watch(rng, seconds=10, monitor=monitor)
-    assert result.n_windows == 19
+    assert watch(rng, seconds=10, monitor=monitor).n_windows == 19
 
 
 def steps(rng, *, offset, at_s=20.0, ramp_s=0.0, rate_hz=2.5, scatter=0.0):
@@ -352,8 +350,7 @@ def test_a_vibration_of_whole_periods_between_readings_is_no_rest(rng):
 
     compensator = Compensator(calibration())
     stream(compensator, recording(3000, 100.0, shaken))
-    assert compensator.counters.n_refuted == 0
-    assert compensator.counters.n_out == 3000
+    assert (compensator.counters.n_refuted, compensator.counters.n_out) == (0, 3000)
 
 
 def test_the_message_states_the_deviation_of_the_latest_windows(rng):

@@ -49,8 +49,7 @@ def ramp(given, rate, hours, environment=units.CHAMBER):
 def test_a_node_lags_a_ramp_by_its_time_constant_and_the_hidden_node_depends_on_the_air():
     # A node with x' = (u - x) / tau lags a ramp u by rate * tau after many time constants.
     lags = np.array([500.0, 900.0, 1500.0])
-    given = unit(board_s=700.0, part_s=lags)
-    _, states = ramp(given, 0.01, 12)
+    _, states = ramp(unit(board_s=700.0, part_s=lags), 0.01, 12)
     case, board = states[-1, units.CASE], states[-1, units.BOARD]
     assert case - board == pytest.approx(0.01 * 700.0, rel=1e-6)
     assert board - states[-1, units.PARTS] == pytest.approx(0.01 * lags, rel=1e-6)
@@ -243,19 +242,16 @@ def test_the_scipy_cubic_fits_a_cubic_bias_in_many_attitudes_and_its_drift_in_on
 
 def test_a_scipy_fit_to_one_attitude_does_not_change_the_scatter_of_forces():
     # WHY: without bounds, a fit to one attitude found scale factors that made all forces equal.
-    rng = rng_of('few')
-    samples = GRAVITY * LEVEL + 0.3 * rng.standard_normal((200, 3))
+    samples = GRAVITY * LEVEL + 0.3 * rng_of('few').standard_normal((200, 3))
     few = Minutes(samples, np.full(200, 20.0), np.full((200, 3), np.nan))
-    force = by_norm([few])(few)
-    assert force.std(axis=0) == pytest.approx(samples.std(axis=0), rel=0.4)
+    assert by_norm([few])(few).std(axis=0) == pytest.approx(samples.std(axis=0), rel=0.4)
 
 
 def test_the_bias_score_is_error_over_bound_and_error_over_claimed_sd():
     # In the calibration the bias of x has an error of 1 count, 1 / 300 m/s^2.
     bias = np.array([0.1, -0.2, 0.3])
     axes = Axes(*(AxisReference(300.0, 300.0 * b) for b in bias + np.array([1 / 300.0, 0.0, 0.0])))
-    bound = cases.Bound(unit(counts=300.0), bias, np.full(3, 1e-3))
-    study = cases.Study('', (), {}, bound=bound)
+    study = cases.Study('', (), {}, bound=cases.Bound(unit(counts=300.0), bias, np.full(3, 1e-3)))
     # The calibration claims a bias sd of 2e-3 m/s^2; the turn-on sd, 5e-3 m/s^2, is not counted.
     again = axis_set(residual_sd_m_s2=5e-3)
     known = regime_set(x=again, y=again, z=again)
@@ -274,15 +270,13 @@ def test_a_minute_is_a_mean_whose_claimed_sd_is_its_noise():
     time_s = np.arange(1.0, 151.0)
     samples = np.repeat(time_s[:, None], 3, axis=1)
     mean = minutes(Bag('', time_s, samples, {'board': (time_s, 2.0 * time_s)}))
-    assert mean.samples[:, 0].tolist() == [30.5, 90.5]
-    assert mean.board.tolist() == [61.0, 181.0]
+    assert (mean.samples[:, 0].tolist(), mean.board.tolist()) == ([30.5, 90.5], [61.0, 181.0])
     assert np.isnan(mean.force).all()
     # The calibration claims only white noise and rounding of counts.
     samples = np.tile(300.0 * GRAVITY * LEVEL, (30000, 1))
     samples[::2] += 1.0
     samples[1::2] -= 1.0
-    bag = Bag('', np.arange(1, 30001) * 0.01, samples, {})
-    out = strangers.corrected(calibration(), bag)
+    out = strangers.corrected(calibration(), Bag('', np.arange(1, 30001) * 0.01, samples, {}))
     assert np.sqrt(np.diagonal(out.claim, axis1=1, axis2=2)) == pytest.approx(1e-4 / np.sqrt(60.0))
     assert out.white == pytest.approx([1e-8 / 60.0] * 3)
     assert out.force == pytest.approx(np.tile(GRAVITY * LEVEL, (5, 1)))

@@ -175,8 +175,7 @@ def test_prediction_correction_and_blend_equal_matrix_algebra():
     gain = covariance[:, 0] / (covariance[0, 0] + 0.2)
     np.testing.assert_allclose(out[:3], mean + gain * (5.0 - mean[0]), rtol=1e-13)
     np.testing.assert_allclose(out[3:], (covariance - np.outer(gain, covariance[0]))[UPPER])
-    assert innovation == 5.0 - mean[0]
-    assert spread == pytest.approx(covariance[0, 0] + 0.2)
+    assert (innovation, spread) == (5.0 - mean[0], pytest.approx(covariance[0, 0] + 0.2))
     rng = np.random.default_rng(2)
     states, samples = [], []
     for n in (300_000, 100_000):
@@ -199,8 +198,7 @@ def test_readings_that_are_not_finite_or_not_newer_do_not_change_the_state(stamp
     thermometer = settled()
     before = state(thermometer)
     assert not thermometer.update(stamp_s * SECOND_NS, reading)
-    assert state(thermometer) == before
-    assert thermometer.n_in_row == 600
+    assert (state(thermometer), thermometer.n_in_row) == (before, 600)
 
 
 def test_a_far_reading_has_little_weight_and_a_lasting_step_is_accepted_after_four():
@@ -233,8 +231,7 @@ def test_a_gap_increases_the_variance_or_restarts_and_changed_ns_is_the_stamp_of
     thermometer = settled()
     for k in range(600, 700):
         thermometer.update(k * SECOND_NS, 20.0)
-    assert thermometer.changed_ns == 600 * SECOND_NS
-    assert thermometer.stamp_ns == 699 * SECOND_NS
+    assert (thermometer.changed_ns, thermometer.stamp_ns) == (600 * SECOND_NS, 699 * SECOND_NS)
 
 
 def test_the_noise_is_estimated_if_the_setting_is_too_small():

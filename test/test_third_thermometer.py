@@ -91,8 +91,7 @@ def test_a_third_thermometer_reduces_the_error_to_the_noise(runs, tmp_path):
         means = error[use][:n].reshape(-1, 120, 3).mean(axis=1)
         errors[sees_lid] = float(np.sqrt(np.mean(np.var(means, axis=0)))) / MICRO_G
         judged = evaluate([held_out], [('unit', tried)]).judgements['unit']
-        norms = np.linalg.norm(judged.windows.force, axis=1)
-        spreads[sees_lid] = float(np.std(norms)) / MICRO_G
+        spreads[sees_lid] = float(np.std(np.linalg.norm(judged.windows.force, axis=1))) / MICRO_G
     switched = float(np.sqrt(np.mean(np.square(LID_UG_K)))) * LOAD_K / 2.0
     assert errors[False] > 0.3 * switched
     assert errors[True] < 0.05 * switched

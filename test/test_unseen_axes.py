@@ -114,8 +114,7 @@ def test_rests_in_one_pose_at_four_temperatures_determine_the_drift_of_level_axe
     study = list(cases.returned(unit))[poses - 1]
     calibration = strangers.fitted(study)
     (held,) = map(slow, study.tests[''])
-    force = strangers.corrected(calibration, held).force
-    drift = force - strangers.minutes(held).force
+    drift = strangers.corrected(calibration, held).force - strangers.minutes(held).force
     drift -= np.nanmean(drift, axis=0)
     # Attitude errors of 0.2 mrad RMS cause errors of about 0.2 mg; the tolerance is twice that.
     assert np.sqrt(np.nanmean(drift**2)) < 2.0 * 2e-4 * GRAVITY
@@ -139,8 +138,7 @@ def test_only_an_attitude_to_which_the_unit_was_returned_is_a_pose():
 
 def test_rests_in_one_pose_use_the_mounting_sd_that_the_user_stated():
     # WHY: a fit of rests in one pose used a smaller sd of mountings than the user had stated.
-    study = next(cases.returned(1))
-    calibration = strangers.fitted(study, mounting_sd=0.01)
+    calibration = strangers.fitted(next(cases.returned(1)), mounting_sd=0.01)
     for axis in calibration.static.axes():
         assert axis.residual_sd_m_s2 == pytest.approx(0.01)
 
