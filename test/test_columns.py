@@ -32,7 +32,7 @@ def by_group(columns):
     return Counter(column.group for column in columns)
 
 
-def test_the_columns_of_the_bank_differ_and_bends_are_within_the_temperature_span():
+def test_columns_of_the_bank_differ_bend_within_the_span_or_are_even_about_rest():
     assert tuple(60.0 * 2.0**k for k in range(8)) == BANK_TAUS
     assert pytest.approx([60.0 * 2.0 ** (k / 2) for k in range(15)]) == FINE_TAUS
     assert by_group(bank()).keys() == by_group(bank(('case', 'tip'))).keys()
@@ -41,9 +41,6 @@ def test_the_columns_of_the_bank_differ_and_bends_are_within_the_temperature_spa
     bends = [column for column in bank(span_k=(-10.0, 2.0)) if column.group == 'bend']
     assert len(bends) == 12 * len({column.tau_s for column in bends}) == 96
     assert all(-10.0 < column.knee_k < 2.0 for column in bends)
-
-
-def test_gradient_even_about_rest_is_an_even_function_of_gradient_less_rest():
     warm = bank(('case', 'tip'), {'case': -0.5, 'tip': 0.0})
     change = [column for column in warm if column.group == 'gradient_even_about_rest']
     assert by_group(warm)['gradient_even_about_rest'] == 21

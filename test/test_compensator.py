@@ -36,7 +36,7 @@ from thermo_comp.unit.correction import Correction
 NOISE = 1e-4**2 / 0.01 + (1.0 / 6.0) / 300.0**2
 
 
-def test_the_offset_is_half_the_sum_of_signed_counts():
+def test_corrected_samples_agree_with_the_formulas_of_two_faces_and_of_the_static_set():
     # Counts at +-g: offset = sum / 2, scale = difference / 2 (Golovach's Eq. (3), (4): exchanged).
     plus, minus = 300.0 * GRAVITY + 12.0, -300.0 * GRAVITY + 12.0
     axis = AxisReference((plus - minus) / 2.0 / GRAVITY, (plus + minus) / 2.0)
@@ -44,9 +44,6 @@ def test_the_offset_is_half_the_sum_of_signed_counts():
     warm(compensator)
     corrected = compensator.process(1, plus, minus, 12.0)[:3]
     assert corrected == pytest.approx((GRAVITY, -GRAVITY, 0.0), abs=1e-12)
-
-
-def test_a_corrected_sample_agrees_with_the_formula_of_the_static_set():
     axis = axis_set((0.0, 0.5, 0.01), (1.0, 1e-4), delta=2.0)
     unit = calibration(
         axes=equal_axes(300.0, 7.0),

@@ -73,26 +73,21 @@ def test_a_bag_converted_from_a_table_has_the_values_of_the_table(tmp_path):
     assert 'gravity is 1 g' in report.inferred_unit
 
 
-def test_counts_with_a_stated_sensitivity_become_imu_messages(tmp_path):
+def test_counts_are_converted_with_a_stated_sensitivity_and_less_an_offset(tmp_path):
     path, columns = table(tmp_path / 'log.csv', scale=2048.0)
     accel = {'columns': ['ax', 'ay', 'az'], 'unit': 'counts', 'output': 'imu'}
-    right = column_map(accel={**accel, 'counts_per_g': 2048.0})
-    write_log(table_log(path, right), tmp_path / 'bag')
+    accel |= {'counts_per_g': 2048.0}
+    write_log(table_log(path, column_map(accel=accel)), tmp_path / 'bag')
     block = read_recording(tmp_path / 'bag').columns
     np.testing.assert_allclose(block.accel[:, 0], columns['ax'] * STANDARD_GRAVITY / 2048.0)
     wrong = table_log(path, column_map(accel={**accel, 'counts_per_g': 16384.0}))
     with pytest.raises(RecordingError, match=r'16384 counts/g are stated$'):
         write_log(wrong, tmp_path / 'other')
     assert not (tmp_path / 'other').exists()
-
-
-def test_an_offset_of_raw_words_is_subtracted(tmp_path):
-    path, columns = table(tmp_path / 'log.csv', scale=2048.0)
     rows = np.loadtxt(path, delimiter=',', skiprows=1)
     rows[:, 1:4] += 32768.0
     np.savetxt(path, rows, '%.17g', ',', header=','.join(columns), comments='')
-    accel = {'columns': ['ax', 'ay', 'az'], 'unit': 'counts', 'output': 'counts'}
-    accel |= {'counts_per_g': 2048.0, 'clip': [0, 65535]}
+    accel |= {'output': 'counts', 'clip': [0, 65535]}
     with pytest.raises(RecordingError, match='is there an `offset`'):
         write_log(table_log(path, column_map(accel=accel)), tmp_path / 'bag.mcap')
     log = table_log(path, column_map(accel={**accel, 'offset': 32768.0}))

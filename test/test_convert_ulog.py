@@ -196,7 +196,7 @@ def parameter(name, value):
     return bytes([len(key)]) + key + struct.pack('<i', value)
 
 
-def test_sensor_combined_replaces_a_missing_sensor_accel(tmp_path, rng, cli):
+def test_sensor_combined_replaces_sensor_accel_unless_px4_compensated_it(tmp_path, rng, cli):
     path = tmp_path / 'default.ulg'
     force = write_combined(path, rng)
     read = read_autopilot(path)
@@ -208,9 +208,6 @@ def test_sensor_combined_replaces_a_missing_sensor_accel(tmp_path, rng, cli):
     printed = cli('convert', path, '-o', tmp_path / 'bag.mcap').stdout
     assert 'the log has no sensor_accel' in printed
     assert 'add 4 to SDLOG_PROFILE' in printed
-
-
-def test_a_combined_sensor_that_px4_compensated_is_refused(tmp_path, rng):
     path = tmp_path / 'corrected.ulg'
     write_combined(path, rng, TC_A_ENABLE=1)
     with pytest.raises(RecordingError, match=r'TC_A_ENABLE was 1.*SDLOG_PROFILE'):

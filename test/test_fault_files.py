@@ -115,10 +115,12 @@ sys.exit(main())
 """
 
 
-def run(script, *arguments, cwd):
-    command = [sys.executable, '-c', script, *arguments]
+def killed_replay(script, point, name, folder):
+    """Run a script that replays the bag HELD_OUT into `folder`/`name` and kills itself."""
+    arguments = [str(word) for word in COMMANDS['bag.mcap']]
+    command = [sys.executable, '-c', script, point, name, *arguments, name]
     environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
-    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, check=False)
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, check=False)
 
 
 @pytest.mark.parametrize('point', ['before', 'writing'])
@@ -126,8 +128,7 @@ def test_a_killed_command_leaves_the_old_file(folder, point):
     output = folder / 'bag.mcap'
     output.write_bytes(b'\x89MCAP old')
     listed = set(folder.iterdir())
-    arguments = [str(word) for word in COMMANDS['bag.mcap']]
-    killed = run(KILLED, point, output.name, *arguments, output.name, cwd=folder)
+    killed = killed_replay(KILLED, point, output.name, folder)
     assert killed.returncode == -signal.SIGKILL, killed.stderr
     assert output.read_bytes() == b'\x89MCAP old'
     (rest,) = set(folder.iterdir()) - listed
@@ -141,8 +142,6 @@ def test_a_killed_command_leaves_the_old_file(folder, point):
 def test_a_command_ended_by_sigterm_leaves_no_file(folder, name):
     # WHY: a command that was ended by SIGTERM left a hidden file as large as the bag.
     listed = set(folder.iterdir())
-    arguments = [str(word) for word in COMMANDS['bag.mcap']]
-    script = KILLED.replace('SIGKILL', 'SIGTERM')
-    ended = run(script, 'writing', name, *arguments, name, cwd=folder)
+    ended = killed_replay(KILLED.replace('SIGKILL', 'SIGTERM'), 'writing', name, folder)
     assert (ended.returncode, ended.stderr) == (143, b'')
     assert set(folder.iterdir()) == listed

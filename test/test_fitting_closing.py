@@ -150,7 +150,7 @@ def score(drift, norms=(), by_thermometer=0.0):
     return Score(drifts, drifts, of_norms, none, none, drifts, by_thermometer=error)
 
 
-def test_few_norms_that_both_models_predict_do_not_select_the_model():
+def test_neither_few_norms_nor_errors_of_a_coarse_thermometer_select_a_model():
     # WHY: only four left-out |f| of a MEMS in six faces could be predicted with and without a
     # curve; for these four the fit rejected the curve: the force error was 7 mg.
     constants = score(20.0, [22.4, 457.7, 54.6, 26.1])
@@ -159,9 +159,6 @@ def test_few_norms_that_both_models_predict_do_not_select_the_model():
     assert is_undecided(constants, curve)
     assert not is_undecided(curve, constants)
     assert is_better(constants, score(20.0, [2.0, 40.0, 5.0, 2.0]))
-
-
-def test_a_larger_model_must_not_explain_the_errors_of_a_coarse_thermometer():
     # WHY: readings in steps of 1 K have equal errors in all bags of a temperature program: knees
     # that fitted these errors doubled the drift error in other programs.
     by_thermometer = 49.0

@@ -307,7 +307,7 @@ def test_readings_that_alternate_at_edges_of_1_k_steps_show_their_noise(noise, f
     assert learned.noise_sd_c == pytest.approx(found, rel=0.3 if noise else 1e-6)
 
 
-def test_without_readings_the_settings_are_the_defaults_and_lags_are_three_reading_intervals(rng):
+def test_thermometer_settings_have_defaults_and_the_detector_s_follow_the_slowest_ramp(rng):
     # WHY: with readings every 60 s and a lag of 50 s the estimated rate was 0 in all ramps.
     time = np.arange(0.0, 14400.0, 60.0)
     celsius = np.interp(time, [0.0, 3600.0, 5400.0], [5.0, 5.0, 35.0])
@@ -317,9 +317,6 @@ def test_without_readings_the_settings_are_the_defaults_and_lags_are_three_readi
     empty = Readings(np.zeros(0, dtype=np.int64), np.zeros(0))
     base = DetectorSettings()
     assert learn_thermometer([empty], base.board) == base.board
-
-
-def test_the_detector_settings_follow_the_slowest_ramp(rng):
     n = 9 * 3600
     time = np.arange(0.0, n)
     celsius = np.interp(time, [0.0, 7200.0, 25200.0], [10.0, 10.0, 55.0])

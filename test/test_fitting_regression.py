@@ -157,15 +157,12 @@ def solved(request):
 
 
 def test_mode_covariance_and_evidence_agree_with_dense_linear_algebra(solved):
-    regression, prior, mode = solved
-    dense = Dense(regression, prior, mode)
-    at = dense.residual(np.zeros(dense.n))
-    gradient = dense.jacobian(np.zeros(dense.n)).T @ at * np.sqrt(mode.variance)
-    assert np.abs(gradient).max() < 1e-4
-    sd = np.sqrt(mode.variance)
+    regression, prior, fitted = solved
+    dense = Dense(regression, prior, fitted)
+    at, sd = dense.residual(np.zeros(dense.n)), np.sqrt(fitted.variance)
+    assert np.abs(dense.jacobian(np.zeros(dense.n)).T @ at * sd).max() < 1e-4
     other = least_squares(dense.residual, np.zeros(dense.n), x_scale=sd, method='trf').x
     assert np.abs(other / sd).max() < 1e-3
-    regression, prior, fitted = solved
     np.testing.assert_allclose(regression.start_root @ regression.start_root.T, START, atol=1e-12)
     beside = []
     for share in (prior.start_variance_ratio, 0.1):

@@ -88,16 +88,15 @@ def test_only_columns_with_an_effect_are_chosen_and_each_trial_has_a_left_out_er
     tilt = GRAVITY * chosen.posterior.state.tilt
     assert np.abs(tilt).max() < hidden
     assert np.sqrt(np.mean(tilt**2)) < 0.5 * hidden
-    _, selected, truth = calm
-    rms = {trial.groups: trial.score.rms for trial in selected.trials}
+    rms = {trial.groups: trial.score.rms for trial in chosen.trials}
     # The first trial fits only constants; its left-out error is the effect of temperature.
     assert [*rms][:2] == [(), ('curve',)]
     assert rms[()] > 2.0 * rms['curve',] > 10.0 * rms['curve', 'board']
-    (chosen,) = (trial for trial in selected.trials if trial.is_chosen)
-    assert chosen.score is selected.score
+    (best,) = (trial for trial in chosen.trials if trial.is_chosen)
+    assert best.score is chosen.score
     # Errors of the fit make the left-out error larger than white noise, by 15 % at most.
-    assert 1.0 < selected.score.rms / truth.sigma[0] < 1.15
-    assert all(is_better(trial.score, selected.score) for trial in selected.trials[:2])
+    assert 1.0 < chosen.score.rms / truth.sigma[0] < 1.15
+    assert all(is_better(trial.score, chosen.score) for trial in chosen.trials[:2])
 
 
 @pytest.mark.parametrize('where', ['one bag', 'one section', 'all'])
@@ -257,7 +256,7 @@ def test_the_bayes_factor_of_a_group_is_the_loss_of_evidence_if_the_group_is_rem
         assert row.log_evidence_change == pytest.approx(fall, rel=0.01, abs=0.02), row
 
 
-def test_outliers_do_not_shift_the_fit(calm):
+def test_outliers_do_not_shift_the_fit_and_quantised_means_are_no_outliers(calm):
     regression, calm_fit, truth = calm
     rng = np.random.default_rng(6)
     clean = regression.windows
@@ -271,9 +270,6 @@ def test_outliers_do_not_shift_the_fit(calm):
     np.testing.assert_allclose(other.posterior.prior.sigma, truth.sigma, rtol=0.2)
     sds = (fitted.posterior.prior.column_sd[0] for fitted in (calm_fit, other))
     np.testing.assert_array_equal(*(sd > 0.0 for sd in sds))
-
-
-def test_quantised_window_means_are_not_down_weighted_as_outliers():
     # Carried remainders make most means equal: a mean that differs by one step is no outlier.
     windows, up = table_of(Truth(), 9, np.random.default_rng(2))
     regression, state = begin(windows, up)

@@ -132,7 +132,6 @@ def test_columns_sections_and_initial_lag_states_agree_with_formulas(bags):
         if column.kind in ('board', 'gradient_lag') and column.power == 0:
             np.testing.assert_allclose(data.start[:, k], fades, atol=0.15)
         assert np.abs(data.start[-1, k]) <= np.abs(data.start[:, k]).max()
-    data, t = windows.data, windows.temperature - 20.0
     for p in range(data.n_positions):
         section = data.section[data.position == p]
         assert (np.diff(section) >= 0).all()
@@ -239,9 +238,7 @@ def fitted(request, all_bags):
 
 
 def states_of(windows, calibration):
-    columns = calibration.response
-    spec = memory_of(columns)
-    layout = StateLayout(spec)
+    layout = StateLayout(memory_of(calibration.response))
     states = np.zeros((len(windows.temperature), layout.width))
     states[:, 0], states[:, 3] = windows.temperature, windows.weight
     raw = dict(zip(windows.model.columns, windows.raw.T, strict=True))
@@ -259,7 +256,7 @@ def states_of(windows, calibration):
 
 def test_a_calibration_file_corrects_windows_with_the_sd_of_the_regression(fitted):
     # In ramps of 1 K/min powers of means over 60 s differ from means of powers by some ppm.
-    result, _ = fitted
+    result, claim = fitted
     windows, calibration = result.fit.windows, result.calibration
     state, prior = result.fit.posterior.state, result.fit.posterior.prior
     correction = Correction(calibration)
@@ -272,12 +269,9 @@ def test_a_calibration_file_corrects_windows_with_the_sd_of_the_regression(fitte
     report = next(row for row in result.residuals if row.section == 'all')
     assert np.sqrt(np.mean(along**2)) < 1.3 * report.fitted.rms + 5e-6
     assert prior.sigma.min() > 0.0
-    result, claim = fitted
-    calibration = result.calibration
     layout = parameter_layout(calibration)
     covariance = calibration.posterior.covariance()
     assert covariance.shape == (layout.n_parameters, layout.n_parameters)
-    state = result.fit.posterior.state
     K = np.array([axis.scale_factor for axis in calibration.axes])
     sd = np.sqrt(np.diag(claim.covariance))
     by_file = np.sqrt(np.diag(covariance))

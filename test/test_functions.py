@@ -29,15 +29,12 @@ FUNCTIONS = [functions.Polynomial((1.0,)), functions.Polynomial((0.0, 2e-3, -3e-
 temperatures = st.floats(-15.0, 15.0)
 
 
-def test_a_polynomial_and_an_exponential_agree_with_hand_numbers():
+def test_curves_agree_with_hand_numbers_and_splines_with_scipy():
     # Eq. (10): the term with a4 is a4 t^4; Golovach's paper prints a4 t.
     assert functions.Polynomial((1.0, 2.0, 0.5, 0.25, 1.0)).value(3.0) == 1 + 6 + 4.5 + 6.75 + 81
     function = functions.Exponential(-2.0, (2.0,), (10.0,))
     assert function.value(0.0) == 0.0
     assert function.value(10.0) == pytest.approx(2.0 * (np.e - 1.0), rel=1e-15)
-
-
-def test_a_cubic_spline_equals_that_of_scipy_and_is_constant_beyond_its_ends():
     values = (1.5, 0.4, 0.0, -0.2, 0.9)
     ours = functions.CubicSpline(KNOTS, values)
     reference = ReferenceSpline(KNOTS, values, bc_type='natural')

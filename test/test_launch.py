@@ -77,7 +77,7 @@ def parameters_set(arguments):
 
 def test_a_parameter_is_set_only_where_its_argument_was_given(tmp_path):
     # WHY: defaults of launch arguments replaced values in the user's parameter file.
-    pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
+    pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
     import rclpy
     import yaml
     from builders import calibration
@@ -113,7 +113,7 @@ def test_a_parameter_is_set_only_where_its_argument_was_given(tmp_path):
 
 
 def test_executable_parameters_topics_and_drivers_of_a_launch_file_exist():
-    pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
+    pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
     from dataclasses import fields
 
     from thermo_comp.ros.parameters import NodeConfig

@@ -74,7 +74,7 @@ def script():
     return only['sourceCode']
 
 
-def test_foxglove_paths_name_numbers_in_the_messages(topics):
+def test_foxglove_paths_name_numbers_of_messages_and_each_panel_is_shown_once(topics):
     used = set()
     (output,) = re.findall(r'export const output = "(.*)"', script())
     fields_of_script = re.findall(r'(\w+): number', re.search(r'type Output = .*', script())[0])
@@ -88,9 +88,6 @@ def test_foxglove_paths_name_numbers_in_the_messages(topics):
         used.add(topic)
     # `regime/stamped` repeats the flags of `regime/dynamic`, which the Foxglove layout shows.
     assert used == {output, *topics} - {'/regime/stamped'}
-
-
-def test_foxglove_panels_are_shown_once_and_their_topics_exist(topics):
     (inputs,) = re.findall(r'export const inputs = (\[.*\])', script())
     assert set(json.loads(inputs)) <= set(topics)
     rendered = {p['topicToRender'] for p in panels().values() if 'topicToRender' in p}

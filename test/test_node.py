@@ -10,7 +10,7 @@ import pytest
 import yaml
 from conftest import ROOT
 
-pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 
 import ros_helpers as ros
 from builders import calibration, rich_calibration, thermal_calibration

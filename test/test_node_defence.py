@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 
 import ros_helpers as ros
 from builders import calibration

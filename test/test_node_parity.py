@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from recording_helpers import imu_columns
 
-pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 
 from builders import rich_calibration
 from live_node import through_the_node

@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import pytest
 
-pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 
 import rclpy
 from builders import calibration

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from conftest import ran
 
-pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 
 from builders import calibration
 from node_process import NodeProcess, without_middleware
@@ -159,7 +159,7 @@ def test_the_node_needs_only_ros_numpy_and_yaml(unit, peer, tmp_path, monkeypatc
     assert (finished.stdout, finished.stderr) == ('', text)
 
 
-def test_the_node_prints_its_help_and_names_wrong_arguments(capfd):
+def test_the_node_prints_its_help_and_names_wrong_arguments_and_parameters(capfd, unit):
     assert main(['thermo_comp_node', '--help']) == 0
     assert 'example: thermo_comp_node --ros-args -p calibration_file' in capfd.readouterr().out
     assert main(['thermo_comp_node', 'unit.yaml']) == 2
@@ -168,9 +168,6 @@ def test_the_node_prints_its_help_and_names_wrong_arguments(capfd):
     printed = capfd.readouterr().err
     assert 'thermo_comp_node: ' in printed
     assert 'Traceback' not in printed
-
-
-def test_misspelt_parameters_of_the_node_are_named(unit, capfd):
     overrides = ['-p', f'calibration_file:={unit}', '-p', 'transition_tme:=3.0']
     overrides += ['-p', 'qos_overrides./imu/uncompensated.subscription.depth:=3']
     with node_in_thread(*overrides):

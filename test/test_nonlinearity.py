@@ -90,7 +90,7 @@ def test_a_nonlinearity_without_terms_changes_no_bit_and_with_a_slope_needs_a_th
         assert value.needs_temperature == bool(slope)
 
 
-def test_the_variance_of_a_nonlinear_axis_includes_all_parameters(rng):
+def test_the_variance_includes_all_parameters_and_beyond_the_fit_an_unknown_square(rng):
     # The unit has no term |f| f, for which the claimed variance exceeds the exact variance.
     unit = with_covariance(calibration(nonlinearity=replace(BENT, terms=(SQUARE, CUBE))), rng)
     layout, correction = parameter_layout(unit), Correction(unit)
@@ -109,9 +109,6 @@ def test_the_variance_of_a_nonlinear_axis_includes_all_parameters(rng):
             along[first : first + 4] = [*powers, *(t * powers)]
             extended = np.polyval(linear[axis, ::-1], f) + f**2 * np.polyval(beyond[axis, ::-1], f)
             assert extended == pytest.approx(along @ whole @ along, rel=1e-5)
-
-
-def test_beyond_the_largest_force_the_variance_includes_an_unknown_square():
     compensator = Compensator(calibration(nonlinearity=Nonlinearity((9.0, 60.0), 1e-4)), UNCHECKED)
     variances = []
     for k, f in enumerate((50.0, 59.99, 70.0, 90.0)):

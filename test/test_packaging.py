@@ -43,23 +43,12 @@ def test_version_and_dependencies_are_equal_wherever_they_are_stated():
     assert all('>=' in requirement for requirement in install), 'no floor'
 
 
-def test_the_licence_file_contains_the_whole_apache_licence():
+def test_every_source_file_states_the_apache_licence_and_has_at_most_500_lines():
     licence = (ROOT / 'LICENSE').read_text()
     assert 'Version 2.0, January 2004' in licence
     assert 'END OF TERMS AND CONDITIONS' in licence
     node = MANIFEST.find('license')
     assert (node.text, node.get('file')) == ('Apache-2.0', 'LICENSE')
-
-
-def tracked(*patterns):
-    listing = ran('git', 'ls-files', '-z', '--', *patterns)
-    names = [name for name in listing.stdout.split('\0') if name]
-    if listing.returncode or not names:
-        pytest.skip('not a git working tree: an installed or unpacked copy')
-    return [ROOT / name for name in names if (ROOT / name).exists()]
-
-
-def test_every_source_file_states_its_licence_and_has_at_most_500_lines():
     first = 'SPDX-FileCopyrightText: 2026 thermo_comp contributors'
     second = 'SPDX-License-Identifier: Apache-2.0'
     for path in tracked('*.py', 'Makefile', '.ci/run'):
@@ -68,6 +57,14 @@ def test_every_source_file_states_its_licence_and_has_at_most_500_lines():
         assert lines[:2] == [f'# {first}', f'# {second}'], path
     lengths = {path: len(path.read_text().splitlines()) for path in tracked('*.py')}
     assert {path.name: n for path, n in lengths.items() if n > 500} == {}
+
+
+def tracked(*patterns):
+    listing = ran('git', 'ls-files', '-z', '--', *patterns)
+    names = [name for name in listing.stdout.split('\0') if name]
+    if listing.returncode or not names:
+        pytest.skip('not a git working tree: an installed or unpacked copy')
+    return [ROOT / name for name in names if (ROOT / name).exists()]
 
 
 def test_hosted_ci_installs_as_the_readme_describes():

@@ -7,7 +7,7 @@ from dataclasses import fields
 import pytest
 import yaml
 
-pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 
 from make_reference import parameters_table
 from rclpy.parameter import Parameter

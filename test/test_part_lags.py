@@ -82,19 +82,24 @@ def judged(calibration, study):
     return strangers.score(outs, [minutes(bag) for bag in bags], is_drift=False)
 
 
-def test_the_fitted_lag_of_each_axis_is_that_of_its_part_and_is_printed(parts):
-    unit, study, calibration, _ = parts
+def test_the_fitted_lag_of_each_axis_is_that_of_its_part_and_the_results_are_printed(parts):
+    unit, study, calibration, (text, content) = parts
     # In a ramp a lag of 10 K changes the bias by 100 ug, an error of the lag of 1 % by 1 ug.
     assert np.array(taus_of(calibration)) == pytest.approx(unit.part_s[:, None], rel=0.01)
     # The noise of |f| in a mean over 60 s is 0.65 ug.
     assert judged(calibration, study).norm < 2.0
-    unit, *_, (text, content) = parts
     (line,) = (line for line in text.splitlines() if 'one part, which' in line)
     printed = [float(word) for word in line.split('by ')[1].split(' s')[0].split(', ')]
     content = json.loads(content)
     assert content['part_lags_s'] == pytest.approx(unit.part_s, rel=0.01)
     assert printed == pytest.approx(content['part_lags_s'], abs=0.5)
     assert content['part_case_shares'] == [0.0, 0.0, 0.0]
+    effects = content['contributions_m_s2']
+    assert effects['thermal_response'] > 100.0 * effects['initial_lag_states'] > 0.0
+    (line,) = (line for line in text.splitlines() if line.startswith('thermal response'))
+    assert float(line.split()[-1]) == pytest.approx(effects['thermal_response'] / UG, abs=0.5)
+    (pair,) = (p for p in content['likeness'] if p['groups'] == ['board', 'gradient_lag'])
+    assert f'(correlation {pair["correlation"]:.5f};' in text
 
 
 @pytest.mark.slow
@@ -348,14 +353,3 @@ def test_units_of_a_type_share_the_lags_of_the_bank(parts):
     off = strangers.corrected(mean, bag).force - strangers.corrected(calibration, bag).force
     # The effect of a lag is 200 ug (10 K, 20 ug/K), and differs by up to 7 % between the units.
     assert np.sqrt(np.mean(off**2)) < 5.0 * UG
-
-
-def test_the_effects_of_unknowns_and_the_most_similar_terms_are_printed(parts):
-    *_, (text, content) = parts
-    content = json.loads(content)
-    effects = content['contributions_m_s2']
-    assert effects['thermal_response'] > 100.0 * effects['initial_lag_states'] > 0.0
-    (line,) = (line for line in text.splitlines() if line.startswith('thermal response'))
-    assert float(line.split()[-1]) == pytest.approx(effects['thermal_response'] / UG, abs=0.5)
-    (pair,) = (p for p in content['likeness'] if p['groups'] == ['board', 'gradient_lag'])
-    assert f'(correlation {pair["correlation"]:.5f};' in text

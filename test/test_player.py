@@ -10,7 +10,7 @@ import threading
 import numpy as np
 import pytest
 
-pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy

@@ -227,7 +227,7 @@ class Recording:
 
 @pytest.fixture
 def play():
-    pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
+    pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
     from thermo_comp.ros.player import play
 
     return play

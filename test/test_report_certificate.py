@@ -233,7 +233,7 @@ def test_the_budget_of_a_unit_with_a_kink_names_the_lack_of_fit():
     assert combined(lines) == pytest.approx(claim)
 
 
-def test_without_a_stated_uncertainty_of_gravity_that_of_scale_factors_is_withheld(tmp_path):
+def test_the_uncertainty_of_scale_factors_contains_that_of_gravity_or_is_withheld(tmp_path):
     # WHY: U = 0.00037 was printed for the scale factor, as if gravity had no error.
     rows = {result.quantity: result for result in results(evidence(), CertificateInfo(), ())}
     assert rows['scale factor x'].expanded == '–'
@@ -251,6 +251,12 @@ def test_without_a_stated_uncertainty_of_gravity_that_of_scale_factors_is_withhe
     # WHY: gravity's sd was in all expanded uncertainties, but its line in the page was blank.
     assert re.search(r'Standard uncertainty of gravity<[^0-9]*2e-05 m/s²', page)
     assert {source.name: source.standard for source in budget(stated, info)}['gravity'] == 2e-5
+    info = load_certificate_info(lab(tmp_path, 'gravity: {standard_uncertainty_m_s2: 9.80665e-3}'))
+    rows = {result.quantity: result for result in results(evidence(), info, ())}
+    scale = fitted().calibration.axes.x.scale_factor
+    # Gravity, with a relative uncertainty of 1e-3, dominates the scale's uncertainty U = 2e-3.
+    assert float(rows['scale factor x'].expanded) == pytest.approx(2e-3 * scale, rel=0.05)
+    assert rows['bias x'] in results(evidence(), CertificateInfo(), ())
 
 
 def float_of(cell):
@@ -321,15 +327,6 @@ def test_values_and_deviations_have_equal_decimals_if_u_is_withheld(is_known, tm
 )
 def test_temperatures_of_the_table_are_round_numbers(ends, expected):
     assert table_temperatures(*ends).tolist() == expected
-
-
-def test_the_uncertainty_of_gravity_is_part_of_that_of_the_scale_factors(tmp_path):
-    info = load_certificate_info(lab(tmp_path, 'gravity: {standard_uncertainty_m_s2: 9.80665e-3}'))
-    rows = {result.quantity: result for result in results(evidence(), info, ())}
-    scale = fitted().calibration.axes.x.scale_factor
-    # Gravity, with a relative uncertainty of 1e-3, dominates the scale's uncertainty U = 2e-3.
-    assert float(rows['scale factor x'].expanded) == pytest.approx(2e-3 * scale, rel=0.05)
-    assert rows['bias x'] in results(evidence(), CertificateInfo(), ())
 
 
 def test_conformity_is_stated_only_with_a_tolerance():

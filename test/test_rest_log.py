@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 
 from builders import calibration
 from diagnostic_msgs.msg import DiagnosticArray

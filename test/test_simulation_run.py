@@ -189,17 +189,7 @@ def test_presets_agree_with_a_numerical_integrator(name):
     np.testing.assert_allclose(states, solved.y.T, atol=2e-5)
 
 
-def test_creep_decays_with_its_time_constant():
-    step = np.full((7201, 1), 10.0)
-    step[0] = 0.0
-    history = PartHistory(('case',), step, np.zeros(1), 1.0)
-    bias, scale = CreepEffect('case', 7200.0, bias=(1.0, 2.0, 0.0)).change(history)
-    # The tolerance is the length of the step, 1 s, relative to the time constant.
-    np.testing.assert_allclose(bias[-1], np.array([10.0, 20.0, 0.0]) * math.exp(-1.0), atol=2e-3)
-    np.testing.assert_array_equal(scale, 0.0)
-
-
-def test_the_steady_state_obeys_the_heat_balance():
+def test_the_steady_state_obeys_the_heat_balance_also_with_a_thermostat():
     network = unit_preset('bare-quartz', 5).network
     warm = network.equilibrium(12.0)
     to_air = next(link for link in network.links if AIR in (link.a, link.b))
@@ -209,9 +199,6 @@ def test_the_steady_state_obeys_the_heat_balance():
     temperatures = response.temperatures(np.array([0.0, 1800.0, 3600.0]))
     np.testing.assert_allclose(temperatures, np.tile(warm, (3, 1)), atol=ROUNDING)
     assert network.equilibrium(network.air_for('board', 20.0))[board] == pytest.approx(20.0)
-
-
-def test_a_thermostat_keeps_its_part_within_0_2_k_by_the_power_that_leaks():
     network = unit_preset('thermostatted', 2).network
     heat = network.thermostat
     oven, head = network.nodes.index('oven'), network.nodes.index('head')
@@ -288,7 +275,7 @@ def test_plans_have_the_stated_durations_and_attitudes():
     assert (ups['held-out'] @ ups['chamber-18'].T).max() < 0.999
 
 
-def test_the_effect_of_heat_flow_is_even_and_zero_at_rest_and_may_saturate():
+def test_the_effect_of_heat_flow_is_even_and_may_saturate_and_creep_decays():
     up = np.stack([np.linspace(0, 3, 50), np.zeros(50)], axis=1)
     effect = FlowEffect('a', 'b', 1.25, bias=(1.0, 0.0, 0.0))
     warm, cold = (effect.change(_history(sign * up))[0] for sign in (1.0, -1.0))
@@ -298,6 +285,13 @@ def test_the_effect_of_heat_flow_is_even_and_zero_at_rest_and_may_saturate():
     up[:, 0] += 2.0
     bias, _ = FlowEffect('a', 'b', 2.0, 0.5, True, 1, bias=(1.0, 0.0, 0.0)).change(_history(up))
     np.testing.assert_allclose(bias[:, 0], [0.0, 1.0, 2.0], atol=1e-3)
+    step = np.full((7201, 1), 10.0)
+    step[0] = 0.0
+    history = PartHistory(('case',), step, np.zeros(1), 1.0)
+    bias, scale = CreepEffect('case', 7200.0, bias=(1.0, 2.0, 0.0)).change(history)
+    # The tolerance is the length of the step, 1 s, relative to the time constant.
+    np.testing.assert_allclose(bias[-1], np.array([10.0, 20.0, 0.0]) * math.exp(-1.0), atol=2e-3)
+    np.testing.assert_array_equal(scale, 0.0)
 
 
 def test_a_switched_load_warms_its_part_by_the_steady_heat_balance():

@@ -99,7 +99,7 @@ def test_simulated_samples_have_the_stated_noise_bias_scale_and_misalignment():
     assert error.std(axis=0) == pytest.approx([sd] * 3, rel=0.03 + 4.0 / np.sqrt(2 * n))
 
 
-def test_a_support_tilts_with_the_square_of_temperature():
+def test_a_support_tilts_with_temperature_squared_and_a_cold_start_is_at_air_temperature():
     axis = np.array([1e-6, 0.0, 0.0])
     bag = record(unit(), units.program(20, 10, (35, 1, 60)), LEVEL, rng_of('tilt'), tilt=axis)
     case = np.interp(bag.time_s - 1.0, *bag.temperatures['case'])
@@ -107,9 +107,6 @@ def test_a_support_tilts_with_the_square_of_temperature():
     # The tolerance is the error of interpolation between case readings 5 s apart.
     assert angle == pytest.approx(1e-6 * (case - 20.0) ** 2, abs=5e-7)
     assert np.linalg.norm(bag.force, axis=1) == pytest.approx(GRAVITY)
-
-
-def test_a_cold_start_begins_at_the_temperature_of_the_air():
     given = unit(heat_k=2.0)
     cold = record(given, cases.FROST, LEVEL, rng_of('cold'), is_cold=True)
     warm = record(given, cases.FROST, LEVEL, rng_of('cold'))
@@ -119,14 +116,11 @@ def test_a_cold_start_begins_at_the_temperature_of_the_air():
         assert board - case == pytest.approx(heat, abs=0.1)
 
 
-def test_the_sum_of_samples_with_carried_remainders_is_exact_to_half_a_count():
+def test_carried_remainders_give_exact_sums_and_flicker_noise_a_flat_allan_deviation():
     words = np.full((1000, 3), 0.3)
     kept, lost = (units.quantised(words, carries) for carries in (True, False))
     assert np.abs(np.cumsum(kept, axis=0) - np.cumsum(words, axis=0)).max() <= 0.5
     assert not lost.any()
-
-
-def test_flicker_noise_has_a_flat_allan_deviation():
     noise = units.flicker_noise(40_000, 2.0, 3.0, rng_of('flicker'))
     for size in (10, 100, 1000):
         means = noise.reshape(-1, size, 3).mean(axis=1)

@@ -106,7 +106,7 @@ def test_errors_in_a_ramp_are_bounded(errors, sensor, temperature_k, rate_k_min)
     assert 60.0 * math.sqrt(np.mean(rows[:, 2])) < rate_k_min
 
 
-def test_a_change_between_steps_of_1_k_determines_the_temperature():
+def test_a_change_of_1_k_steps_shows_the_temperature_and_without_noise_it_is_exact():
     # Readings with steps of 1 K change from 20 to 21 degC when the temperature is 20.5 degC.
     thermometer = Thermometer(ThermometerSettings(0.01, 1.0))
     for k in range(600):
@@ -116,6 +116,19 @@ def test_a_change_between_steps_of_1_k_determines_the_temperature():
     assert thermometer.temperature == pytest.approx(20.5, abs=0.03)
     # At a change of the reading the estimate's sd is the noise plus the change between readings.
     assert 0.005 < math.sqrt(thermometer.var_temperature) < 0.03
+    thermometer = Thermometer(ThermometerSettings())
+    for k in range(100):
+        assert thermometer.update(k * SECOND_NS, 20.25)
+        assert (thermometer.temperature, thermometer.rate) == (20.25, 0.0)
+        assert thermometer.acceleration[0] == 0.0
+    assert type(thermometer.temperature) is float
+    # After minutes of readings the prior of the rate (sd 3 K/min) has no effect.
+    thermometer = Thermometer(ThermometerSettings())
+    for k in range(600):
+        thermometer.update(k * SECOND_NS, 20.0 + 0.01 * k)
+    assert thermometer.temperature == pytest.approx(25.99, abs=1e-5)
+    assert thermometer.rate == pytest.approx(0.01, abs=1e-6)
+    assert abs(thermometer.acceleration[0]) < 1e-7
 
 
 @pytest.mark.parametrize(('quantum', 'lag_s'), [(0.1, 120.0), (0.5, 180.0), (1.0, 600.0)])
@@ -132,22 +145,6 @@ def test_equal_readings_each_minute_keep_the_error_below_1_5_quanta(quantum, lag
     # In the ramp of 1 K/min the estimated rate is right although a reading comes once a minute.
     rows = np.flatnonzero((t > 2.0 * lag_s) & (t < 1200.0))
     assert np.abs(out[rows, 1] - 1.0 / 60.0).max(initial=0.0) < max(quantum, 0.3) / 60.0
-
-
-def test_the_estimate_of_a_constant_temperature_or_a_ramp_without_noise_is_exact():
-    thermometer = Thermometer(ThermometerSettings())
-    for k in range(100):
-        assert thermometer.update(k * SECOND_NS, 20.25)
-        assert (thermometer.temperature, thermometer.rate) == (20.25, 0.0)
-        assert thermometer.acceleration[0] == 0.0
-    assert type(thermometer.temperature) is float
-    # After minutes of readings the prior of the rate (sd 3 K/min) has no effect.
-    thermometer = Thermometer(ThermometerSettings())
-    for k in range(600):
-        thermometer.update(k * SECOND_NS, 20.0 + 0.01 * k)
-    assert thermometer.temperature == pytest.approx(25.99, abs=1e-5)
-    assert thermometer.rate == pytest.approx(0.01, abs=1e-6)
-    assert abs(thermometer.acceleration[0]) < 1e-7
 
 
 UPPER = np.triu_indices(3)

@@ -42,7 +42,7 @@ def prior_of(lower, upper, *lacks):
     return Parts(regime_sets=lambda: (regime, regime))
 
 
-def test_axes_never_along_gravity_at_some_temperatures_have_a_larger_sd():
+def test_axes_never_along_gravity_have_a_larger_sd_and_in_an_update_keep_that_of_the_prior():
     # Six positions, one per face, cover 0 to 40 degC; one position with x up covers -40 to 0 degC.
     faces = [*np.eye(3), *-np.eye(3), np.eye(3)[0]]
     fit = fit_of([0, 40] * 6 + [-40, 0], faces, np.repeat(np.arange(7), 2))
@@ -54,6 +54,13 @@ def test_axes_never_along_gravity_at_some_temperatures_have_a_larger_sd():
         assert point.sd_m_s2 == pytest.approx((0.0, sd, sd), abs=1e-12)
     (finding,) = thermal_ranges.judge_unseen_axes(fit, None)
     assert 'below -4 degC no position has gravity along y and z' in finding.message
+    lacks = LackOfFit(0.0, (1e-3, 1e-3, 1e-3)), LackOfFit(40.0, (1e-3, 1e-3, 1e-3))
+    fit = fit_of([10, 30], [[1.0, 0.0, 0.0]], [0, 0])
+    new = (LackOfFit(20.0, (2e-4, 2e-4, 2e-3)),)
+    (points, _) = thermal_ranges.with_unseen_axes(fit, (new, new), prior_of(0.0, 40.0, *lacks))
+    by_temperature = {point.temperature_c: point.sd_m_s2 for point in points}
+    assert by_temperature[20.0] == pytest.approx((2e-4, 1e-3, 2e-3))
+    assert by_temperature[0.0] == pytest.approx((1e-3, 1e-3, 2e-3))
 
 
 @pytest.mark.parametrize('only_x', [False, True])
@@ -65,16 +72,6 @@ def test_no_sd_is_added_if_the_same_axes_are_along_gravity_at_all_temperatures(o
     # A prior determines all axes within its temperature range, from 0 to 40 degC.
     (lack, _) = thermal_ranges.with_unseen_axes(fit, ((), ()), prior_of(0.0, 40.0))
     assert bool(lack) == only_x
-
-
-def test_an_update_keeps_the_lack_of_fit_of_axes_that_it_does_not_observe():
-    lacks = LackOfFit(0.0, (1e-3, 1e-3, 1e-3)), LackOfFit(40.0, (1e-3, 1e-3, 1e-3))
-    fit = fit_of([10, 30], [[1.0, 0.0, 0.0]], [0, 0])
-    new = (LackOfFit(20.0, (2e-4, 2e-4, 2e-3)),)
-    (points, _) = thermal_ranges.with_unseen_axes(fit, (new, new), prior_of(0.0, 40.0, *lacks))
-    by_temperature = {point.temperature_c: point.sd_m_s2 for point in points}
-    assert by_temperature[20.0] == pytest.approx((2e-4, 1e-3, 2e-3))
-    assert by_temperature[0.0] == pytest.approx((1e-3, 1e-3, 2e-3))
 
 
 def kinked(bag, unit):
