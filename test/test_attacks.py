@@ -198,8 +198,7 @@ def test_damaged_autopilot_logs_are_read_or_refused_with_one_line(kind, tmp_path
             data[at : at + cut] = rng.bytes(int(rng.integers(0, 9)))
         path.write_bytes(bytes(data))
         try:
-            log = read_autopilot(path)
-            write_log(log, tmp_path / f'{number}.mcap')
+            write_log(read_autopilot(path), tmp_path / f'{number}.mcap')
             n_read += 1
         except RecordingError as error:
             lines.append(str(error))

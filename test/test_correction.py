@@ -173,8 +173,7 @@ def test_corrections_with_random_initial_lag_states_scatter_by_the_claimed_sd(rn
     layout = StateLayout(correction.memory)
     places = [layout.places[lag] for lag in layout.lags]
     draws = rng.multivariate_normal(np.zeros(len(lags)), start_covariance(lags), size=4000)
-    state = np.array(state)
-    moved = np.repeat(state[:, np.newaxis], len(draws), axis=1)
+    moved = np.repeat(np.array(state)[:, np.newaxis], len(draws), axis=1)
     terms = tuple(replace(term, range=(-4000.0, 4000.0)) for term in unit.response)
     wide = replace(unit, response=terms)
     # Columns with squares of lags are nonlinear, so draw initial lag states with 0.05 of their sd.

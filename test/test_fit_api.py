@@ -83,8 +83,7 @@ def test_a_knee_in_the_curve_of_the_bias_is_found_only_if_there_is_one(monkeypat
 def test_a_thermometer_on_two_topics_is_used_once():
     bags = []
     for copies in (('board',), ('board', 'case')):
-        rng = np.random.default_rng(9)
-        records = [recording(up, rng) for up in UPS[:3]]
+        records = [recording(up, np.random.default_rng(9)) for up in UPS[:3]]
         bags.append([columns(each, f'rest{k}', copies) for k, each in enumerate(records)])
     first, second = (tc.fit(each, gravity=G, input='m/s^2', groups=('curve',)) for each in bags)
     assert (first.static, first.axes) == (second.static, second.axes)

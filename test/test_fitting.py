@@ -145,8 +145,7 @@ def test_the_error_of_the_compensator_is_that_stated_by_the_fit(response):
     n = len(after.index) // per_window
     force = after.specific_force[: n * per_window].reshape(n, per_window, 3).mean(axis=1)
     # In the first 45 min the unknown initial lag states cause the largest errors.
-    late = force[45:]
-    rms = residual_statistics(norm_residual(late, STANDARD_GRAVITY)).rms
+    rms = residual_statistics(norm_residual(force[45:], STANDARD_GRAVITY)).rms
     assert rms < 2.0 * response.residuals[-1].left_out.rms
     density = np.array(response.calibration.noise_density_m_s2_sqrt_hz)
     variance = after.covariance[: n * per_window, [0, 4, 8]].reshape(n, per_window, 3).mean(axis=1)

@@ -29,8 +29,7 @@ def stamps(n, rate_hz=RATE_HZ):
 
 def block(accel, seconds=None):
     n = len(accel)
-    seconds = n / RATE_HZ if seconds is None else seconds
-    readings = stamps(int(seconds) + 1, 1.0)
+    readings = stamps(int(n / RATE_HZ if seconds is None else seconds) + 1, 1.0)
     celsius = np.full(len(readings), 20.0)
     return ArrayBlock(stamps(n), accel, readings, celsius, readings, celsius + 1.0)
 
@@ -318,8 +317,7 @@ def test_thermometer_settings_have_defaults_and_the_detector_s_follow_the_slowes
     base = DetectorSettings()
     assert learn_thermometer([empty], base.board) == base.board
     n = 9 * 3600
-    time = np.arange(0.0, n)
-    celsius = np.interp(time, [0.0, 7200.0, 25200.0], [10.0, 10.0, 55.0])
+    celsius = np.interp(np.arange(0.0, n), [0.0, 7200.0, 25200.0], [10.0, 10.0, 55.0])
     readings = Readings(stamps(n, 1.0), celsius + 0.005 * rng.standard_normal(n))
     bag = reduced([block(still(rng, 30.0, UP))])
     slow = learn_detector([replace(bag, temperatures={'board': readings, 'case': readings})])

@@ -203,11 +203,9 @@ def test_curve_columns_of_a_fit_are_powers_of_temperature(
     assert isinstance(sets.static, static)
     assert sets.is_shared == is_shared
     assert dynamic is None or sets.dynamic.n_free == dynamic
-    t = np.linspace(-5.0, 15.0, 9)
-    columns = sets.columns(t, np.linspace(0.0, 1.0, 9))
+    columns = sets.columns(np.linspace(-5.0, 15.0, 9), np.linspace(0.0, 1.0, 9))
     assert len(columns) == len(sets.groups) == sets.static.n_free + 1 + sets.dynamic.n_free
-    nothing = sets.columns(np.zeros(3), np.array([0.0, 0.5, 1.0]))
-    for k, column in enumerate(nothing):
+    for k, column in enumerate(sets.columns(np.zeros(3), np.array([0.0, 0.5, 1.0]))):
         expected = [0.0, 0.5, 1.0] if k == sets.level else 0.0
         np.testing.assert_allclose(column, expected, atol=1e-12)
     assert all(column[0] == 0.0 for column in columns[sets.static.n_free :])

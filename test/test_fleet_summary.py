@@ -233,8 +233,7 @@ class TestTable:
 def test_the_result_folder_of_any_name_is_inside_the_results(name, tmp_path):
     folder = Results(tmp_path / 'out').folder_of(name)
     folder.mkdir(parents=True)
-    inside = (tmp_path / 'out' / 'units').resolve()
-    assert inside in folder.resolve().parents
+    assert (tmp_path / 'out' / 'units').resolve() in folder.resolve().parents
 
 
 def test_results_are_not_written_into_a_file(tmp_path):

@@ -122,8 +122,7 @@ def test_the_predicted_sd_agrees_with_hand_numbers_or_is_that_of_the_residual():
     states = ramp_states(unit, np.array([20.0, 30.0]), 0.0, np.inf)
     _, bias, _, scale = bias_scale_and_sd(unit, states)
     # Bias variance at 30 degC: 4e-4 + 100 * 1e-6 counts^2, plus the residual's (30 um/s^2)^2.
-    expected = np.sqrt([4e-4, 5e-4]) / 300.0
-    assert bias[:, 0] == pytest.approx(np.hypot(expected, 3e-5), rel=1e-6)
+    assert bias[:, 0] == pytest.approx(np.hypot(np.sqrt([4e-4, 5e-4]) / 300.0, 3e-5), rel=1e-6)
     assert bias[:, 1] == pytest.approx([3e-5, 3e-5])
     assert scale[:, 0] == pytest.approx([1e-6, 1e-6], rel=1e-6)
     # In an endless ramp of 0.6 K/min a part with a lag of 600 s is 6 K behind the board.

@@ -68,8 +68,7 @@ def test_one_attitude_in_the_chamber_does_not_separate_bias_and_scale():
     rng = rng_of('alike', 'bench')
     unit = navigation(rng)
     bench = positions(unit, ROOM, spread(18, rng), rng)
-    heated = positions(unit, HALF, UP, rng)
-    one, two = (fitted((*bench, *heated[:n])) for n in (1, 2))
+    one, two = (fitted((*bench, *positions(unit, HALF, UP, rng)[:n])) for n in (1, 2))
     (message,) = advice_of(one)
     assert 'changes of the bias from changes of the scale factor' in message
     assert 'with this axis at another angle to the vertical' in message

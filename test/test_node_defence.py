@@ -216,8 +216,7 @@ def test_while_a_calibration_file_hangs_other_parameters_can_be_set(peer, unit):
         node._reader._process.send_signal(signal.SIGSTOP)
         process, name = node._reader._process, 'thermo_comp/set_parameters'
         message = Parameter('calibration_file', value=str(unit)).to_parameter_msg()
-        request = srv.SetParameters.Request(parameters=[message])
-        hanging = peer._clients[name].call_async(request)
+        hanging = peer._clients[name].call_async(srv.SetParameters.Request(parameters=[message]))
         (result,) = peer.set_parameters(frame_id='body')
         assert result.successful
         samples.go_on()

@@ -138,8 +138,7 @@ def test_a_survey_finds_no_fault_in_a_good_bag_and_the_duration_is_the_span_of_s
     result = survey_recording(tmp_path / 'empty')
     assert result.n == 0
     assert any('no accelerometer samples' in f for f in result.findings)
-    result = survey(tmp_path / 'flips', 20.0 + (np.arange(3600) % 2))
-    board = result.thermometers['board']
+    board = survey(tmp_path / 'flips', 20.0 + (np.arange(3600) % 2)).thermometers['board']
     assert board.quantum == 1.0
     assert board.steepest_heating_k_min < 0.1
 

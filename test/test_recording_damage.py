@@ -67,8 +67,7 @@ def test_a_bag_cut_in_its_last_chunk_is_read_up_to_the_cut(tmp_path):
     at = position + 9 + 40
     last = []
     while at < position + length:
-        size = struct.unpack_from('<Q', content, at + 1)[0] + 9
-        at += size
+        at += struct.unpack_from('<Q', content, at + 1)[0] + 9
         last.append(at)
     n_before = len(messages) - len(last)
     assert 0 < n_before < len(messages)

@@ -33,8 +33,7 @@ SENSORS = {'1 mK': (0.001, 0.0), '10 mK': (0.01, 0.0),
 
 
 def case_and_board(t, corners, lag=LAG_S, start=20.0):
-    behind = lagged(t, corners, lag, BOARD_LAG_S)
-    return start + lagged(t, corners, lag), start + 0.3 + behind
+    return start + lagged(t, corners, lag), start + 0.3 + lagged(t, corners, lag, BOARD_LAG_S)
 
 
 def onsets(noise, quantum, rate_k_min, lag, n, *, dt=1.0, end_s=1500.0, soak_s=1500.0):

@@ -92,8 +92,7 @@ def test_rounding_changes_a_value_by_at_most_half_a_digit(value, expanded):
 
 
 def test_statements_of_a_laboratory_are_printed_and_missing_statements_are_blank(tmp_path):
-    info = load_certificate_info(lab(tmp_path), 'thermostatted-0001')
-    page = render_report(evidence(), info)
+    page = render_report(evidence(), load_certificate_info(lab(tmp_path), 'thermostatted-0001'))
     for text in (
         *('2026-017', 'Inertial Lab', '1 Street', 'L-1', 'A Customer', 'A. Person', 'ACME'),
         *('TRI-3', 'certificate 3 of 2025', '2e-05 m/s²', 'absolute gravimeter', '2026-03-01'),

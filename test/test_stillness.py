@@ -117,8 +117,7 @@ def test_each_short_rest_of_a_hand_held_unit_is_found(rng, rest_s, shaky):
 def test_motion_is_not_taken_for_a_rest_nor_a_drift_in_a_ramp_for_a_motion(rng):
     # For the last 10 s |f| is 1.04 g, with the noise of a shaky rest: the unit is accelerated.
     accel = by_hand(rng, 14, 6.0, (3,), misalignment=5e-3)
-    time = time_of(10.0)
-    push = GRAVITY * np.array((0.0, 0.6, 0.8)) * 1.04 + 0.0 * time[:, None]
+    push = GRAVITY * np.array((0.0, 0.6, 0.8)) * 1.04 + 0.0 * time_of(10.0)[:, None]
     accel = np.concatenate((accel, push + 12.0 * MG * rng.standard_normal(push.shape)))
     result = fit([source(accel)], OPTIONS)
     assert 13 <= len(result.positions) <= 14

@@ -41,8 +41,7 @@ def state(thermometer):
 
 def settled(noise=0.001, n=600, **changes):
     thermometer = Thermometer(ThermometerSettings(noise, **changes))
-    rng = np.random.default_rng(5)
-    run(thermometer, np.arange(n), read(np.full(n, 20.0), noise, 0.0, rng))
+    run(thermometer, np.arange(n), read(np.full(n, 20.0), noise, 0.0, np.random.default_rng(5)))
     return thermometer
 
 

@@ -135,8 +135,7 @@ def test_only_an_attitude_to_which_the_unit_was_returned_is_a_pose():
 
 def test_rests_in_one_pose_use_the_mounting_sd_that_the_user_stated():
     # WHY: a fit of rests in one pose used a smaller sd of mountings than the user had stated.
-    calibration = strangers.fitted(next(cases.returned(1)), mounting_sd=0.01)
-    for axis in calibration.static.axes():
+    for axis in strangers.fitted(next(cases.returned(1)), mounting_sd=0.01).static.axes():
         assert axis.residual_sd_m_s2 == pytest.approx(0.01)
 
 
@@ -236,8 +235,7 @@ def test_a_lag_is_corrected_at_twice_the_rates_of_the_fit():
 
 def test_the_claimed_sd_of_a_mems_with_a_single_turn_on_is_0_3_to_1_5_mg():
     # WHY: a bias change of 0.6 mg at a turn-on of a MEMS was 5 times the claimed sd.
-    rng = np.random.default_rng(3)
-    bag, *_ = turned(rng, ((0.0, 20.0), (9000.0, 20.0)), 'one')
+    bag, *_ = turned(np.random.default_rng(3), ((0.0, 20.0), (9000.0, 20.0)), 'one')
     unit = tc.fit([bag], gravity=GRAVITY, input='m/s^2')
     # The bias of a MEMS of noise `NOISE` changes by 0.1 to 1 mg at a turn-on.
     assert 0.3 * 1e-3 * GRAVITY < unit.static.x.residual_sd_m_s2 < 1.5e-3 * GRAVITY
