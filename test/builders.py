@@ -142,23 +142,6 @@ def rich_gyroscope():
     )  # fmt: skip
 
 
-def columns_from_events(events):
-    """Sort events (kind, stamp_ns, value) into columns; kind: 'accel' or a thermometer's name."""
-    accel = [(s, v) for kind, s, v in events if kind == 'accel']
-    readings = {}
-    n_accel = 0
-    for kind, stamp, value in events:
-        if kind == 'accel':
-            n_accel += 1
-        else:
-            readings.setdefault(kind, []).append((stamp, value, n_accel))
-    for name, rows in readings.items():
-        readings[name] = tuple(map(np.array, zip(*rows, strict=True), (np.int64, float, np.int64)))
-    stamp_ns = np.array([stamp for stamp, _ in accel], dtype=np.int64)
-    values = np.array([value for _, value in accel], dtype=float).reshape(-1, 3)
-    return SimpleNamespace(accel_stamp_ns=stamp_ns, accel=values, temperatures=readings)
-
-
 def stream(compensator, events):
     """Process events one by one, rates 1e-3 * sample; return rows and the numbers of samples."""
     rows, index = [], []
@@ -179,9 +162,23 @@ def stream(compensator, events):
 
 
 def batch(compensator, events):
-    """Process events as one block, with angular rates of 1e-3 * sample."""
-    columns = columns_from_events(events)
-    return process_block(compensator, columns, 1e-3 * columns.accel)
+    """
+    Process events (kind, stamp [ns], value) as one block, with angular rates of 1e-3 * sample.
+    The kind of an event is 'accel' or the name of a thermometer.
+    """
+    stamps, samples, readings = [], [], {}
+    for kind, stamp, value in events:
+        if kind == 'accel':
+            stamps.append(stamp)
+            samples.append(value)
+        else:
+            readings.setdefault(kind, []).append((stamp, value, len(stamps)))
+    for name, rows in readings.items():
+        readings[name] = tuple(map(np.array, zip(*rows, strict=True), (np.int64, float, np.int64)))
+    accel = np.array(samples, dtype=float).reshape(-1, 3)
+    stamp_ns = np.array(stamps, dtype=np.int64)
+    columns = SimpleNamespace(accel_stamp_ns=stamp_ns, accel=accel, temperatures=readings)
+    return process_block(compensator, columns, 1e-3 * accel)
 
 
 def assert_equal_bits(unit, config, events, chunk):

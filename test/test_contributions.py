@@ -38,13 +38,6 @@ def settled(truth):
     return windows, contributions_of(regression, posterior)
 
 
-def added(truth):
-    """Return the effects of initial lag states, tilts and offsets on the readings."""
-    with_effects, _ = table(truth)
-    without, _ = table(replace(truth, start_sd=0.0, offset_sd=0.0, tilt_sd=NOTHING.tilt_sd))
-    return (with_effects.mean - without.mean) / NOMINAL
-
-
 @pytest.mark.parametrize(
     ('name', 'effect', 'tolerance'),
     [
@@ -58,7 +51,8 @@ def added(truth):
 def test_each_unknown_explains_what_it_adds_to_the_readings(name, effect, tolerance):
     truth = replace(NOTHING, **effect)
     windows, found = settled(truth)
-    true = added(truth)
+    without, _ = table(replace(truth, start_sd=0.0, offset_sd=0.0, tilt_sd=NOTHING.tilt_sd))
+    true = (table(truth)[0].mean - without.mean) / NOMINAL
     if name == 'support_tilt':
         true = within_positions(true, windows.position)
     # The noise of a mean over 60 windows is 0.26 ug.
@@ -93,13 +87,11 @@ def test_the_sd_of_correlated_noise_is_that_of_the_process():
 @pytest.mark.parametrize(
     ('name', 'value', 'expected'),
     [
-        ('initial_lag_states', 90.0, ['starts']),
-        ('initial_lag_states', 50.0, []),
-        ('support_tilt', 90.0, ['supports']),
-        ('support_tilt', None, []),
+        ('initial_lag_states', 90.0, ['starts']), ('initial_lag_states', 50.0, []),
+        ('support_tilt', 90.0, ['supports']), ('support_tilt', None, []),
         ('mounting_offsets', 90.0, []),
     ],
-)
+)  # fmt: skip
 def test_starts_and_tilts_larger_than_the_response_are_findings(name, value, expected):
     usual = dict.fromkeys((field.name for field in fields(Contributions)), 0.0)
     micro = None if value is None else value * MICRO_G

@@ -227,12 +227,6 @@ def test_readings_are_kept_if_they_change_or_after_ten_seconds():
 
 
 class TestColumnMap:
-    def write(self, tmp_path, **changes):
-        accel = {'columns': ['x', 'y', 'z'], 'unit': 'g', 'output': 'imu'}
-        data = {'stamp': {'column': 't', 'unit': 's'}, 'accel': accel, **changes}
-        (tmp_path / 'map.yaml').write_text(yaml.safe_dump(data))
-        return tmp_path / 'map.yaml'
-
     def test_shipped_column_maps_are_valid(self):
         paths = sorted((ROOT / 'config' / 'columns').glob('*.yaml'))
         assert paths
@@ -270,7 +264,9 @@ class TestColumnMap:
         ],
     )  # fmt: skip
     def test_mistakes_in_a_column_map_name_their_key(self, tmp_path, changes, key, message):
-        path = self.write(tmp_path, **changes)
+        path, accel = tmp_path / 'map.yaml', {'columns': [*'xyz'], 'unit': 'g', 'output': 'imu'}
+        data = {'stamp': {'column': 't', 'unit': 's'}, 'accel': accel, **changes}
+        path.write_text(yaml.safe_dump(data))
         with pytest.raises(RecordingError, match=message) as caught:
             load_column_map(path)
         assert str(path) in str(caught.value)

@@ -331,12 +331,10 @@ def write(path, rng, unit, **columns):
 @pytest.mark.parametrize(
     ('unit', 'text', 'step', 'time_unit', 'rate_hz'),
     [
-        (9.80665, 'm/s^2', 0.01, 's', 100),
-        (1.0, 'g', 5.0, 'ms', 200),
-        (1000.0, 'mg', 10000.0, 'us', 100),
-        (4096.0, 'counts', 5e6, 'ns', 200),
+        (9.80665, 'm/s^2', 0.01, 's', 100), (1.0, 'g', 5.0, 'ms', 200),
+        (1000.0, 'mg', 10000.0, 'us', 100), (4096.0, 'counts', 5e6, 'ns', 200),
     ],
-)
+)  # fmt: skip
 def test_the_norm_at_rest_and_a_plausible_sample_rate_show_the_units(
     tmp_path, rng, unit, text, step, time_unit, rate_hz
 ):

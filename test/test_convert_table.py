@@ -314,18 +314,11 @@ def test_a_stated_unit_that_may_be_true_is_not_contradicted():
     assert contradiction('g', float('nan'), None) is None
 
 
-def shaken(rng, n, scale, noise):
-    accel = scale * np.array([0.6, 0.0, 0.8]) + noise * rng.standard_normal((n, 3))
-    middle = slice(2 * n // 5, 3 * n // 5)
-    accel[middle] += 20.0 * noise * rng.standard_normal((len(accel[middle]), 3))
-    return accel
-
-
 @pytest.mark.parametrize('scale', [1.0, 9.81, 2048.0])
 def test_movement_is_found_in_any_unit(rng, scale):
-    n = 5000
-    stamp_ns = np.arange(1, n + 1) * 10_000_000
-    stillness = find_stillness(stamp_ns, shaken(rng, n, scale, 1e-3 * scale))
+    accel = scale * (np.array([0.6, 0.0, 0.8]) + 1e-3 * rng.standard_normal((5000, 3)))
+    accel[2000:3000] += 20e-3 * scale * rng.standard_normal((1000, 3))
+    stillness = find_stillness(np.arange(1, 5001) * 10_000_000, accel)
     assert np.array(stillness.moving_ns) * 1e-9 == pytest.approx(np.array([[20.01, 30.01]]))
     # A mean over 2 s at 100 Hz of samples with a noise of 0.1 % has a noise of 0.1 % / sqrt(200).
     assert stillness.magnitude == pytest.approx(scale, rel=3e-4)

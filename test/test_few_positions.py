@@ -189,8 +189,7 @@ def test_tilts_of_two_supports_are_not_taken_for_a_scale_slope_of_a_level_axis(r
     at = np.array([0.0, 10.0])
     # 15000 samples (noise 0.1 mg) determine the mean bias slope of the two rests to 1 ug/K.
     assert np.diff(z.bias_function.value(at))[0] == pytest.approx(MG, abs=0.01 * MG)
-    # At 0.03 g a drift error of 1 ug/K is a scale slope of 33 ppm/K; the errors of two rests give
-    # sqrt(2) * 33 = 47 ppm/K.
+    # At 0.03 g drift errors of 1 ug/K in two rests are a scale slope of sqrt(2) * 33 = 47 ppm/K.
     assert abs(np.diff(z.scale_function.value(at))[0]) < 10.0 * 47e-6
 
 
@@ -274,9 +273,8 @@ def test_the_claimed_variance_of_a_curve_contains_that_of_turn_ons_at_each_tempe
     unit = tc.fit(bags, gravity=GRAVITY, input='m/s^2', mounting_sd=turn_on)
     for bag in (bags[0], bags[2]):
         out = unit.correct(bag.time_s, bag.counts, board=bag.temperatures['board'])
-        # If turn-ons have variance V, a line through three temperatures has a variance of 5/6 V at
-        # its ends, a parabola V; the next turn-on adds V, nine mountings V/3 for bias, V/3 for
-        # scale.
+        # V: variance of a turn-on. At its ends a line through three temperatures has the variance
+        # 5/6 V, a parabola V. The next turn-on adds V; nine mountings add V/3 (bias), V/3 (scale).
         variance = np.diagonal(out.covariance[-dwell:].mean(axis=0)) - 1e-3**2
         assert ((1.0 + 5.0 / 6.0) * turn_on**2 < variance).all()
         assert (variance < (1.0 + 1.0 + 2.0 / 3.0) * turn_on**2).all()

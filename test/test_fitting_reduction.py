@@ -135,39 +135,32 @@ def test_positions_in_one_bag_are_separated_but_not_by_vibrations_of_a_compresso
     assert first.time[-1] < 345.0 < second.time[0]
 
 
-def test_readings_of_a_lost_thermometer_are_counted_and_left_out(rng):
+def test_readings_of_a_lost_thermometer_and_glitches_are_counted_and_left_out(rng):
     # WHY: with -127 degC in every 60th reading the error of the fit was 25 times as large.
     whole = block(still(rng, 2000.0, UP))
     whole.board[:] = 20.0 + 0.02 * rng.standard_normal(len(whole.board))
     whole.board[30::60] = -127.0
+    # WHY: each wrong sample ended a rest, and with 1 % wrong samples a fit took minutes, not 2 s.
+    whole.accel[50::100, 1] += 1500.0
+    whole.accel[100_000:100_010] += 1500.0 * np.array([[-1.0], [1.0]] * 5)
     bag = reduced([whole])
     assert bag.n_spikes == {'board': 33, 'case': 0}
     assert bag.board.value.min() > 19.0
     noise = learn_thermometer([bag.board], ThermometerSettings()).noise_sd_c
     assert noise == pytest.approx(0.02, rel=0.1)
-    (finding,) = (f for f in judge_bags([bag], FitOptions(gravity=9.8)) if f.name == 'spikes')
-    assert '33 readings' in finding.message
+    findings = {f.name: f.message for f in judge_bags([bag], FitOptions(gravity=9.8))}
+    assert '33 readings' in findings['spikes']
+    assert '2000 samples' in findings['glitches']
+    assert (bag.n_glitches, len(bag.intervals)) == (len(whole.accel) // 100, 2)
+    assert abs(bag.intervals[0].mean[:, 1].mean()) < 1.0
+    turned = block(still(rng, 200.0, UP))
+    turned.accel[9000:11_000] += 600.0 * rng.standard_normal((2000, 3))
+    assert reduced([turned]).n_glitches == 0
     at_ends = np.array([85.0, 20.0, 20.1, 20.2, 20.3, 20.4, -127.0])
     assert np.flatnonzero(is_spike(at_ends)).tolist() == [0, 6]
     assert not is_spike(np.array([np.inf, np.inf, np.inf, np.inf, 20.0, 20.0, np.inf])).all()
     # Readings of a temperature that changes by up to 18 K from reading to reading are no spikes.
     assert not is_spike(np.array([-18.0, 0.0, 12.0, 18.0, 20.0, 21.0, 21.0])).any()
-
-
-def test_glitches_are_counted_and_end_no_rest(rng):
-    # WHY: each wrong sample ended a rest, and with 1 % wrong samples a fit took minutes, not 2 s.
-    whole = block(still(rng, 2000.0, UP))
-    whole.accel[50::100, 1] += 1500.0
-    whole.accel[100_000:100_010] += 1500.0 * np.array([[-1.0], [1.0]] * 5)
-    bag = reduced([whole])
-    turned = block(still(rng, 200.0, UP))
-    turned.accel[9000:11_000] += 600.0 * rng.standard_normal((2000, 3))
-    assert reduced([turned]).n_glitches == 0
-    assert bag.n_glitches == len(whole.accel) // 100
-    assert len(bag.intervals) == 2
-    assert abs(bag.intervals[0].mean[:, 1].mean()) < 1.0
-    (finding,) = (f for f in judge_bags([bag], FitOptions(gravity=9.8)) if f.name == 'glitches')
-    assert '2000 samples' in finding.message
 
 
 def test_samples_in_bursts_are_a_rest_and_several_with_one_stamp_are_reported(rng):

@@ -34,13 +34,6 @@ from thermo_comp.fitting.unknowns import Noise, State, inverse_misalignment, tan
 POSE_SD = 1e-4
 
 
-def returned(pose, rng):
-    """Draw attitudes that differ by `POSE_SD` from one of three poses, shape (n, 3)."""
-    poses = np.array([[0.577, 0.577, 0.578], [-0.577, 0.578, 0.577], [0.578, -0.577, 0.577]])
-    up = poses[pose] + POSE_SD * rng.standard_normal((len(pose), 3))
-    return up / np.linalg.norm(up, axis=1, keepdims=True)
-
-
 class Dense:
     """The posterior of a `Regression` by dense linear algebra and numerical derivatives."""
 
@@ -142,8 +135,12 @@ def solved(request):
         start_sd=0.5 if n_positions == 1 else 0.0, noise=Noise(4.0, 2000.0),
         offset_sd=2.0 * MICRO, tilt_sd=2e-7 if pose_of else 5e-6,
     )  # fmt: skip
-    pose = np.array(pose_of) if pose_of else None
-    up = None if pose is None else returned(pose, rng)
+    pose, up = (np.array(pose_of) if pose_of else None), None
+    if pose_of:
+        # The attitudes differ by `POSE_SD` from one of three poses.
+        poses = np.array([[0.577, 0.577, 0.578], [-0.577, 0.578, 0.577], [0.578, -0.577, 0.577]])
+        up = poses[pose] + POSE_SD * rng.standard_normal((len(pose), 3))
+        up /= np.linalg.norm(up, axis=1, keepdims=True)
     windows, up = table_of(truth, 10, rng, n_windows=12, step_s=400.0, up=up)
     weight = rng.uniform(0.3, 1.0, len(windows.time))
     windows = replace(windows, weight=weight, bag=windows.position // n_positions, pose=pose)

@@ -11,6 +11,7 @@ import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -201,21 +202,17 @@ class TestScheduler:
             fit_fleet(refused, tmp_path / 'other', OPTIONS, scheduler=address)
 
 
-class _Future:
-    def __init__(self, status, error=None):
-        self.status, self._error = status, error
-
-    def exception(self):
-        return self._error
+def future_of(status, error=None):
+    return SimpleNamespace(status=status, exception=lambda: error)
 
 
 @pytest.mark.parametrize(
     ('future', 'problem'),
     [
-        (_Future('error', distributed.KilledWorker('task', None, 3)),
+        (future_of('error', distributed.KilledWorker('task', None, 3)),
          'the worker of its task died 4 times: too little memory?'),
-        (_Future('error', MemoryError('no\n room')), 'MemoryError: no room'),
-        (_Future('lost'), 'the connection to the Dask scheduler was lost'),
+        (future_of('error', MemoryError('no\n room')), 'MemoryError: no room'),
+        (future_of('lost'), 'the connection to the Dask scheduler was lost'),
     ],
 )  # fmt: skip
 def test_the_next_run_repeats_a_failed_task(future, problem, fleet, tmp_path):

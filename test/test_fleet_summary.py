@@ -166,20 +166,15 @@ class TestDrift:
         assert summarise(first, before).drifts == ()
 
 
-def hostile(rng):
-    evil = '<script>alert(1)</script>"&$x_1$'
-    first = fleet_of(12, rng, lots=('A', evil))
-    rows = [*first, *fleet_of(12, rng, lots=('A', evil), day=400.0, like=first)]
-    for row in rows:
-        row |= {name: f'{evil}{row[name]}' for name in ('serial', 'name')}
-    rows[0] = {**rows[0], 'bias_x_ug': 1e5}
-    rows[1] = row_of(name=evil, serial=evil, verdict='refused', problem=f'3.5 {evil}')
-    return rows
-
-
 class TestPage:
     def test_text_from_bags_is_no_markup_and_the_page_needs_no_network(self, rng):
-        rows = hostile(rng)
+        evil = '<script>alert(1)</script>"&$x_1$'
+        first = fleet_of(12, rng, lots=('A', evil))
+        rows = [*first, *fleet_of(12, rng, lots=('A', evil), day=400.0, like=first)]
+        for row in rows:
+            row |= {name: f'{evil}{row[name]}' for name in ('serial', 'name')}
+        rows[0] = {**rows[0], 'bias_x_ug': 1e5}
+        rows[1] = row_of(name=evil, serial=evil, verdict='refused', problem=f'3.5 {evil}')
         page = render_fleet(rows, summarise(rows), lambda row: f'units/{row["name"]}/c.html')
         assert '<script' not in page
         assert '&lt;script&gt;alert(1)' in page

@@ -105,20 +105,16 @@ def test_a_curve_that_is_not_finite_is_refused(bad):
             functions.check_reference('bias_function', function, 0.0)
 
 
-def slope_and_lag(variances):
-    """Make a unit with a bias slope and a lag of 600 s; `variances` of its first parameters."""
+def test_the_predicted_sd_agrees_with_hand_numbers_or_is_that_of_the_residual():
     unit = calibration(
         static=regime_set(*[axis_set((0.0, 0.3), residual_sd_m_s2=3e-5)] * 3),
         dynamic=regime_set(*[axis_set((0.0, 0.3))] * 3),
         response=(term('board', (0.3, 0.0, 0.0), tau_s=600.0),),
     )
-    n_other = parameter_layout(unit).n_parameters - len(variances)
-    return replace(unit, posterior=posterior_of(np.diag([*variances, *[0.0] * n_other])))
-
-
-def test_the_predicted_sd_agrees_with_hand_numbers_or_is_that_of_the_residual():
     # Parameters of x: level and slope of the bias per set (0-3), lag (4), scale per set (5, 6).
-    unit = slope_and_lag([4e-4, 1e-6, 9e-4, 0.0, 1e-6, 1e-12, 4e-12])
+    variances = np.zeros(parameter_layout(unit).n_parameters)
+    variances[:7] = 4e-4, 1e-6, 9e-4, 0.0, 1e-6, 1e-12, 4e-12
+    unit = replace(unit, posterior=posterior_of(np.diag(variances)))
     states = ramp_states(unit, np.array([20.0, 30.0]), 0.0, np.inf)
     _, bias, _, scale = bias_scale_and_sd(unit, states)
     # Bias variance at 30 degC: 4e-4 + 100 * 1e-6 counts^2, plus the residual's (30 um/s^2)^2.

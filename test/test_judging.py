@@ -9,6 +9,7 @@ import json
 import numpy as np
 import pytest
 from builders import GRAVITY, axis_set, calibration, equal_axes, regime_set
+from conftest import ROOT
 
 from thermo_comp.cli.output import micro_g
 from thermo_comp.errors import RecordingError
@@ -163,8 +164,7 @@ class TestWindows:
 
     @pytest.mark.parametrize('rate_hz', [10, 40])
     def test_residuals_of_white_noise_agree_with_their_claimed_sd(self, tmp_path, rate_hz):
-        # The calibration, at 10 Hz, has the density of the bag's white noise: 0.3 counts per
-        # sample at 10 Hz, 0.6 at 40 Hz.
+        # At both rates the noise has the density in the calibration: 0.3 counts/sample at 10 Hz.
         knows, noise = of_noise(0.3 / K), 0.3 * np.sqrt(rate_hz / 10.0)
         bag = resting(tmp_path / 'bag', 20.0, minutes=40.0, rate_hz=rate_hz, noise=noise)
         windows = judged(bag, knows, window_s=10.0).windows
@@ -380,11 +380,11 @@ class TestShifts:
         np.testing.assert_allclose(judgement.axis_rms, [[0, 0, 0], [3e-5, 0, 0]], atol=1e-12)
 
 
-def test_evaluate_reports_exchanged_thermometers_and_temperatures_out_of_range(root, tmp_path):
+def test_evaluate_reports_exchanged_thermometers_and_temperatures_out_of_range(tmp_path):
     """Exchanged thermometers make a verdict invalid; temperatures out of range give a note."""
     exchanged = Topics(board='temperature/case', case='temperature/board')
     for topics, text in ((Topics(), []), (exchanged, [SWAPPED])):
-        bag = root / 'bags' / 'held_out.mcap'
+        bag = ROOT / 'bags' / 'held_out.mcap'
         result = replay(bag, CLAIMING, tmp_path / f'{len(text)}.mcap', topics=topics, serial='')
         assert result.notes == text
         verdict = judged(bag, CLAIMING, topics=topics, serial='', tolerance=1.0 + 9.0 * len(text))

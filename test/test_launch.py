@@ -112,7 +112,24 @@ def test_a_parameter_is_set_only_where_its_argument_was_given(tmp_path):
         assert all(name.startswith(NOT_GIVEN) for name in unknown)
 
 
-def test_executable_parameters_topics_and_drivers_of_a_launch_file_exist():
+def test_executables_parameters_topics_drivers_and_frames_of_launch_files_exist():
+    (include,) = parse(BESIDE).findall('include')
+    assert include.get('file', '').endswith(OURS.name)
+    assert {element.get('name') for element in include.findall('arg')} <= declared(parse(OURS))
+    nodes = {(node.get('pkg'), node.get('exec')): node for node in parse(BESIDE).findall('node')}
+    assert set(nodes) == set(OTHERS)
+    for key, node in nodes.items():
+        assert {element.get('name') for element in node.findall('param')} <= OTHERS[key]
+    by_exec = {executable: node for (_, executable), node in nodes.items()}
+    madgwick, ekf = (
+        {arg.get('name'): arg.get('value') for arg in by_exec[name].findall('param')}
+        for name in ('imu_filter_madgwick_node', 'ekf_node')
+    )
+    assert (madgwick['publish_tf'], ekf['publish_tf']) == ('false', 'true')
+    assert madgwick['remove_gravity_vector'] == 'false'
+    assert ekf['imu0_remove_gravitational_acceleration'] == 'true'
+    mounting = by_exec['static_transform_publisher'].get('args', '')
+    assert f'--frame-id {ekf["base_link_frame"]}' in mounting
     pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
     from dataclasses import fields
 
@@ -138,23 +155,3 @@ def test_executable_parameters_topics_and_drivers_of_a_launch_file_exist():
         assert defaults[argument[1]] == topic
     assert parameters_set({'driver': 'xsens'})['topics'] == str(ROOT / 'config/drivers/xsens.yaml')
     assert 'topics' not in parameters_set({})
-
-
-def test_the_launch_file_beside_ins_has_existing_arguments_parameters_and_frames():
-    (include,) = parse(BESIDE).findall('include')
-    assert include.get('file', '').endswith(OURS.name)
-    assert {element.get('name') for element in include.findall('arg')} <= declared(parse(OURS))
-    nodes = {(node.get('pkg'), node.get('exec')): node for node in parse(BESIDE).findall('node')}
-    assert set(nodes) == set(OTHERS)
-    for key, node in nodes.items():
-        assert {element.get('name') for element in node.findall('param')} <= OTHERS[key]
-    by_exec = {executable: node for (_, executable), node in nodes.items()}
-    madgwick, ekf = (
-        {arg.get('name'): arg.get('value') for arg in by_exec[name].findall('param')}
-        for name in ('imu_filter_madgwick_node', 'ekf_node')
-    )
-    assert (madgwick['publish_tf'], ekf['publish_tf']) == ('false', 'true')
-    assert madgwick['remove_gravity_vector'] == 'false'
-    assert ekf['imu0_remove_gravitational_acceleration'] == 'true'
-    mounting = by_exec['static_transform_publisher'].get('args', '')
-    assert f'--frame-id {ekf["base_link_frame"]}' in mounting

@@ -103,16 +103,6 @@ def plotjuggler():
     return ET.fromstring(PLOTJUGGLER.read_text())  # noqa: S314 - our own file
 
 
-def source_kind(topics, series):
-    topic = max((t for t in topics if series.startswith(f'{t}/')), key=len)
-    fields = series[len(topic) + 1 :].split('/')
-    # PlotJuggler names an entry of a covariance [row;column]; messages number entries from 0 to 8.
-    if match := re.fullmatch(r'\[([012]);([012])\]', fields[-1]):
-        place = 3 * int(match[1]) + int(match[2])
-        fields = [*fields[:-2], f'{fields[-2]}[{place}]']
-    return field_kind(topics[topic], fields)
-
-
 def test_plotjuggler_curves_name_numbers_and_splitters_count_their_panels(topics):
     root = plotjuggler()
     snippets = {snippet.get('name'): snippet for snippet in root.iter('snippet')}
@@ -121,7 +111,13 @@ def test_plotjuggler_curves_name_numbers_and_splitters_count_their_panels(topics
     sources = {element.text for pattern in patterns for element in root.findall(pattern)}
     assert set(snippets) <= curves
     for series in (curves - set(snippets)) | sources:
-        assert source_kind(topics, series) in ('float64', 'bool')
+        topic = max((name for name in topics if series.startswith(f'{name}/')), key=len)
+        fields = series[len(topic) + 1 :].split('/')
+        # PlotJuggler names entries of a covariance [row;column]; messages number them from 0 to 8.
+        if match := re.fullmatch(r'\[([012]);([012])\]', fields[-1]):
+            place = 3 * int(match[1]) + int(match[2])
+            fields = [*fields[:-2], f'{fields[-2]}[{place}]']
+        assert field_kind(topics[topic], fields) in ('float64', 'bool')
     for splitter in root.iter('DockSplitter'):
         assert int(splitter.get('count')) == len(splitter)
         assert len(splitter.get('sizes').split(';')) == len(splitter)

@@ -57,9 +57,8 @@ def test_a_bag_without_fan_separates_lags_of_board_and_gradient():
     result = fitted((*bags, record(unit, HALF, spread(1, rng)[0], rng, environment=STILL_AIR)))
     assert all(finding.name != 'environment' for finding in result.findings)
     assert not advice_of(result)
-    # Without fan the gradient of a ramp is 1 / 0.7 = 1.43 times as large. One such bag in ten
-    # makes the columns differ by 0.3 * 0.43 = 0.13 RMS, as sqrt(0.1 * 0.9) = 0.3: the inflation is
-    # 0.13^-2 = 60.
+    # Without fan the gradient of a ramp is 1 / 0.7 = 1.43 times as large. With one such bag in ten
+    # the columns differ by 0.43 * sqrt(0.1 * 0.9) = 0.13 RMS: the inflation is 0.13^-2 = 60.
     assert 30.0 < inflation_of(result, 'board', 'gradient_lag') < 90.0
 
 

@@ -35,13 +35,10 @@ from thermo_comp.unit.calibration_file import save_calibration
 SLOW = pytest.mark.slow
 
 
-def odd(name, kind):
-    return ParameterMessage(name=name, value=ParameterValue(type=kind))
-
-
 #: Parameters that a request may contain; the node must answer each request.
 STRANGE = [
-    *[odd(name, kind) for name in ('frame_id', '', 'no such') for kind in (0, 77, 255)],
+    *[ParameterMessage(name=name, value=ParameterValue(type=kind))
+      for name in ('frame_id', '', 'no such') for kind in (0, 77, 255)],
     *[
         Parameter(name, value=value).to_parameter_msg()
         for name, value in (

@@ -61,11 +61,6 @@ def page_of(evidence, folder, **keys):
     return Page(path.read_text(encoding='utf-8'))
 
 
-def bare():
-    """Gather the data for a report on a calibration alone, without bags."""
-    return evidence_of_bags([], fitted().calibration)
-
-
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory):
     return write_bag(tmp_path_factory.mktemp('report') / 'held_out.mcap')
@@ -81,7 +76,7 @@ def page():
     return Page(certificate())
 
 
-def test_the_certificate_of_a_fit_has_the_expected_statements_and_residuals(page):
+def test_the_certificate_has_its_statements_and_residuals_and_runs_no_script(page):
     assert not page.open  # every tag is closed
     for fact in (
         *('Unit thermostatted-0001', evidence().calibration.provenance.created),
@@ -97,9 +92,6 @@ def test_the_certificate_of_a_fit_has_the_expected_statements_and_residuals(page
     assert shown == [*LEFT_OUT_RMS, None]
     assert 'left out, µg RMS' in page.text
     assert 'Left out: RMS of |f| − g of each position by a fit to the other pos' in page.text
-
-
-def test_the_page_loads_no_file_runs_no_script_and_has_unique_ids(page):
     assert not page.names() & {'script', 'img', 'link', 'iframe', 'object', 'embed', 'form'}
     for tag, attributes in page.tags:
         for name, value in attributes.items():
@@ -207,7 +199,7 @@ def test_a_bag_is_read_for_a_page_in_limited_memory(tmp_path):
 
 def test_a_calibration_without_bags_gives_a_page_and_figures_as_png(tmp_path):
     folder = tmp_path / 'new' / 'figures'
-    page = page_of(bare(), tmp_path, figures=folder)
+    page = page_of(evidence_of_bags([], fitted().calibration), tmp_path, figures=folder)
     assert 'no recording was judged' in page.text
     assert '01.mcap' in page.text
     assert f'{1:064x}' in page.text

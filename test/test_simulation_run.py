@@ -357,8 +357,8 @@ def test_units_of_equal_seeds_are_equal_and_start_at_the_reference_temperature(n
 
 @pytest.mark.parametrize('seed', range(8))
 def test_the_presets_bare_quartz_and_mems_have_the_published_slopes(seed):
-    # Q-Flex: scale slope 68 ppm/K at 5 degC, 87 at 35 degC; bias slope 0.3 to 5 ug/K.
-    # MEMS: bias slope 90 to 550 ug/K.
+    # Q-Flex: scale slopes of 68 ppm/K at 5 degC, 87 at 35 degC. Bias slopes: 0.3 to 5 ug/K, of a
+    # MEMS 90 to 550 ug/K.
     unit = unit_preset('bare-quartz', seed)
     bias, scale = _static(unit, np.array([4.5, 5.5, 19.5, 20.0, 20.5, 34.5, 35.5]))
     cold, hot = (scale[1] - scale[0]) * 1e6, (scale[6] - scale[5]) * 1e6

@@ -298,7 +298,19 @@ def test_the_ratio_is_1_for_the_claimed_covariance_and_infinite_if_minutes_are_m
         assert scores.ratio == pytest.approx(expected)
 
 
-def test_misses_names_exactly_the_limits_that_a_row_violates():
+@pytest.mark.parametrize('name', ['units', 'cases', 'baselines', 'limits'])
+def test_the_simulation_and_the_limits_import_nothing_of_the_package(name):
+    source = (ROOT / 'benchmarks' / f'strangers_{name}.py').read_text(encoding='utf-8')
+    imports = [line for line in source.splitlines() if 'import ' in line]
+    assert imports
+    assert not [line for line in imports if 'thermo_comp' in line]
+
+
+def test_each_case_has_a_limit_and_misses_names_exactly_the_violated_limits():
+    names = (*strangers.RECORDED, *cases.CASES)
+    assert all(any(key.startswith(name) for key in LIMITS) for name in names)
+    assert all(any(key.startswith(name) for name in names) for key in LIMITS)
+    assert all(isinstance(limit, Limit) for limit in LIMITS.values())
     baselines = {'cubic': Score(50.0, 100.0), 'constants': Score(40.0, 200.0)}
 
     def missed(fit, title='ageing'):
@@ -316,21 +328,6 @@ def test_misses_names_exactly_the_limits_that_a_row_violates():
                     Result('third-node joint: its attitude', 1, {'fit': joint})])  # fmt: skip
     assert misses(rows[0], rows) == []
     assert misses(rows[1], rows) == ['vector / alone: its attitude 0.75 > 0.5']
-
-
-@pytest.mark.parametrize('name', ['units', 'cases', 'baselines', 'limits'])
-def test_the_simulation_and_the_limits_import_nothing_of_the_package(name):
-    source = (ROOT / 'benchmarks' / f'strangers_{name}.py').read_text(encoding='utf-8')
-    imports = [line for line in source.splitlines() if 'import ' in line]
-    assert imports
-    assert not [line for line in imports if 'thermo_comp' in line]
-
-
-def test_each_case_has_a_limit_and_each_limit_has_a_case():
-    names = (*strangers.RECORDED, *cases.CASES)
-    assert all(any(key.startswith(name) for key in LIMITS) for name in names)
-    assert all(any(key.startswith(name) for name in names) for key in LIMITS)
-    assert all(isinstance(limit, Limit) for limit in LIMITS.values())
 
 
 def carried_bag():

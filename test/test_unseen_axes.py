@@ -143,12 +143,10 @@ def test_rests_in_one_pose_use_the_mounting_sd_that_the_user_stated():
 @pytest.mark.parametrize(
     ('draw', 'unit', 'is_cold'),
     [
-        (cases.consumer_grade, 3, False),
-        (cases.consumer_grade, 4, False),
-        (navigation, 2, True),
-        (navigation, 2, False),
+        (cases.consumer_grade, 3, False), (cases.consumer_grade, 4, False),
+        (navigation, 2, True), (navigation, 2, False),
     ],
-)
+)  # fmt: skip
 def test_the_claimed_sd_is_right_if_one_ramp_cannot_separate_bias_and_scale(draw, unit, is_cold):
     # WHY: the drift in the only ramp, or a lag's effect in warm-ups, was taken for scale changes.
     rng = rng_of('bench beside a ramp', unit)
