@@ -94,12 +94,10 @@ def test_any_number_of_any_message_layout_is_read(store, rows, cells, is_little)
     [
         ('temp', r'has the fields header, names, parts.*, no `temp`'),
         ('last.celsius.x', 'a number has the fields none, no `x`'),
-        ('names', 'is not a number'),
-        ('header', 'is not a number'),
-        ('last[0]', 'of a field that is not an array'),
-        ('raw[', 'no `raw\\['),
+        ('names', 'is not a number'), ('header', 'is not a number'),
+        ('last[0]', 'of a field that is not an array'), ('raw[', 'no `raw\\['),
     ],
-)
+)  # fmt: skip
 def test_a_path_that_leads_to_no_number_is_refused(store, path, text):
     with pytest.raises(RecordingError, match=text):
         Field('lab_msgs/msg/Deep', path, store.fielddefs)

@@ -68,17 +68,6 @@ def test_the_evidence_selects_the_condition_that_ends_the_dynamic_regime(end_con
     assert last.fitted.rms < 0.35 * last.raw.rms
 
 
-def uneven(rng):
-    """Make positions of 7, 1, 12 and 4 windows, with a gap in the third, and random weights."""
-    lengths = (7, 1, 12, 4)
-    position = np.repeat(np.arange(len(lengths)), lengths)
-    steps = rng.uniform(1.0, 9.0, len(position))
-    steps[12] = 4000.0
-    own = [steps[position == k] for k in range(len(lengths))]
-    time = np.concatenate([100.0 * k + np.cumsum(part) for k, part in enumerate(own)])
-    return position, time, rng.uniform(0.1, 3.0, len(position))
-
-
 def dense(position, time, weight, noise):
     """Build the covariance of exponentially correlated noise in each position and white noise."""
     same = position[:, None] == position
@@ -96,7 +85,12 @@ def dense(position, time, weight, noise):
     ],
 )
 def test_products_and_determinant_equal_those_of_the_dense_matrix(rng, noise):
-    position, time, weight = uneven(rng)
+    # Four positions of 7, 1, 12 and 4 windows, with a gap in the third, and random weights.
+    position = np.repeat(np.arange(4), (7, 1, 12, 4))
+    steps = rng.uniform(1.0, 9.0, len(position))
+    steps[12] = 4000.0
+    time = np.concatenate([100.0 * p + np.cumsum(steps[position == p]) for p in range(4)])
+    weight = rng.uniform(0.1, 3.0, len(position))
     series = rng.standard_normal((len(time), 5))
     whitener = Whitener(position, time)
     white = whitener.filter(series, weight, noise)

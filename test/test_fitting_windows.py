@@ -183,14 +183,13 @@ def test_the_derivative_of_a_column_by_its_lag_agrees_with_differences():
 @pytest.mark.parametrize(
     ('options', 'static', 'dynamic', 'is_shared'),
     [
-        ({}, Polynomial, 2, True),
-        ({'static_curve': 'quadratic'}, Polynomial, 2, True),
+        ({}, Polynomial, 2, True), ({'static_curve': 'quadratic'}, Polynomial, 2, True),
         ({'model': 'golovach'}, Polynomial, 2, False),
         ({'static_curve': 'spline'}, CubicSpline, None, False),
         ({'static_curve': 'exponential'}, Exponential, 2, False),
         ({'static_curve': 'linear', 'dynamic_curve': 'linear'}, Polynomial, 1, False),
     ],
-)
+)  # fmt: skip
 def test_curve_columns_of_a_fit_are_powers_of_temperature(
     bags, options, static, dynamic, is_shared
 ):

@@ -244,12 +244,10 @@ def test_a_part_by_stamps_equals_a_part_by_seconds_also_after_a_jump_of_the_cloc
 @pytest.mark.parametrize(
     ('begin', 'end', 'reason'),
     [
-        (5.0, 5.0, 'must end after its begin 5 s, got 5 s'),
-        (-1.0, None, '0 s or a positive time'),
-        (float('nan'), None, '0 s or a positive time'),
-        (5.0, 1.7e9, 'or both as stamps'),
+        (5.0, 5.0, 'must end after its begin 5 s, got 5 s'), (5.0, 1.7e9, 'or both as stamps'),
+        *((begin, None, '0 s or a positive time') for begin in (-1.0, float('nan'))),
     ],
-)
+)  # fmt: skip
 def test_impossible_bounds_of_a_part_are_refused(begin, end, reason):
     with pytest.raises(ValueError, match=reason):
         BagPart(begin, end)
