@@ -143,7 +143,7 @@ def rich_gyroscope():
 
 
 def stream(compensator, events):
-    """Process events one by one, rates 1e-3 * sample; return rows and the numbers of samples."""
+    """Process events singly, angular rates 1e-3 * sample; return rows and numbers of samples."""
     rows, index = [], []
     position = 0
     for kind, stamp, value in events:
@@ -204,7 +204,7 @@ def assert_equal_bits(unit, config, events, chunk):
 
 
 def warm(compensator, celsius=20.0, case=None, *, until_s=1, start_s=0, flicker=0.0):
-    """Push a reading per second; readings that alternate by `flicker` [K] are not stuck."""
+    """Push both readings each second; `flicker` [K]: noise, so that they do not count as stuck."""
     for second in range(start_s, until_s):
         noise = flicker * (-1) ** second
         compensator.push('board', second * SECOND_NS, celsius + noise)

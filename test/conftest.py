@@ -250,7 +250,7 @@ def once(tmp_path_factory):
         with (shared / f'.{name}.lock').open('w') as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             if not folder.exists():
-                # Remove files of an earlier `make` that failed.
+                # Remove the files of an earlier call of `make` that failed.
                 shutil.rmtree(partial, ignore_errors=True)
                 partial.mkdir()
                 make(partial)

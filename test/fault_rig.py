@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the bag of the fault tests and functions that insert faults; all other errors are noise."""
+"""Owns the bag of the fault tests (its only errors: noise) and functions that insert faults."""
 
 import math
 from collections.abc import Callable
@@ -34,7 +34,7 @@ NOISE_SD = 1e-4
 BIAS = (18000.0, -15000.0, 16500.0)  # counts, which are 5 to 6 mg
 BIAS_SLOPE, BIAS_CURVE = 300.0, 4.0  # counts/K, counts/K^2: 100 ug/K, 1.4 ug/K^2
 SCALE_SLOPE = 7e-5
-BY_GRADIENT, BY_MEMORY = 150.0, 60.0  # counts/K
+BY_GRADIENT, BY_MEMORY = 150.0, 60.0  # counts per K of case less board, and of board lag
 
 #: Residual sd of the static curves [m/s^2], as large as the error until a ramp is detected.
 STATIC_RESIDUAL = 1.5e-4

@@ -132,7 +132,7 @@ def test_a_backward_jump_of_the_clock_begins_a_new_position(stream):
     assert still_s == pytest.approx([40.0] * 2, abs=1.0)
 
 
-def test_the_zero_of_unsigned_words_is_in_mid_range(stream):
+def test_the_zero_of_unsigned_counts_is_in_mid_range(stream):
     for up in [*UPS, UPS[0]]:
         stream.rest(up, 40.0)
         stream.turn()
@@ -166,9 +166,9 @@ def test_the_columns_equal_the_derivatives_of_the_measured_force(rng):
     up, step = units(rng, 20), 1e-6
 
     def force(constants):
-        bias, scale, skew = constants.reshape(3, 3)
+        bias, scale, misalignment = constants.reshape(3, 3)
         inverse = np.eye(3)
-        inverse[1, 0], inverse[2, 0], inverse[2, 1] = skew
+        inverse[1, 0], inverse[2, 0], inverse[2, 1] = misalignment
         return (up @ inverse.T) * (1.0 + scale) + bias
 
     for k, step_of in enumerate(step * np.eye(9)):
@@ -179,7 +179,7 @@ def test_the_columns_equal_the_derivatives_of_the_measured_force(rng):
         np.testing.assert_allclose(coverage.norm_columns(up)[:, k], slope, atol=1e-9)
 
 
-def test_without_positions_all_and_with_two_opposite_faces_seven_constants_keep_their_prior_sd():
+def test_constants_that_the_positions_do_not_determine_keep_their_prior_sd():
     covariance = coverage.constants_covariance(NOTHING, np.empty(0))
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), PRIOR_SD)
     # Along an axis the variance of |f| is the sum of the variances of its bias and scale.

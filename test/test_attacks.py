@@ -36,7 +36,7 @@ def test_a_clock_topic_that_goes_back_or_pauses_does_not_change_samples(peer, tm
         samples = Samples(peer, node)
         assert peer.set_parameters(use_sim_time=True)[0].successful
         clock = peer.publisher(Clock, '/clock')
-        # /clock begins, falls by 1 h, is constant for five checks, jumps by a year, and ends.
+        # /clock rises by 1 h, falls back, is constant for five checks, jumps by a year, and ends.
         hour = 3600 * 10**9
         times = [START_NS, START_NS + hour, START_NS, *[START_NS] * 5, START_NS + 8760 * hour]
         for now_ns in times:

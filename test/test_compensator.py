@@ -37,7 +37,7 @@ NOISE = 1e-4**2 / 0.01 + (1.0 / 6.0) / 300.0**2
 
 
 def test_corrected_samples_agree_with_the_formulas_of_two_faces_and_of_the_static_set():
-    # Counts at +-g: offset = sum / 2, scale = difference / 2 (Golovach's Eq. (3), (4): exchanged).
+    # Counts at +-g: offset = sum / 2, scale = difference / 2; the paper's Eq. (3), (4) swap them.
     plus, minus = 300.0 * GRAVITY + 12.0, -300.0 * GRAVITY + 12.0
     axis = AxisReference((plus - minus) / 2.0 / GRAVITY, (plus + minus) / 2.0)
     compensator = Compensator(calibration(axes=Axes(*[axis] * 3)))

@@ -280,11 +280,11 @@ def test_the_guessed_column_map_is_printed(tmp_path, rng, cli, headings, thermom
     assert f'log.csv: columns not used: {not_used}\n' in printed
     head, *lines = printed.splitlines()
     assert 'guessed column map; if the map is wrong, edit it for --columns' in head
-    own = yaml.safe_load('\n'.join(takewhile(lambda line: line.startswith('  '), lines)))
-    assert own['stamp'] == {'column': 'time (s)', 'unit': 's'}
-    assert own['accel'] == {'columns': ['ax', 'ay', 'az'], 'unit': 'g', 'output': 'imu'}
-    assert [own.get(name, {}).get('column') for name in ('board', 'case')] == thermometers
-    (tmp_path / 'map.yaml').write_text('\n'.join(map_lines(own)))
+    guess = yaml.safe_load('\n'.join(takewhile(lambda line: line.startswith('  '), lines)))
+    assert guess['stamp'] == {'column': 'time (s)', 'unit': 's'}
+    assert guess['accel'] == {'columns': ['ax', 'ay', 'az'], 'unit': 'g', 'output': 'imu'}
+    assert [guess.get(name, {}).get('column') for name in ('board', 'case')] == thermometers
+    (tmp_path / 'map.yaml').write_text('\n'.join(map_lines(guess)))
     again = ('--columns', tmp_path / 'map.yaml', '-o', tmp_path / 'again')
     assert f'not used: {not_used}\n' in cli('convert', tmp_path / 'log.csv', *again).stdout
 
@@ -311,7 +311,7 @@ def test_equal_guessed_column_maps_are_printed_once(tmp_path, rng, cli):
 
 
 @pytest.mark.parametrize(('one_g', 'bits'), [(4096.0, 15), (524288.0, 23), (1e8, 31)])
-def test_words_of_24_and_32_bits_are_not_saturated(rng, one_g, bits):
+def test_counts_of_24_and_32_bits_are_not_saturated(rng, one_g, bits):
     rest = Rest(rng, level=(0.0, 0.0, one_g), sd=0.002 * one_g)
     rest.accel[:] = np.rint(rest.accel)
     rest.accel[100] = 2.0**bits - 1.0  # largest value of the converter

@@ -101,7 +101,7 @@ def test_stamps_of_a_table_are_exact():
         ('1,2\n3,4\n', 'a', "no column 'a': the table has no headings"),
         ('1,2\n3,4\n', 2, 'no column 2: the table has 2 columns, 0 to 1'),
         ('1,2\n3,4\n', -1, 'no column -1: the table has 2 columns, 0 to 1'),
-        # WHY: of a table with decimal commas only rows with whole numbers were read.
+        # WHY: rows whose numbers have decimal commas were left out.
         ('a;b\n1,5;2\n3;4\n5;6\n', 'a', "column 'a' has decimal commas, it begins with 1,5"),
         ('a,b\n\0\0\n', 'a', 'it holds zero bytes'),
     ],

@@ -122,7 +122,7 @@ def test_corrections_drawn_from_the_posterior_scatter_by_the_claimed_sd(rng):
     judged = replace(unit, posterior=posterior)
     states = states_of(unit, rng)
     slow = SlowUncertainty(judged, Correction(judged))
-    nobody = np.zeros((len(Correction(unit).memory.lags), 2))
+    no_shares = np.zeros((len(Correction(unit).memory.lags), 2))
     draws = rng.multivariate_normal(np.zeros(n), posterior.covariance(), size=300)
     weights = np.array([0.0, 0.3])
     pair = np.repeat(np.array([states[-1][1]]), 2, axis=0).T
@@ -139,7 +139,7 @@ def test_corrections_drawn_from_the_posterior_scatter_by_the_claimed_sd(rng):
     tilted[:, [1, 2, 2], [0, 0, 1]] = draws[:, layout.misalignment :]
     M = np.array([[1.0, 0.0, 0.0], [0.1, 1.0, 0.0], [-0.2, 0.15, 1.0]])
     elements = CovarianceMap((0.1, -0.2, 0.15))
-    rows = slow.at(pair, nobody)
+    rows = slow.at(pair, no_shares)
     each = zip(elements.coefficients(rows).T.tolist(), rows[:9].T.reshape(2, 3, 3), strict=True)
     for k, (coefficients, parts) in enumerate(each):
         for axis, (a, b, c) in enumerate(parts):

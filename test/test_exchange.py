@@ -337,7 +337,7 @@ def test_kalibr_files_without_bias_with_rates_and_with_several_imus_are_read():
     np.testing.assert_allclose(ours(back, np.array([[1.01, 1.99, 3.06]])), [[1, 2, 3]], rtol=1e-12)
     with pytest.raises(CalibrationError, match='an IMU with --number: the file has imu0, imu1'):
         import_calibration(f'imu0:\n{imu}imu1:\n{imu}', serial='7')
-    # WHY: the calibration of a file with 400 Hz had 200 Hz, at which the node drops samples.
+    # WHY: for a file with 400 Hz the calibration had 200 Hz, so the node dropped samples.
     imu = 'imu0:\n  accelerometers:\n    M: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n'
     text = f'{imu}  update_rate: 400.0\n  accelerometer_noise_density: 0.0025\n'
     back = import_calibration(text, serial='7')

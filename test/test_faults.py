@@ -71,7 +71,7 @@ class Direct:
 
 @cache
 def undisturbed():
-    """Return the groups of messages of the undisturbed bag, each with the `Direct` before it."""
+    """Return the groups of messages of the bag without a fault, each with the state before it."""
     run, result = Direct(), []
     for lot in (*lots(bag()), []):
         result.append((lot, deepcopy(run)))

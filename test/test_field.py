@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from builders import rich_calibration
 from conftest import ROOT, parsed
-from field_helpers import in_any_attitude, jump_of, known, no_error, rests, upright, write_log
+from field_helpers import in_any_attitude, jump_of, no_error, precise, rests, upright, write_log
 
 from thermo_comp.errors import FitError
 from thermo_comp.field.ageing import Ageing, Model, learn, rows_of, solve
@@ -35,7 +35,7 @@ def test_derivatives_of_a_rest_by_all_parameters_agree_with_finite_differences()
     layout = parameter_layout(unit)
     levels = {level for block in layout.scale for level in (block.static, block.dynamic)}
     levels |= {block.static for block in layout.bias}
-    # Every second parameter tests each kind in bias or scale, as both have odd numbers of them.
+    # Every second parameter: as blocks have odd lengths, each kind is tested in bias or in scale.
     for k in range(0, layout.n_parameters, 2):
         step = 1e-7
         moved = values.copy()
@@ -123,7 +123,7 @@ def test_updates_of_ageing_units_have_small_errors_of_at_most_1_4_claimed_sd_rms
 
 
 def test_an_update_does_not_change_the_constants_of_axes_that_no_rest_observes():
-    unit = known()
+    unit = precise()
     updated = update(series_of(rests(unit, upright, jump_of(300.0, 10.0)), unit), unit)
     new = updated.calibration
     assert [axis.is_determined for axis in updated.axis_changes] == [False, False, True]
@@ -139,7 +139,7 @@ def test_an_update_does_not_change_the_constants_of_axes_that_no_rest_observes()
 
 
 def test_a_jump_is_distinguished_from_ageing(rng):
-    unit = known()
+    unit = precise()
     jumped = update(series_of(rests(unit, upright, jump_of(300.0, 10.0)), unit), unit)
     (change,) = jumped.changes
     first = series_of(rests(unit, upright, no_error), unit).time[0]
@@ -154,7 +154,7 @@ def test_a_jump_is_distinguished_from_ageing(rng):
 
 def test_the_sd_of_an_old_calibration_aged_to_the_last_rest_includes_the_random_walk(rng):
     # After 30 days a random walk of 60 ug per root day has an sd of 329 ug.
-    unit = known()
+    unit = precise()
     walk = np.cumsum(60.0 / np.sqrt(3.0) * MICRO_G * rng.standard_normal((90, 3)), axis=0)
     logged = rests(unit, upright, lambda day: walk[round(3 * day)], 30)
     x, y, z = update(series_of(logged, unit), unit).axis_changes
@@ -235,7 +235,7 @@ def on_z(rest, counts):
 def test_a_changed_curve_is_corrected_and_the_sd_of_an_unobserved_slope_grows():
     # The slope of the z bias changes by 5 ug/K; the rests are at 15 to 25 degC.
     curved = field_units.calibration()
-    unit = known(static=curved.static, dynamic=curved.dynamic)
+    unit = precise(static=curved.static, dynamic=curved.dynamic)
     logged = rests(unit, upright, no_error, days=30)
     bent = [(s, on_z(r, 300.0 * 5 * MICRO_G * (r.state[0] - 20.0))) for s, r in logged]
     result = update(series_of(bent, unit), unit)
@@ -253,7 +253,7 @@ def test_a_changed_curve_is_corrected_and_the_sd_of_an_unobserved_slope_grows():
 
 
 def test_a_contradicting_turn_on_is_left_out_and_stamps_may_be_in_wrong_order(rng):
-    unit = known()
+    unit = precise()
     logged = rests(unit, upright, jump_of(100.0, 8.0), days=15)
     bad = [(s, on_z(r, 300.0 * 0.02) if s == logged[80][0] else r) for s, r in logged]
     result = update(series_of(bad, unit), unit)
@@ -269,7 +269,7 @@ def test_a_contradicting_turn_on_is_left_out_and_stamps_may_be_in_wrong_order(rn
 
 def test_a_wrong_clock_at_the_start_of_the_node_does_not_change_the_update(tmp_path, rng):
     # Sample stamps are right; start times of no, of all or of only the last start are wrong.
-    unit = known()
+    unit = precise()
     logged = rests(unit, upright, jump_of(300.0, 10.0))
     image = {start.start_ns: int(1.6e18 + 5e8 * rng.standard_normal()) for start, _ in logged}
     last = logged[-1][0].start_ns
@@ -287,7 +287,7 @@ def test_a_wrong_clock_at_the_start_of_the_node_does_not_change_the_update(tmp_p
 @pytest.fixture
 def unit_file(tmp_path):
     path = tmp_path / 'unit.yaml'
-    save_calibration(known(provenance=Provenance(created='2029-12-31T00:00:00Z')), path)
+    save_calibration(precise(provenance=Provenance(created='2029-12-31T00:00:00Z')), path)
     return path
 
 
@@ -414,7 +414,7 @@ def test_unknown_initial_lag_states_are_not_taken_for_scatter_of_rests(rng, lags
 
 
 def test_the_newest_of_too_many_turn_ons_are_used_and_fewer_than_three_are_refused(monkeypatch):
-    unit = known()
+    unit = precise()
     series = series_of(rests(unit, upright, no_error), unit)
     everything = rows_of(series, MICRO_G)
     monkeypatch.setattr('thermo_comp.field.ageing._MOST_ROWS', 25)

@@ -75,7 +75,7 @@ def test_the_reduction_does_not_depend_on_blocks_or_on_the_origin_of_time(rng):
 
 @pytest.mark.parametrize('rest_s', [30, 45])
 def test_short_rests_of_slow_samples_are_found(rng, rest_s):
-    # WHY: at 1 Hz means were over 30 s and several attitudes, so |f| of a mean was 0.07 m/s^2.
+    # WHY: at 1 Hz each mean over 30 s was of several attitudes, and so had a norm of 0.07 m/s^2.
     ups = np.repeat(positions(18, 1), rest_s, axis=0)
     samples = 9.8 * (ups + 5e-6 * rng.standard_normal(ups.shape))
     tumble = ArrayBlock(stamps(len(samples), 1.0), samples)
@@ -348,7 +348,7 @@ def test_steps_of_a_converter_after_a_constant_soak_do_not_divide_a_rest_but_a_t
     ramp = np.maximum(rest.time - 1800.0, 0.0) / 1800.0
     rest.accel = np.rint(rest.accel / 0.04 + 6.0 * np.outer(ramp, (1.0, -1.3, 0.7))) * step
     assert len(reduce_source(rest.source(), full_scale=None).intervals) == 1
-    # WHY: if samples changed only as the unit was turned, this change counted as an ADC step.
+    # WHY: between two rests with constant samples, a turn counted as one step of the converter.
     rest = Rest(rng, sd=0.0)
     rest.accel[rest.time > 300.0] = (GRAVITY, 0.0, 0.0)
     assert len(reduce_source(rest.source(), full_scale=None).intervals) == 2

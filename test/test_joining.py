@@ -97,7 +97,7 @@ def test_recordings_that_are_not_parts_of_one_are_not_joined(rng):
     assert len(joined(reduced(cut(whole, (200.0,)), force=known))) == 2
     short = recorded(rng, 2.0)
     assert len(joined(reduced([short, short]))) == 2
-    # Two recordings have equal stamps: each is joined only with its own second part.
+    # Both recordings have the same stamps; each first part is joined with its own second part.
     parts = [*cut(whole, (200.0,)), *cut(replace(whole, accel=-whole.accel), (200.0,))[::-1]]
     first, second = joined(reduced(parts))
     assert len(first.intervals) == len(second.intervals) == 1

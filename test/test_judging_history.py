@@ -10,7 +10,7 @@ import field_watch
 import numpy as np
 import pytest
 from builders import axis_set, calibration, regime_set
-from field_helpers import in_any_attitude, jump_of, known, no_error, rests, upright
+from field_helpers import in_any_attitude, jump_of, no_error, precise, rests, upright
 from report_helpers import evidence, fitted, write_bag
 from scipy.stats import norm
 
@@ -169,7 +169,7 @@ def test_forecasts_agree_with_the_simulated_future_of_units():
 @pytest.mark.parametrize('attitudes', [upright, pytest.param(in_any_attitude, marks=SLOW)])
 def test_the_verdict_follows_the_true_error_on_each_day(attitudes):
     # The RMS error is 1.5 times the limit on days 20 to 34, 20 times on day 12, else 0.6 times.
-    unit = known()
+    unit = precise()
     limit = LIMIT * np.sqrt(np.mean(series_of(rests(unit, attitudes, no_error), unit).claim ** 2))
 
     def error(day):
@@ -195,7 +195,7 @@ def test_the_verdict_follows_the_true_error_on_each_day(attitudes):
 
 def test_the_drift_watch_states_the_day_and_the_temperature_range():
     of_field = field_units.calibration()
-    unit = known(static=of_field.static, dynamic=of_field.dynamic)
+    unit = precise(static=of_field.static, dynamic=of_field.dynamic)
     healthy = watch(series_of(rests(unit, upright, no_error), unit), unit)
     assert (healthy.exit_code, healthy.outside_since) == (0, None)
     assert 'within its claim up to 2030-01-20' in str(healthy)

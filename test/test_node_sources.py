@@ -208,7 +208,7 @@ def test_a_driver_with_incompatible_qos_or_type_is_named(peer, unit):
 
 
 def test_reports_more_frequent_than_samples_report_no_missing_samples(peer, tmp_path):
-    # WHY: with a diagnostics_period below the sample interval, reports between samples were ERROR.
+    # WHY: with a diagnostics_period below the sample interval, some reports had level ERROR.
     slow = tmp_path / 'slow.yaml'
     # An error needs 5 cycles (1.5 s) without a sample: no busy machine pauses for so long.
     save_calibration(calibration(unit=Unit('T-1', 'counts', 32767.0, 0.3)), slow)

@@ -67,7 +67,7 @@ def test_position_errors_and_the_map_of_the_sphere_agree_with_hand_numbers():
     assert schuler_peak(MICRO_G) == pytest.approx(12.742, rel=1e-4)
     assert figures.equal_area((0.0, 0.0, 1.0), 1) == (0.0, 0.0)
     assert figures.equal_area((0.0, 1.0, 0.0), -1) == (0.0, 1.0)
-    # The cap above 45 deg is 1 - sin 45 of the hemisphere; its map is this share of the disc.
+    # The cap above 45 deg has the share 1 - sin 45 of the hemisphere's area, and of the disc's.
     x, y = figures.equal_area((np.sqrt(0.5), 0.0, np.sqrt(0.5)), 1)
     assert x**2 + y**2 == pytest.approx(1.0 - np.sqrt(0.5))
 

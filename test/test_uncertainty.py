@@ -264,13 +264,13 @@ def test_the_claimed_sd_grows_with_the_distance_from_the_range():
     unit = rich_calibration()
     correction = Correction(unit)
     slow = SlowUncertainty(unit, correction)
-    nobody = np.zeros((len(correction.memory.lags), 1))
+    no_shares = np.zeros((len(correction.memory.lags), 1))
     for sign in (1.0, -1.0):
         variances = []
         for beyond in (0.0, 0.1, 1.0, 3.0, 7.4, 7.6, 15.0, 40.0):
             state = np.zeros((StateLayout(correction.memory).width, 1))
             state[BOARD] = 20.0 + sign * (15.0 + beyond)
-            line = correction.line(state, state, slow.at(state, nobody), 0.0)
+            line = correction.line(state, state, slow.at(state, no_shares), 0.0)
             variances.append(line[list(VARIANCES), 0])
         assert (np.diff(variances, axis=0) > 0.0).all()
         # If the true curve is constant outside the range, the error is within the claimed sd.
