@@ -209,19 +209,6 @@ def test_damaged_autopilot_logs_are_read_or_refused_with_one_line(kind, tmp_path
 NODE = 'thermo_comp'
 
 
-def allowed():
-    root = ET.parse(ROOT / 'config' / 'policy.xml').getroot()  # noqa: S314 - our own file
-    (profile,) = root.iter('profile')
-    assert (profile.get('ns'), profile.get('node')) == ('/', NODE)
-    collected = {}
-    for group in profile:
-        ((what, verdict),) = group.attrib.items()
-        assert verdict == 'ALLOW'
-        names = [(entry.text or '').replace('~', f'/{NODE}') for entry in group]
-        collected[what] = {name if name.startswith('/') else f'/{name}' for name in names}
-    return collected
-
-
 def test_the_policy_permits_exactly_the_topics_and_services_of_the_node(tmp_path):
     pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
     from ros_helpers import node_in_thread
@@ -241,7 +228,16 @@ def test_the_policy_permits_exactly_the_topics_and_services_of_the_node(tmp_path
             ):
                 opened[what] |= {name for name, _ in names}
             assert ros.get_client_names_and_types_by_node(NODE, '/') == []
-    assert opened == allowed()
+    root = ET.parse(ROOT / 'config' / 'policy.xml').getroot()  # noqa: S314 - our own file
+    (profile,) = root.iter('profile')
+    assert (profile.get('ns'), profile.get('node')) == ('/', NODE)
+    allowed = {}
+    for group in profile:
+        ((what, verdict),) = group.attrib.items()
+        assert verdict == 'ALLOW'
+        names = [(entry.text or '').replace('~', f'/{NODE}') for entry in group]
+        allowed[what] = {name if name.startswith('/') else f'/{name}' for name in names}
+    assert opened == allowed
 
 
 BOMB = '\n'.join(

@@ -62,9 +62,24 @@ class TestOutput:
 
     def test_progress_is_shown_only_on_a_terminal_and_colour_only_without_no_color(self, bag, cli):
         for no_color in (False, True):
-            text = on_a_terminal('info', str(bag), no_color=no_color)
-            assert 'reading bag' in text
-            assert bool(re.search(r'\x1b\[(3\d|9\d|38)', text)) != no_color
+            leader, follower = pty.openpty()
+            terminal = {'COLUMNS': '80', 'TERM': 'xterm-256color', 'NO_COLOR': '1'}
+            environment = {**os.environ, **terminal}
+            if not no_color:
+                del environment['NO_COLOR']
+            process = subprocess.Popen(
+                [sys.executable, '-m', 'thermo_comp', 'info', str(bag)], cwd=ROOT,
+                env=environment, stdin=follower, stdout=follower, stderr=follower,
+            )  # fmt: skip
+            os.close(follower)
+            shown = b''
+            with suppress(OSError):  # the command has ended and closed its terminal
+                while part := os.read(leader, 65536):
+                    shown += part
+            os.close(leader)
+            assert process.wait(timeout=60) == 0
+            assert b'reading bag' in shown
+            assert bool(re.search(rb'\x1b\[(3\d|9\d|38)', shown)) != no_color
         finished = cli('info', bag)
         assert 'reading bag' not in finished.stdout + finished.stderr
 
@@ -90,25 +105,6 @@ def test_a_command_computes_in_one_thread():
         environment = {k: v for k, v in os.environ.items() if k != 'OPENBLAS_NUM_THREADS'}
         finished = ran(sys.executable, '-c', code, env={**environment, **wanted}, check=True)
         assert finished.stdout.split() == ['False', text]
-
-
-def on_a_terminal(*arguments, no_color=False):
-    leader, follower = pty.openpty()
-    environment = {**os.environ, 'COLUMNS': '80', 'TERM': 'xterm-256color', 'NO_COLOR': '1'}
-    if not no_color:
-        del environment['NO_COLOR']
-    process = subprocess.Popen(
-        [sys.executable, '-m', 'thermo_comp', *arguments], cwd=ROOT, env=environment,
-        stdin=follower, stdout=follower, stderr=follower,
-    )  # fmt: skip
-    os.close(follower)
-    shown = b''
-    with suppress(OSError):  # the command has ended and closed its terminal
-        while part := os.read(leader, 65536):
-            shown += part
-    os.close(leader)
-    assert process.wait(timeout=60) == 0
-    return shown.decode()
 
 
 class TestPlay:

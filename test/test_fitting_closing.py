@@ -68,15 +68,6 @@ def test_the_evidence_selects_the_condition_that_ends_the_dynamic_regime(end_con
     assert last.fitted.rms < 0.35 * last.raw.rms
 
 
-def dense(position, time, weight, noise):
-    """Build the covariance of exponentially correlated noise in each position and white noise."""
-    same = position[:, None] == position
-    distance = np.abs(time[:, None] - time)
-    times_s = [noise.time_s * 10.0**k for k in range(noise.n_times)]
-    slow = noise.ratio * sum(np.exp(-distance / time_s) for time_s in times_s)
-    return np.where(same, slow, 0.0) + np.diag(1.0 / weight)
-
-
 @pytest.mark.parametrize(
     'noise',
     [
@@ -94,7 +85,11 @@ def test_products_and_determinant_equal_those_of_the_dense_matrix(rng, noise):
     series = rng.standard_normal((len(time), 5))
     whitener = Whitener(position, time)
     white = whitener.filter(series, weight, noise)
-    covariance = dense(position, time, weight, noise)
+    # The covariance of exponentially correlated noise in each position, and of white noise.
+    distance = np.abs(time[:, None] - time)
+    times_s = [noise.time_s * 10.0**k for k in range(noise.n_times)]
+    slow = noise.ratio * sum(np.exp(-distance / time_s) for time_s in times_s)
+    covariance = np.where(position[:, None] == position, slow, 0.0) + np.diag(1.0 / weight)
     expected = series.T @ np.linalg.solve(covariance, series)
     # The tolerance allows for rounding at condition numbers of the covariance below 1e6.
     np.testing.assert_allclose(white.T @ white, expected, rtol=1e-9, atol=1e-10)

@@ -134,10 +134,10 @@ def test_chance_correlations_between_parameters_of_twelve_units_are_reduced(rng)
     assert share_left(rng.standard_normal((12, 1)) + 0.01 * independent, bias) < 0.1
 
 
-@cache
-def helped():
-    """Fit one position with the siblings' prior; return all priors tried, the initial one last."""
-    seen = []
+@pytest.mark.slow
+def test_a_fit_begins_with_the_widest_of_its_priors(monkeypatch):
+    # WHY: a fit that began with a narrow prior found mounting offsets of 190 ug, a local minimum.
+    seen = []  # all priors that the fit of one position tries, the initial one last
 
     def fitted_with(*given):
         (prior,) = (argument for argument in given if isinstance(argument, Prior))
@@ -147,16 +147,9 @@ def helped():
 
     few = [source(record) for record in test_of(9, 0, 1)]
     options = replace(OPTIONS, serial='unit-9', prior=population(siblings()))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr('thermo_comp.fitting.initialisation.fit_all', fitted_with)
-        fit(few, options)
-    return seen
-
-
-@pytest.mark.slow
-def test_a_fit_begins_with_the_widest_of_its_priors():
-    # WHY: a fit that began with a narrow prior found mounting offsets of 190 ug, a local minimum.
-    *tried, widest = (prior.root.T @ prior.root for prior in helped())
+    monkeypatch.setattr('thermo_comp.fitting.initialisation.fit_all', fitted_with)
+    fit(few, options)
+    *tried, widest = (prior.root.T @ prior.root for prior in seen)
     assert len(tried) > 2
     root = np.sqrt(np.diag(widest))
     for precision in tried:

@@ -197,11 +197,6 @@ def changed_in_motion(rest, end, sd, step):
     rest.add(np.array(step) * MG, from_s=0.5 * (300.0 + end))
 
 
-def drifting(rest):
-    # The bias changes by 2 mg/K, at up to 6 K/min.
-    rest.accel[:, 2] += 2.0 * MG * (rest.temperature(rest.time) - 20.0)
-
-
 @pytest.mark.parametrize(
     'change',
     [
@@ -210,7 +205,9 @@ def drifting(rest):
         lambda rest: changed_in_motion(rest, 312.0, 200.0 * MG, (50.0, 0, 0)),
         lambda rest: changed_in_motion(rest, 360.0, GRAVITY, (0, 0, 20.0)),
         lambda rest: turned(rest, 250.0, 0.02, with_rate=False),
-        drifting,
+        lambda rest: rest.add(  # a bias of 2 mg/K, at up to 6 K/min
+            np.outer(rest.temperature(rest.time) - 20.0, (0.0, 0.0, 2.0 * MG)), from_s=0.0
+        ),
     ],
     ids=['none', 'for two seconds', 'in a motion', 'in a large motion', 'a turn', 'temperature'],
 )

@@ -32,14 +32,6 @@ LID_UG_K = (12.0, -9.0, 15.0)
 LOAD_K = 5.0
 
 
-def unit_with_a_lid():
-    links = Link(AIR, 'case', 4.0), Link('case', 'board', 0.4), Link('case', 'lid', 0.1)
-    network = ThermalNetwork({'case': 800.0, 'board': 120.0, 'lid': 60.0}, links)
-    drift = (PartEffect('board', bias=(6.0, 4.0, -8.0)), PartEffect('lid', bias=LID_UG_K))
-    load = SwitchedLoad('lid', 0.1 * LOAD_K)
-    return replace(unit_preset('bare-quartz', 1), network=network, drift=drift, load=load)
-
-
 def record(path, run):
     truth, rng = run.truth, np.random.default_rng(7)
     with BagWriter(path, metadata={'serial': truth.unit.serial}) as bag:
@@ -55,7 +47,12 @@ def record(path, run):
 
 @pytest.fixture(scope='module')
 def runs():
-    unit, rates = unit_with_a_lid(), {'rate_hz': 2.0, 'temperature_rate_hz': 0.25}
+    links = Link(AIR, 'case', 4.0), Link('case', 'board', 0.4), Link('case', 'lid', 0.1)
+    network = ThermalNetwork({'case': 800.0, 'board': 120.0, 'lid': 60.0}, links)
+    drift = (PartEffect('board', bias=(6.0, 4.0, -8.0)), PartEffect('lid', bias=LID_UG_K))
+    load = SwitchedLoad('lid', 0.1 * LOAD_K)
+    unit = replace(unit_preset('bare-quartz', 1), network=network, drift=drift, load=load)
+    rates = {'rate_hz': 2.0, 'temperature_rate_hz': 0.25}
     return [simulate(unit, PROGRAM, up, seed=k, **rates) for k, up in enumerate(positions(4, 1))]
 
 
