@@ -78,7 +78,7 @@ def test_one_attitude_in_the_chamber_does_not_separate_bias_and_scale():
 @pytest.mark.parametrize(
     ('parts', 'correlation', 'n_directions', 'is_advised'),
     [
-        (('bias', 'bias'), 0.996, 1, True),  # an inflation of 125
+        (('bias', 'bias'), 0.996, 1, True),  # variance inflation factor: 125
         (('bias', 'bias'), 0.994, 9, False),  # an inflation of 84
         (('bias', 'scale'), 0.996, 6, True),
         # The finding `positions` says that five attitudes do not separate bias and scale.
