@@ -48,7 +48,7 @@ def settled(truth):
         ('mounting_offsets', {'offset_sd': 30.0 * MICRO}, 0.36),
     ],
 )
-def test_the_stated_size_of_an_effect_is_the_rms_that_it_adds_to_the_readings(name, effect, tolerance):
+def test_the_size_of_an_effect_is_the_rms_that_it_adds_to_the_readings(name, effect, tolerance):
     truth = replace(NOTHING, **effect)
     windows, found = settled(truth)
     without, _ = table(replace(truth, start_sd=0.0, offset_sd=0.0, tilt_sd=NOTHING.tilt_sd))
