@@ -7,6 +7,7 @@ All bags hold counts at 400 Hz and two temperatures at 10 Hz; rosbags and mcap g
 (`--peer-samples`). `rosbags` reads and deserializes each message; `mcap` only reads each message.
 A rate is the number of counts messages read per second of wall time, in the fastest of the
 repeats. Ratios between the rates of two readers vary less from machine to machine than the rates.
+In the table, 'blocks' and 'whole' are thermo_comp, block by block and into memory at once.
 
     python benchmarks/bag_read.py --samples 1000000
 """
@@ -139,8 +140,8 @@ def main() -> None:
     parser.add_argument(
         '--peer-samples', type=int, default=200_000, help='messages that rosbags and mcap read'
     )
-    parser.add_argument('--repeats', type=int, default=3)
-    parser.add_argument('--chunk-bytes', type=int, default=CHUNK_BYTES)
+    parser.add_argument('--repeats', type=int, default=3, help='runs of each reader')
+    parser.add_argument('--chunk-bytes', type=int, default=CHUNK_BYTES, help='size of a chunk')
     parser.add_argument('--json', action='store_true', help='print JSON')
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
@@ -161,7 +162,7 @@ def main() -> None:
         print()
         return
     print(f'{machine}; {options.samples} samples, chunks of {options.chunk_bytes} bytes')
-    print('             bytes      million messages per second       ours (blocks) to rosbags')
+    print('             bytes      million messages per second        speed: blocks / rosbags')
     print('compression  /msg  rosbags   mcap  blocks   whole        wall time   CPU time')
     for row in rows:
         million = ''.join(f'{rate / 1e6:8.2f}' for rate in row['rates'].values())

@@ -85,7 +85,7 @@ def _peak_megabytes(pid: int) -> float:
 
 
 def run(name: str, command: str, path: Path, out: Path) -> Run:
-    """Run a command to its end, or until the time limit."""
+    """Run a command to its end, or until the time limit; judge the run by the rules."""
     program = Path(sys.executable).with_name('thermo_comp')
     log = out / 'said.txt'
     began = time.monotonic()
@@ -125,7 +125,9 @@ def main() -> int:
     """Make the inputs, run the commands, print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
     parser.add_argument('--only', default='', help='inputs whose name contains this text')
-    parser.add_argument('--commands', nargs='*', choices=COMMANDS, default=list(COMMANDS))
+    parser.add_argument(
+        '--commands', nargs='*', choices=COMMANDS, default=list(COMMANDS), help='default: all'
+    )
     parser.add_argument('--json', type=Path, help='file for the results')
     arguments = parser.parse_args()
     runs: list[Run] = []

@@ -78,7 +78,7 @@ def stamps(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], Path]
     return make
 
 
-def spoilt(change: Callable[[Columns], object]) -> Callable[[Path], Path]:
+def changed(change: Callable[[Columns], object]) -> Callable[[Path], Path]:
     """Return a function that writes a recording whose columns `change` has altered."""
 
     def make(folder: Path) -> Path:
@@ -108,7 +108,7 @@ def imu(
     return make
 
 
-def _by_turns(force: np.ndarray) -> np.ndarray:
+def _with_zero_rows(force: np.ndarray) -> np.ndarray:
     """Set every second sample to zero, as in a log whose every second row is of the gyroscope."""
     return force * (np.arange(len(force)) % 2)[:, None]
 
@@ -119,7 +119,7 @@ def _without_gravity(force: np.ndarray) -> np.ndarray:
     return (positions - positions.mean(axis=1, keepdims=True)).reshape(-1, 3)
 
 
-def _worn(sd: float, longest_s: float) -> Callable[[np.ndarray], np.ndarray]:
+def _moved(sd: float, longest_s: float) -> Callable[[np.ndarray], np.ndarray]:
     """Add noise of `sd` [m/s^2], as on an arm or in a car, except for `longest_s` in each 20 s."""
 
     def change(force: np.ndarray) -> np.ndarray:
@@ -130,12 +130,12 @@ def _worn(sd: float, longest_s: float) -> Callable[[np.ndarray], np.ndarray]:
     return change
 
 
-def _leaning(force: np.ndarray) -> np.ndarray:
+def _misaligned(force: np.ndarray) -> np.ndarray:
     """Set y to 0.6 x + 0.9 y: a misalignment larger than that of any real triad."""
     return force @ np.array([[1.0, 0.6, 0.0], [0.0, 0.9, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _later(size_ns: int, every: int = 0) -> Callable[[np.ndarray], np.ndarray]:
+def _jumping(size_ns: int, every: int = 0) -> Callable[[np.ndarray], np.ndarray]:
     """Add a jump [ns] to the stamps: in the middle or, if `every` > 0, after each `every` rows."""
 
     def change(stamp_ns: np.ndarray) -> np.ndarray:
@@ -257,36 +257,36 @@ class Input:
 
 
 INPUTS: dict[str, Input] = {
-    'whole': Input(spoilt(lambda _: None)),
-    'jump of a year': Input(stamps(_later(YEAR))),
+    'whole': Input(changed(lambda _: None)),
+    'jump of a year': Input(stamps(_jumping(YEAR))),
     'jump from 1970': Input(
         stamps(lambda s: np.where(s < s[len(s) // 2], s - START_NS + SECOND, s))
     ),
-    'jump back by a year': Input(stamps(_later(-YEAR))),
+    'jump back by a year': Input(stamps(_jumping(-YEAR))),
     'a day between samples': Input(stamps(lambda s: START_NS + (s - START_NS) * 17280 // 500)),
-    'an hour after every ten samples': Input(stamps(_later(3600 * SECOND, 10))),
+    'an hour after every ten samples': Input(stamps(_jumping(3600 * SECOND, 10))),
     'reversed stamps': Input(stamps(lambda s: s[::-1])),
     'equal stamps': Input(stamps(np.zeros_like)),
     'stamps of the limits': Input(stamps(lambda s: np.where(s < s[50], 0, (2**31 - 1) * SECOND))),
-    'one sample': Input(spoilt(lambda c: _samples(c, 1))),
-    'no sample': Input(spoilt(lambda c: _samples(c, 0))),
-    'one reading': Input(spoilt(lambda c: _readings(c, 1))),
-    'readings of one stamp': Input(spoilt(_at_one_stamp)),
-    'a value of 1e308': Input(spoilt(lambda c: _value(c, 1e308))),
-    'all values 1e308': Input(spoilt(lambda c: _set('counts', c.counts * 0 + 1e308)(c))),
-    'a reading of 1e308': Input(spoilt(lambda c: c.board.__setitem__(9, 1e308))),
-    'all NaN': Input(spoilt(lambda c: _set('counts', c.counts * np.nan)(c))),
-    'zeros in every second row': Input(imu(_by_turns)),
+    'one sample': Input(changed(lambda c: _samples(c, 1))),
+    'no sample': Input(changed(lambda c: _samples(c, 0))),
+    'one reading': Input(changed(lambda c: _readings(c, 1))),
+    'readings of one stamp': Input(changed(_at_one_stamp)),
+    'a value of 1e308': Input(changed(lambda c: _value(c, 1e308))),
+    'all values 1e308': Input(changed(lambda c: _set('counts', c.counts * 0 + 1e308)(c))),
+    'a reading of 1e308': Input(changed(lambda c: c.board.__setitem__(9, 1e308))),
+    'all NaN': Input(changed(lambda c: _set('counts', c.counts * np.nan)(c))),
+    'zeros in every second row': Input(imu(_with_zero_rows)),
     'no acceleration in the messages': Input(imu(np.zeros_like, -1.0)),
     'gravity subtracted': Input(imu(_without_gravity)),
     'samples in g': Input(imu(lambda force: force / 9.80665)),
     'stamps all zero': Input(stamps(np.zeros_like)),
-    'worn on a wrist': Input(imu(_worn(4.0, 2.9))),
-    'a drive in a car': Input(imu(_worn(1.5, 0.0))),
-    'axes not orthogonal': Input(imu(_leaning)),
-    'all zeros': Input(spoilt(lambda c: _set('counts', c.counts * 0)(c))),
-    'a span of 1 K': Input(spoilt(lambda c: _set('board', 20 + c.board / 30)(c))),
-    'Cyrillic serial': Input(spoilt(_set('serial', 'блок 7'))),
+    'worn on a wrist': Input(imu(_moved(4.0, 2.9))),
+    'a drive in a car': Input(imu(_moved(1.5, 0.0))),
+    'axes not orthogonal': Input(imu(_misaligned)),
+    'all zeros': Input(changed(lambda c: _set('counts', c.counts * 0)(c))),
+    'a span of 1 K': Input(changed(lambda c: _set('board', 20 + c.board / 30)(c))),
+    'Cyrillic serial': Input(changed(_set('serial', 'блок 7'))),
     'name not UTF-8': Input(other_name),
     'db3': Input(DB3),
     'db3 with a flipped bit': Input(damaged(DB3, '*.db3', flip), is_lost=True),

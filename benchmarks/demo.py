@@ -105,7 +105,7 @@ def main() -> int:
     parser.add_argument('--out', default='out', help='folder for the results')
     arguments = parser.parse_args()
     if not Path(arguments.bags, 'held_out.mcap').is_file():
-        parser.error(f'no sample bags in {arguments.bags}: run it in a clone of the repository')
+        parser.error(f'no sample bags in {arguments.bags}: start in a clone of the repository')
     return 0 if demo(Path(arguments.bags), Path(arguments.out)) else 1
 
 

@@ -77,8 +77,8 @@ def errors_of(series: RestSeries, calibrated: Calibration, force: Floats) -> Flo
     return np.column_stack((series.residual, f - force))
 
 
-def root_mean(values: Floats) -> float:
-    """Return the RMS of an array."""
+def rms_of(values: Floats) -> float:
+    """Return the RMS of all values of an array."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 
@@ -103,7 +103,7 @@ def worse(after: list, new: Calibration, kalman: Floats) -> tuple[bool, bool]:
     before, *later = (
         np.sqrt(weights @ x**2 / n_starts) for x in (old.residual, updated.residual, of_best)
     )
-    error = root_mean(updated.claim) / np.sqrt(2.0 * n_starts)
+    error = rms_of(updated.claim) / np.sqrt(2.0 * n_starts)
     found = [bool(rms > before + error) for rms in later]
     return found[0], found[1]
 
@@ -183,10 +183,10 @@ def simulated(kind: str, n_units: int, days: int) -> None:
     joined = {name: np.array([result[0][name] for result in results]) for name in results[0][0]}
     print(f'\n{kind}: {n_units} units, {days} days, one shock each')
     for column, name in enumerate(('|f|', 'x', 'y', 'z')):
-        a, b, c = (root_mean(joined[key][..., column]) / UG for key in ('before', 'after', 'best'))
+        a, b, c = (rms_of(joined[key][..., column]) / UG for key in ('before', 'after', 'best'))
         n_worse, n_best = (
             sum(
-                root_mean(result[0][key][:, column]) > root_mean(result[0]['before'][:, column])
+                rms_of(result[0][key][:, column]) > rms_of(result[0]['before'][:, column])
                 for result in results
             )
             for key in ('after', 'best')
@@ -195,11 +195,11 @@ def simulated(kind: str, n_units: int, days: int) -> None:
             f'  {name:4} before {a:6.1f} ug  after {b:6.1f}  filter {c:6.1f}  ratio {b / c:.2f}  '
             f'units with a larger error after {n_worse} (filter: {n_best})'
         )
-    ratio = root_mean(joined['missed']) / root_mean(joined['claimed'])
+    ratio = rms_of(joined['missed']) / rms_of(joined['claimed'])
     print(f'  error / claimed sd of |f| {ratio:.2f} (goal 0.7 .. 1.4)')
     days_after = np.array([pair for result in results for pair in result[1]])
     print(
-        f'  error larger with the update than without, by over a standard error, on '
+        f'  RMS larger with the update than without, by more than its standard error, on '
         f'{days_after[:, 0].sum()} (filter: {days_after[:, 1].sum()}) of {len(days_after)} days'
     )
     print(f'  time of an update: {max(result[2] for result in results):.1f} s at most')
@@ -210,14 +210,14 @@ def log_size() -> None:
     history = live('carried', 0, 30, Process())
     size = sum(len(encode(rest)) for _, rest in history.rests)
     size += sum(len(encode(start)) for start in {start for start, _ in history.rests})
-    print(f'log of 30 days: {size / 1e6:.2f} MB, {len(history.rests)} windows')
+    print(f'rest log of 30 days: {size / 1e6:.2f} MB, {len(history.rests)} windows')
 
 
 def main() -> None:
     """Print all figures."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
-    parser.add_argument('--units', type=int, default=10)
-    parser.add_argument('--days', type=int, default=60)
+    parser.add_argument('--units', type=int, default=10, help='units on each kind of platform')
+    parser.add_argument('--days', type=int, default=60, help='days for which a unit ages')
     parser.add_argument('--recordings', type=Path, help='folder with the real recordings')
     arguments = parser.parse_args()
     for kind in KINDS[:2]:

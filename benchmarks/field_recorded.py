@@ -119,5 +119,5 @@ def judge_recordings(folder: Path) -> None:
             n_worse = sum(b > 1.001 * a for a, b in zip(old, new, strict=True))
             print(
                 f'  {name:11} {len(old)} updates, {n_written} written: |f| - g of the next part '
-                f'{mg[0]:.2f} mg RMS before, {mg[1]:.2f} after; worse on {n_worse} parts'
+                f'{mg[0]:.2f} mg RMS before, {mg[1]:.2f} after; larger on {n_worse} parts'
             )

@@ -64,7 +64,7 @@ class Process:
 
 @dataclass
 class History:
-    """Rests of a unit, and the true deviations of the unit from its calibration after each day."""
+    """Rests of a unit; `states`: deviations of the unit from its calibration after each day."""
 
     rests: list[tuple[Start, Rest]] = field(default_factory=list)
     #: For each window of `rests`: number of its day, and number of its turn-on.
@@ -207,8 +207,9 @@ class BestFilter:
         """
         Update the filter with a rest.
 
-        now: time [days]; counts: mean sample of the rest / `K`; variance: variance of its
-        norm [m^2/s^4]; warmth: board temperature less the reference temperature [K]
+        now: time [days]; start: number of the turn-on; counts: mean sample of the rest / `K`
+        [m/s^2]; variance: variance of the norm of `counts` [m^2/s^4]; warmth: board temperature
+        less the reference temperature [K]
         """
         process = self.process
         if start != self._start:

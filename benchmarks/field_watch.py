@@ -20,7 +20,7 @@ import argparse
 from itertools import pairwise
 
 import numpy as np
-from field import probes, root_mean
+from field import probes, rms_of
 from field_units import DAY_ZERO, KINDS, UG, Floats, G, Process, calibration, live
 
 from thermo_comp.field.series import RestSeries, series_of
@@ -32,8 +32,8 @@ CLASSES = (0.0, 0.6, 0.8, 0.9, 1.0, 1.1, 1.2, 1.5, 9.0)
 LABORATORY, TOLERANCE, N_FUTURES = calibration(), 200.0 * UG, 200
 
 
-def leaves(probe: RestSeries, process: Process, bound: float, rng: np.random.Generator) -> Floats:
-    """Return the times [days] at which the RMS of |f| - g exceeds `bound` in 200 random walks."""
+def exits(probe: RestSeries, process: Process, bound: float, rng: np.random.Generator) -> Floats:
+    """Return for 200 random walks the time [days] at which the RMS of |f| - g exceeds `bound`."""
     size = np.repeat([process.bias, process.scale * G], 3) / np.sqrt(3.0)
     error, levels = np.full(N_FUTURES, np.inf), np.zeros((N_FUTURES, 6))
     # The norm of `root` @ (1, changes `levels` of bias and scale) is the RMS of |f| - g.
@@ -71,7 +71,7 @@ def forecasts(kind: str, n_units: int, days: int) -> dict[str, Floats]:
             ('interval', after, result.interval),
         ):
             if printed:
-                drawn = leaves(probe, process, TOLERANCE, rng)
+                drawn = exits(probe, process, TOLERANCE, rng)
                 inside = ((drawn >= printed[0]) & (drawn <= printed[2])).mean()
                 found[name].append((float(inside), float(np.median(drawn)), *printed))
     return {name: np.array(rows) for name, rows in found.items()}
@@ -88,8 +88,8 @@ def verdicts(kind: str, n_units: int, days: int) -> None:
         for day in range(5, days + 1, 5):
             chosen = series.at(series.day < DAY_ZERO + day)
             probe = series_of(probes(kind, history.states[day - 1], seed)[0], LABORATORY)
-            limit = LIMIT * root_mean(chosen.claim)
-            ratio = float(np.hypot(root_mean(probe.residual), process.turn_on)) / limit
+            limit = LIMIT * rms_of(chosen.claim)
+            ratio = float(np.hypot(rms_of(probe.residual), process.turn_on)) / limit
             found.append((ratio, 1 - seed % 2, watch(chosen, LABORATORY).exit_code))
     ratio, is_ageing, is_out = np.array(found).T
     for name, chosen in (('of constant error', is_ageing == 0), ('that age', is_ageing == 1)):
@@ -104,16 +104,16 @@ def verdicts(kind: str, n_units: int, days: int) -> None:
 def main() -> None:
     """Print all figures."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
-    parser.add_argument('--units', type=int, default=20)
-    parser.add_argument('--days', type=int, default=30)
+    parser.add_argument('--units', type=int, default=20, help='units of each kind')
+    parser.add_argument('--days', type=int, default=30, help='days for which a unit logs rests')
     arguments = parser.parse_args()
     for kind in KINDS:
         for name, rows in forecasts(kind, arguments.units, arguments.days).items():
             shares, true, _, printed, _ = rows.T
             factor = np.log(np.maximum(printed, 0.3) / np.maximum(true, 0.3))
             print(
-                f'{kind:12} {name}: {len(rows)} units, {100 * shares.mean():.0f} % of true days '
-                f'in the 10 .. 90 % range; median {np.median(printed):.0f} days, true '
+                f'{kind:12} {name}: {len(rows)} units, {100 * shares.mean():.0f} % of drawn times '
+                f'in the 10 .. 90 % range; median {np.median(printed):.0f} days, drawn '
                 f'{np.median(true):.0f} days, ratio {np.exp(np.median(factor)):.2f} (scatter over '
                 f'the units: factor {np.exp(np.std(factor)):.1f})'
             )

@@ -93,8 +93,8 @@ def main() -> int:
     )
     parser.add_argument('paths', nargs='*', type=Path, help=argparse.SUPPRESS)
     parser.add_argument('--task', choices=['read', 'fit'], help=argparse.SUPPRESS)
-    parser.add_argument('--bags', type=int, nargs='+', default=[6, 12, 24])
-    parser.add_argument('--rate-hz', type=float, default=100.0)
+    parser.add_argument('--bags', type=int, nargs='+', default=[6, 12, 24], help='bags per fit')
+    parser.add_argument('--rate-hz', type=float, default=100.0, help='samples per second')
     options = parser.parse_args()
     if options.task:
         print(json.dumps(run_task(options.task, options.paths)))
@@ -116,7 +116,7 @@ def main() -> int:
     if len(measured) > 1:
         samples, seconds = np.log(measured).T
         slope = np.polyfit(samples, seconds, 1)[0]
-        print(f'CPU time of the fit grows as samples^{slope:.2f}')
+        print(f'CPU time of the fit grows as (number of samples)^{slope:.2f}')
     return 0
 
 

@@ -45,7 +45,7 @@ PROGRAM, RATE_HZ, TEMPERATURE_HZ = '15 6min, 40@2 12min, 5@2 15min', 1.0, 0.2
 #: A thermal test that is fitted quickly: the shorter the fits, the higher the scheduler's load.
 SMALL_PROGRAM, SMALL_BAGS = '20 2min, 45@5 8min, 5@5 10min', 6
 N_LOTS = 4
-_REST_S = 4.0
+_IDLE_S = 4.0
 
 
 def write_fleet(folder: Path, n_units: int, n_bags: int, program: str) -> Path:
@@ -99,7 +99,7 @@ class Measured:
         Time of each task on its worker [s].
     own_cpu_s : float
         Processor time of the benchmark's process, which is client and scheduler [s].
-    rest_cpu : float
+    idle_cpu : float
         Processor time per second of the benchmark's process while no task runs, as for heartbeats.
     n_bytes : int
         Number of bytes that all processes wrote to their connections.
@@ -111,14 +111,14 @@ class Measured:
     seconds: float
     tasks: tuple[float, ...]
     own_cpu_s: float
-    rest_cpu: float
+    idle_cpu: float
     n_bytes: int
     cpu_s: float
 
     @property
     def per_task_s(self) -> float:
         """Return the processor time of client and scheduler for a task [s]."""
-        return max(self.own_cpu_s - self.rest_cpu * self.seconds, 0.0) / len(self.tasks)
+        return max(self.own_cpu_s - self.idle_cpu * self.seconds, 0.0) / len(self.tasks)
 
     def busy(self, n_workers: int) -> float:
         """Return the summed time of the tasks / (number of workers times duration of the fit)."""
@@ -134,8 +134,8 @@ def measure(folder: Path, n_units: int, n_workers: int, options: FleetOptions) -
         list(run(client, str(folder), units[: 2 * n_workers], options))
         client.get_task_stream()
         cpu, began = process_cpu(), time.perf_counter()
-        time.sleep(_REST_S)
-        rest_cpu = (process_cpu() - cpu) / (time.perf_counter() - began)
+        time.sleep(_IDLE_S)
+        idle_cpu = (process_cpu() - cpu) / (time.perf_counter() - began)
         before = bytes_written() + sum(client.run(bytes_written).values())
         cpu, began, started = process_cpu(), time.perf_counter(), time.time()
         outcomes = list(run(client, str(folder), units, options))
@@ -151,7 +151,7 @@ def measure(folder: Path, n_units: int, n_workers: int, options: FleetOptions) -
     assert len(tasks) == n_units
     assert all(outcome.calibration for _, outcome in outcomes)
     cpu_s = sum(float(outcome.row['cpu_s'] or 0.0) for _, outcome in outcomes)
-    return Measured(seconds, tasks, spent, rest_cpu, n_bytes, cpu_s)
+    return Measured(seconds, tasks, spent, idle_cpu, n_bytes, cpu_s)
 
 
 def process_cpu() -> float:
@@ -185,7 +185,7 @@ def bytes_written() -> int:
 
 
 def scaling(folder: Path, n_units: int, repeats: int, model: str) -> None:
-    """Measure two workers against one worker on the same units, and on half of the units."""
+    """Compare a fit by two workers with fits of the same and of half as many units by one."""
     write_fleet(folder / 'fleet', n_units, 12, PROGRAM)
     fit = FitOptions(gravity=STANDARD_GRAVITY, model=model)
     options = FleetOptions(fit, certificates=False)
@@ -222,12 +222,12 @@ def overhead(folder: Path, n_units: int) -> None:
     cost = measure(folder / 'small', n_units, 2, FleetOptions(fit, certificates=False))
     busy = sum(cost.tasks)
     print(f'{n_units} units x {SMALL_BAGS} bags, model golovach, 2 workers; load {loads()}')
-    print(f'elapsed {cost.seconds:.1f} s, tasks {busy:.1f} s on both workers')
-    print(f'idle workers: {100.0 * (1.0 - busy / (2.0 * cost.seconds)):.2f} % of their time')
+    print(f'elapsed {cost.seconds:.1f} s; all tasks of both workers took {busy:.1f} s')
+    print(f'workers idle for {100.0 * (1.0 - busy / (2.0 * cost.seconds)):.2f} % of the time')
     print(
         f'processor time of scheduler and client: {100.0 * cost.own_cpu_s / busy:.2f} % of the '
         f'time of the tasks; {1e3 * cost.per_task_s:.2f} ms per unit, and '
-        f'{100.0 * cost.rest_cpu:.1f} % of a processor while no task runs'
+        f'{100.0 * cost.idle_cpu:.1f} % of a processor while no task runs'
     )
     print(f'network: {cost.n_bytes / n_units / 1e3:.1f} kB per unit, all connections together')
     paper(cost)
@@ -315,9 +315,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument('part', choices=['scaling', 'overhead', 'kill'])
+    parser.add_argument('part', choices=['scaling', 'overhead', 'kill'], help='what to measure')
     parser.add_argument('--units', type=int, help='number of units (default 16, 500, 200)')
-    parser.add_argument('--repeats', type=int, default=3)
+    parser.add_argument('--repeats', type=int, default=3, help='repetitions of part scaling')
     parser.add_argument('--model', default='response', help='model of the fits')
     parser.add_argument('--folder', type=Path, help='folder that keeps the bags')
     options = parser.parse_args()

@@ -276,7 +276,7 @@ def _print_reload(rate: int, run: dict[str, Any]) -> None:
     times = run['reload_ms']
     print(
         f'{rate:6d} Hz with {len(times)} reloads: answered in {statistics.median(times):.1f} ms '
-        f'(median), {max(times):.1f} ms (worst); lost {run["n_lost"]}; '
+        f'(median), {max(times):.1f} ms (longest); lost {run["n_lost"]}; '
         f'p99 {run["p99_ms"]:.2f} ms; stolen {run["stolen"]:.1%}'
     )
 

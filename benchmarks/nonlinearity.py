@@ -215,11 +215,11 @@ def figures(seed: int, k2: float, k3: float) -> dict[str, Floats]:
 
 
 def main() -> int:
-    """Print the figures; return 0 if all goals are met."""
+    """Print the figures; return 1 if a goal is missed."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--units', type=int, default=20)
+    parser.add_argument('--units', type=int, default=20, help='units with nonlinear terms')
     parser.add_argument('--without', type=int, default=5, help='units without nonlinear terms')
-    parser.add_argument('--processes', type=int, default=2)
+    parser.add_argument('--processes', type=int, default=2, help='units fitted at once')
     options = parser.parse_args()
     with ProcessPoolExecutor(options.processes) as pool:
         results = list(pool.map(partial(figures, k2=1e-5, k3=1e-6), range(options.units)))

@@ -71,8 +71,9 @@ def left(bags: list[Path], held: list[Path], calibration: Path, *options: str) -
 def main() -> None:
     """Print RMS of |f| - g for each unit: raw, and fits with two and with one thermometer."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
-    parser.add_argument('units', nargs='*', default=list(UNITS))
-    print(f'{"unit":16}{"raw ug":>8}{"two":>8}{"one":>8}')
+    parser.add_argument('units', nargs='*', default=list(UNITS), help='kinds (default: all)')
+    print('RMS of |f| - g [ug]: raw, and after fits with two thermometers and with one')
+    print(f'{"unit":16}{"raw":>8}{"two":>8}{"one":>8}')
     for unit in parser.parse_args().units:
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)

@@ -229,9 +229,9 @@ def main() -> None:
     )
     parser.add_argument('parts', nargs='*', help=f'all by default: {", ".join(PARTS)}')
     parser.add_argument('--quick', action='store_true', help='fewer runs, done in seconds')
-    parser.add_argument('--seed', type=int, default=1)
+    parser.add_argument('--seed', type=int, default=1, help='seed of the random numbers')
     parser.add_argument('--workers', type=int, default=1, help='number of processes')
-    parser.add_argument('--soak-hours', type=float, default=1100.0)
+    parser.add_argument('--soak-hours', type=float, default=1100.0, help='soak: total length')
     parser.add_argument(
         '--rates', type=float, nargs='+', choices=RAMPS, help='matrix: rates of the readings, Hz'
     )

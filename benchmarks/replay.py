@@ -197,7 +197,7 @@ def day(folder: Path, hours: float, compression: str, repeats: int) -> None:
         times.append(both[1])
         path.unlink()
     slope = np.polyfit(np.log(lengths), np.log(times), 1)[0]
-    print(f'CPU time grows as samples^{slope:.2f}')
+    print(f'CPU time of reading and compensating grows as (number of samples)^{slope:.2f}')
 
 
 def memory(folder: Path, gigabytes: float) -> None:
@@ -221,7 +221,7 @@ def memory(folder: Path, gigabytes: float) -> None:
     )
     n, peak = result.stdout.split()
     spent = time.perf_counter() - begin
-    print(f'{size / 1e9:.1f} GB, {n} samples: peak {peak} MB, {spent:.0f} s')
+    print(f'replay of {size / 1e9:.1f} GB, {n} samples: peak memory {peak} MB, {spent:.0f} s')
 
 
 def main() -> None:
@@ -231,7 +231,7 @@ def main() -> None:
     parser.add_argument('--hours', type=float, default=2.0, help='length of the bag to read [h]')
     parser.add_argument('--compression', default='zstd', choices=('none', 'lz4', 'zstd'))
     parser.add_argument('--gigabytes', type=float, default=0.0, help='size of the large bag [GB]')
-    parser.add_argument('--repeats', type=int, default=2)
+    parser.add_argument('--repeats', type=int, default=2, help='runs of each measurement')
     options = parser.parse_args()
     print(
         f'{platform.machine()}, {os.cpu_count()} CPUs, Python {platform.python_version()}, '

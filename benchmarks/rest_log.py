@@ -118,14 +118,16 @@ def _compared(with_log: Floats, without: Floats, unit: str) -> str:
     # Medians, because the host may stop the machine and so make some seconds outliers.
     sd = 1.2533 * 1.4826 * float(np.median(np.abs(more - np.median(more)))) / np.sqrt(n)
     change = float(np.median(more))
-    return f'{usual:.3g} {unit} without, {change / usual:+.1%} +- {sd / usual:.1%} with the log'
+    more_by = f'{change / usual:+.1%} +- {sd / usual:.1%}'
+    return f'{usual:.3g} {unit} without the log, {more_by} with the log'
 
 
 def main() -> None:
     """Measure the node with and without the rest log at each sample rate."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
-    parser.add_argument('--rates', type=int, nargs='+', default=(400, 1000, 10000))
-    parser.add_argument('--seconds', type=int, default=60)
+    rates = (400, 1000, 10000)
+    parser.add_argument('--rates', type=int, nargs='+', default=rates, help='sample rates [Hz]')
+    parser.add_argument('--seconds', type=int, default=60, help='length of a measurement [s]')
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         for rate in arguments.rates:

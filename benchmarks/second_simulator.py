@@ -71,6 +71,7 @@ PLANS['beyond'] = (
         for low, high in ((0, 40), (-5, 45), (-15, 55))
     ],
 )
+#: Kinds of physics, in the order of the rows of the table in docs/accuracy.md.
 KINDS = ('own', 'products', 'hyst', 'hystm', 'even', 'convection', 'slow', 'plain')
 
 

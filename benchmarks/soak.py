@@ -299,7 +299,7 @@ def calibrations(rate: int, folder: Path) -> list[str]:
 def main() -> int:
     """Run a soak and print its results."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
-    parser.add_argument('--minutes', type=float, default=60.0)
+    parser.add_argument('--minutes', type=float, default=60.0, help='length of the run [min]')
     parser.add_argument('--rate', type=int, default=2000, help='samples per second')
     parser.add_argument('--json', help='file for the figures')
     arguments = parser.parse_args()

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Compares errors of fits to bags of units whose physics the package does not model with the errors
-of curves that scipy fits.
+Compares fits of the package with curves fitted by scipy, by their errors on units whose physics
+the package does not model.
 
 Run ``python benchmarks/strangers.py`` for every case (many hours), or some cases with fewer units:
 ``python benchmarks/strangers.py --cases kink,soaks --units 2 --json strangers.json``. A colon
@@ -311,7 +311,7 @@ def run(
 
 
 def studies_of(case: str, unit: int, path: Path | None) -> Iterator[Study]:
-    """Return the studies of a unit of a case."""
+    """Return the studies of one unit of a case."""
     if case != 'cats':
         return samples(case) if case in RECORDED else CASES[case][0](unit)
     assert path is not None

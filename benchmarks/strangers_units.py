@@ -323,7 +323,7 @@ def record(
     shift : ndarray, shape (3,)
         Additional bias of this bag [ug].
     tilt : ndarray, shape (3,) or None
-        Rotation of the support per square of the case's temperature less `REFERENCE_C` [rad/K^2].
+        Rotation of the support / (case temperature less `REFERENCE_C`)^2 [rad/K^2].
     is_cold : bool
         Whether the unit is switched on at the start of the recording, at the temperature of the
         air.

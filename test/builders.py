@@ -3,6 +3,7 @@
 """Owns small calibrations and blocks of samples for tests of many modules."""
 
 from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -141,34 +142,8 @@ def rich_gyroscope():
     )  # fmt: skip
 
 
-@dataclass
-class Columns:
-    accel_stamp_ns: np.ndarray
-    accel: np.ndarray
-    temperatures: dict = field(default_factory=dict)
-
-
-def columns_from_events(events):
-    """Sort events (kind, stamp_ns, value) into columns; kind: 'accel' or a thermometer's name."""
-    accel = [(s, v) for kind, s, v in events if kind == 'accel']
-    readings = {}
-    n_accel = 0
-    for kind, stamp, value in events:
-        if kind == 'accel':
-            n_accel += 1
-        else:
-            readings.setdefault(kind, []).append((stamp, value, n_accel))
-    for name, rows in readings.items():
-        readings[name] = tuple(map(np.array, zip(*rows, strict=True), (np.int64, float, np.int64)))
-    return Columns(
-        np.array([s for s, _ in accel], dtype=np.int64),
-        np.array([v for _, v in accel], dtype=float).reshape(-1, 3),
-        readings,
-    )
-
-
 def stream(compensator, events):
-    """Process events singly, with 1e-3 * sample as angular rate; return rows, sample numbers."""
+    """Process events singly, angular rates 1e-3 * sample; return rows and numbers of samples."""
     rows, index = [], []
     position = 0
     for kind, stamp, value in events:
@@ -187,13 +162,27 @@ def stream(compensator, events):
 
 
 def batch(compensator, events):
-    """Process events as one block, with 1e-3 * sample as angular rate."""
-    columns = columns_from_events(events)
-    return process_block(compensator, columns, 1e-3 * columns.accel)
+    """
+    Process events (kind, stamp [ns], value) as one block, with angular rates of 1e-3 * sample.
+    The kind of an event is 'accel' or the name of a thermometer.
+    """
+    stamps, samples, readings = [], [], {}
+    for kind, stamp, value in events:
+        if kind == 'accel':
+            stamps.append(stamp)
+            samples.append(value)
+        else:
+            readings.setdefault(kind, []).append((stamp, value, len(stamps)))
+    for name, rows in readings.items():
+        readings[name] = tuple(map(np.array, zip(*rows, strict=True), (np.int64, float, np.int64)))
+    accel = np.array(samples, dtype=float).reshape(-1, 3)
+    stamp_ns = np.array(stamps, dtype=np.int64)
+    columns = SimpleNamespace(accel_stamp_ns=stamp_ns, accel=accel, temperatures=readings)
+    return process_block(compensator, columns, 1e-3 * accel)
 
 
 def assert_equal_bits(unit, config, events, chunk):
-    """Check that blocks and single events give equal bits; return rows, block and compensators."""
+    """Check that single events, a block, and blocks of `chunk` events give equal bits."""
     streamed, whole, cut = (Compensator(unit, config) for _ in range(3))
     rows, index = stream(streamed, events)
     block = batch(whole, events)
@@ -215,7 +204,7 @@ def assert_equal_bits(unit, config, events, chunk):
 
 
 def warm(compensator, celsius=20.0, case=None, *, until_s=1, start_s=0, flicker=0.0):
-    """Push a reading per second; readings that alternate by `flicker` [K] are not stuck."""
+    """Push both readings each second; `flicker` [K]: noise, so that they do not count as stuck."""
     for second in range(start_s, until_s):
         noise = flicker * (-1) ** second
         compensator.push('board', second * SECOND_NS, celsius + noise)
@@ -234,10 +223,10 @@ class ArrayBlock:
 
     @property
     def temperatures(self):
-        own = {'board': (self.board_stamp_ns, self.board), 'case': (self.case_stamp_ns, self.case)}
+        pairs = (self.board_stamp_ns, self.board), (self.case_stamp_ns, self.case)
         return {
             name: (stamp_ns, celsius, np.searchsorted(self.accel_stamp_ns, stamp_ns))
-            for name, (stamp_ns, celsius) in own.items()
+            for name, (stamp_ns, celsius) in zip(('board', 'case'), pairs, strict=True)
         }
 
 
@@ -254,7 +243,7 @@ def arrays_of(run, every=1):
 
 
 def drawn(unit, layout, d):
-    """Add `d` to the parameters of a calibration; the levels of scale curves stay 1."""
+    """Add `d` to the parameters of a calibration, except for the levels of the scale curves."""
 
     def moved_by(values, start):
         return tuple(value + d[start + k] for k, value in enumerate(values))

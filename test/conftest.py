@@ -25,7 +25,8 @@ from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# Use one BLAS thread: on a busy machine several wait for each other. numpy's import reads this.
+# One BLAS thread per process: on a busy machine several BLAS threads wait for each other. numpy
+# reads this variable when it is imported.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 # Each worker of a test run uses its own DDS domain, limited to this machine. The id of the run and
@@ -93,11 +94,6 @@ def rng():
     import numpy as np
 
     return np.random.default_rng(20161)
-
-
-@pytest.fixture(scope='session')
-def root():
-    return ROOT
 
 
 @pytest.fixture(scope='session')
@@ -191,7 +187,7 @@ def cli(program):
         with _as_a_process(cwd), _caught('stdout', 1) as output, _caught('stderr', 2) as errors:
             keep_standard_output()
             returned = run_command(arguments)
-            sys.stdout.close()  # writes what it holds
+            sys.stdout.close()  # flushes its buffer
             finished = subprocess.CompletedProcess(arguments, returned, output(), errors())
         return _checked(finished, code)
 
@@ -254,7 +250,7 @@ def once(tmp_path_factory):
         with (shared / f'.{name}.lock').open('w') as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             if not folder.exists():
-                # Remove files of an earlier `make` that failed.
+                # Remove the files of an earlier call of `make` that failed.
                 shutil.rmtree(partial, ignore_errors=True)
                 partial.mkdir()
                 make(partial)

@@ -116,8 +116,7 @@ class Desk:
             rests += 0.02 * rng.standard_normal(rests.shape)
             moves = np.arange(len(rests)) % 500 < 100
             rests[moves] += 5.0 * rng.standard_normal((int(moves.sum()), 3))
-            time = 0.01 * np.arange(len(rests))
-            np.savetxt(path, np.column_stack([time, rests]), fmt='%.6f')
+            np.savetxt(path, np.column_stack([0.01 * np.arange(len(rests)), rests]), fmt='%.6f')
         elif name == 'map.yaml':
             path.write_text(
                 'stamp: {column: t, unit: s}\n'

@@ -160,7 +160,7 @@ class Bench:
         return n
 
     def meet(self):
-        """Send samples, stamped after all bags, until the node publishes; read its counters."""
+        """Send samples with stamps after all bags until the node publishes; read its counters."""
         pause = threading.Event()
         standing = _STANDING.copy()
         for k in range(1000):
@@ -175,7 +175,11 @@ class Bench:
         last_ns = stamp_ns + 1_000_000_000
         standing[2] += 1.0
         self.send([('counts', last_ns, tuple(standing))])
-        self.wait_for(lambda: self._frames and _stamp_of(self._frames[-1]) == last_ns, 'the meet')
+        last = divmod(last_ns, 1_000_000_000)
+        self.wait_for(
+            lambda: self._frames and struct.unpack_from('<iI', self._frames[-1], 4) == last,
+            'the output of the last sample',
+        )
         n_reports = self._n_reports
         self.wait_for(lambda: self._n_reports > n_reports + 1, 'a report')
         self.n_sent = int(self._values['samples in'])
@@ -214,11 +218,6 @@ class Bench:
         stamps = table['sec'].astype(np.int64) * 1_000_000_000 + table['nanosec']
         numbers = table['values']
         return Heard(stamps, numbers[:, 25:28], numbers[:, 28:].reshape(-1, 3, 3), reports, values)
-
-
-def _stamp_of(frame):
-    sec, nanosec = struct.unpack_from('<iI', frame, 4)
-    return int(sec * 1_000_000_000 + nanosec)
 
 
 def lots(events):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the bag of the fault tests and functions that insert faults; all other errors are noise."""
+"""Owns the bag of the fault tests (its only errors: noise) and functions that insert faults."""
 
 import math
 from collections.abc import Callable
@@ -31,14 +31,16 @@ READING_SD = 0.003
 K = 3e5
 FULL_SCALE = 8388607.0
 NOISE_SD = 1e-4
-BIAS = (18000.0, -15000.0, 16500.0)  # counts: 5 to 6 mg
+BIAS = (18000.0, -15000.0, 16500.0)  # counts, which are 5 to 6 mg
 BIAS_SLOPE, BIAS_CURVE = 300.0, 4.0  # counts/K, counts/K^2: 100 ug/K, 1.4 ug/K^2
 SCALE_SLOPE = 7e-5
-BY_GRADIENT, BY_MEMORY = 150.0, 60.0  # counts/K
+BY_GRADIENT, BY_MEMORY = 150.0, 60.0  # counts per K of case less board, and of board lag
 
-#: Residual sd of the static curves [m/s^2], which covers the error until a ramp is detected.
+#: Residual sd of the static curves [m/s^2], as large as the error until a ramp is detected.
 STATIC_RESIDUAL = 1.5e-4
 DYNAMIC_RESIDUAL = 3e-5
+#: A published force is wrong if its error exceeds this number of published standard deviations.
+SIGMAS = 5.0
 
 CONFIG = CompensatorConfig(transition_time_s=5.0, temperature_timeout_s=20.0, case_timeout_s=10.0,
                            gravity_tolerance_m_s2=0.02)  # fmt: skip
@@ -80,15 +82,14 @@ def unit(**changes):
 
 
 def force_at(seconds):
-    """Return the true specific force [m/s^2], shape (n, 3), in a slow turn and then at rest."""
+    """Return the true specific force [m/s^2], shape (n, 3), of a slow turn and a rest after it."""
     angle = 0.02 * np.minimum(seconds, STANDS_S)
-    up = np.array([np.sin(angle) * 0.6, np.sin(angle) * 0.8, np.cos(angle)]).T
-    return GRAVITY * up
+    return GRAVITY * np.array([np.sin(angle) * 0.6, np.sin(angle) * 0.8, np.cos(angle)]).T
 
 
 @dataclass(frozen=True)
 class Truth:
-    """Temperatures of case and board [degC], `memory`: board - lagged board [K], times [s]."""
+    """Times [s], temperatures of case and board [degC], `memory`: board - lagged board [K]."""
 
     time: np.ndarray
     case: np.ndarray
@@ -99,6 +100,12 @@ class Truth:
         return tuple(
             np.interp(seconds, self.time, c) for c in (self.case, self.board, self.memory)
         )
+
+
+def ratios_to_sd(force, covariance, seconds):
+    """Return the errors of forces [m/s^2] at true times [s] divided by the claimed sd, (n, 3)."""
+    sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    return np.abs(force - force_at(seconds)) / sd
 
 
 def truth(ramp_s=RAMP_S, duration_s=DURATION_S):

@@ -26,11 +26,11 @@ class Row:
     n_least: int
     #: Spans [s] in which nothing may be published.
     silent: tuple[tuple[float, float], ...] = ()
-    #: Span [s] in which the fault is not yet detected and the output may be wrong.
+    #: Span [s] from the fault to its detection, in which the output may be wrong.
     blind: tuple[float, float] = (0.0, 0.0)
     #: Time [s] from which the output is within 1 ug of the output without the fault; inf: never.
     recovered: float = 0.0
-    #: Time from which stamps are ahead of the true times, and the difference [s].
+    #: Time [s] from which stamps are ahead of the true times, and by how many seconds.
     shift: tuple[float, float] = (math.inf, 0.0)
     #: Messages before the fault is applied; None: the bag of `fault_rig`.
     source: list[rig.Event] | None = field(default=None, repr=False)
@@ -59,7 +59,7 @@ def faster(begin_s, end_s, factor):
     return rig.changed('counts', begin_s, end_s, split)
 
 
-def half_time(begin_s):
+def play_again(begin_s):
     """Play the messages before `begin_s` and then the whole bag, so that stamps jump back."""
     return lambda events: [e for e in events if rig.seconds_of(e[1]) < begin_s] + events
 
@@ -162,7 +162,7 @@ TIME_ROWS = [
         rig.chain(*(rig.stop(topic, 130, 730) for topic in ('counts', 'board', 'case'))), (), 2300,
         recovered=820.0, source=rig.bag(duration_s=850.0)),
     Row('counts alone pause for 2 min', rig.stop('counts', 80.0, 200.0), (), 2500),
-    Row('time jumps back', half_time(100.0),
+    Row('time jumps back', play_again(100.0),
         ((WARN, 'jumps of time backwards, estimators reset'),), 5000),
     *(
         Row(f'time jumps forward by {word}{where}', rig.shifted(at, by), (), 3995, shift=(at, by),

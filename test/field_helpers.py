@@ -21,7 +21,7 @@ ZERO = np.zeros(3)
 
 
 def rests(calibration, attitudes, error, days=20, seed=1, turn_on=20.0 * MICRO_G, rate=0.0):
-    """Simulate 3 starts a day of 4 windows at `rate` [K/s]; `error(day)`: bias error [m/s^2]."""
+    """Log 3 starts a day, 4 windows each; `error(day)`: bias error [m/s^2]; `rate`: ramp [K/s]."""
     rng = np.random.default_rng(seed)
     correction = Correction(calibration)
     M, logged = np.array(calibration.misalignment), []
@@ -66,7 +66,7 @@ def in_any_attitude(rng):
     return np.asarray(u / np.linalg.norm(u))
 
 
-def known(**keys):
+def precise(**keys):
     """Make a calibration with an sd of 10 ug of each bias and of 10 ppm of each scale factor."""
     value = builders.calibration(noise_density_m_s2_sqrt_hz=(60 * MICRO_G,) * 3, **keys)
     layout = parameter_layout(value)

@@ -17,12 +17,12 @@ from thermo_comp.simulation.campaign import positions
 from thermo_comp.typing import Floats
 
 GRAVITY = 9.81
-NOMINAL = np.array([1000.0, 1010.0, 990.0])
+NOMINAL = np.array([1000.0, 1010.0, 990.0])  # counts per m/s^2
 #: Groups of the columns: curve (t, t^2), board (two lags), idle (two columns without effect).
 GROUPS = ('curve', 'curve', 'board', 'board', 'idle', 'idle')
-TAUS = np.array([400.0, 2500.0])
-START = np.array([[0.25, 0.1], [0.1, 1.0]])
-MICRO = 1e-6 * GRAVITY
+TAUS = np.array([400.0, 2500.0])  # time constants of the two board lags [s]
+START = np.array([[0.25, 0.1], [0.1, 1.0]])  # covariance of the two lags at the start [K^2]
+MICRO = 1e-6 * GRAVITY  # 1 ug [m/s^2]
 
 
 @dataclass(frozen=True)
@@ -149,13 +149,13 @@ def column_sd(names, bias_sd, scale_sd):
 
 
 def prior_of(truth, names=('curve', 'board'), **changes):
-    known = {
+    values = {
         'bias_sd': np.full(3, 1.0), 'scale_sd': 0.05,
         'misalignment_sd': 1e-2, 'column_sd': column_sd(names, 1e-2, 1e-3),
         'offset_sd': max(truth.offset_sd, 1e-9), 'tilt_sd': max(truth.tilt_sd, 1e-9),
         'sigma': truth.sigma, 'noise': truth.noise,
     }  # fmt: skip
-    return Prior(**(known | changes))
+    return Prior(**(values | changes))
 
 
 def candidates_of(windows, forced=()):
@@ -177,8 +177,7 @@ def begin(windows, up):
 
 def mode_of(regression, state, prior):
     """Find the mode to full precision by Newton steps from the result of a fit."""
-    solution = regression.solve(state, prior, n_steps=12)
-    point = regression.at(solution.state, prior)
+    point = regression.at(regression.solve(state, prior, n_steps=12).state, prior)
     for _ in range(6):
         step, _ = point.solution
         point = point.with_step(step)

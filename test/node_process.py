@@ -11,7 +11,7 @@ from pathlib import Path
 
 _STOPPING_S = 10.0  # time for the node to end [s]
 
-#: For processes that a test kills: UDP, as the shared memory they leave may crash other nodes.
+#: Node without shared memory: that of a killed process is not removed and may crash other nodes.
 OVER_UDP = {'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4'}
 
 

@@ -30,16 +30,16 @@ class Imu:
 
 @dataclass
 class Rest:
-    """A sensor at rest at `level` [m/s^2]; the board cools from `warm` [degC] by `fall` [K]."""
+    """A sensor at rest at `level`; the board cools from `warm` by `fall`."""
 
     rng: np.random.Generator
     duration_s: float = 600.0
     rate_hz: float = 25.0
-    level: tuple[float, float, float] = (0.0, 0.0, GRAVITY)
-    sd: float = 3.0 * MG
-    warm: float = 35.0
-    fall: float = 20.0
-    pace_s: float = 200.0
+    level: tuple[float, float, float] = (0.0, 0.0, GRAVITY)  # specific force [m/s^2]
+    sd: float = 3.0 * MG  # noise of a sample [m/s^2]
+    warm: float = 35.0  # [degC]
+    fall: float = 20.0  # [K]
+    pace_s: float = 200.0  # time constant of the cooling [s]
     quantum: float = 0.0  # step of the board's readings [K]
 
     def __post_init__(self):
@@ -53,8 +53,7 @@ class Rest:
         return self.warm - self.fall * (1.0 - np.exp(-time / self.pace_s))
 
     def add(self, vector, from_s, to_s=np.inf):
-        rows = (self.time >= from_s) & (self.time < to_s)
-        self.accel[rows] += np.asarray(vector)
+        self.accel[(self.time >= from_s) & (self.time < to_s)] += np.asarray(vector)
 
     def source(self, n_blocks=1, with_gyro=False, name='rest'):
         stamp_ns = START_NS + np.rint(self.time * 1e9).astype(np.int64)

@@ -116,8 +116,7 @@ def test_faults_of_a_position_are_reported(stream):
     assert account.positions[-1].n_rests == 2
     test = Acquisition(1, 30.0)
     stamp_ns = START_NS + np.arange(3000) * 20_000_000
-    zeros = Block(stamp_ns, np.zeros((3000, 3)), '', None, {}, {'accel': stamp_ns})
-    assert test.add(zeros) == []
+    assert test.add(Block(stamp_ns, np.zeros((3000, 3)), '', None, {}, {'accel': stamp_ns})) == []
     account = test.account()
     assert [position.reason for position in account.positions] == ['all axes read zero']
     assert (account.n_good, account.farthest_deg) == (0, 180.0)
@@ -133,7 +132,7 @@ def test_a_backward_jump_of_the_clock_begins_a_new_position(stream):
     assert still_s == pytest.approx([40.0] * 2, abs=1.0)
 
 
-def test_the_zero_of_unsigned_words_is_in_mid_range(stream):
+def test_the_zero_of_unsigned_counts_is_in_mid_range(stream):
     for up in [*UPS, UPS[0]]:
         stream.rest(up, 40.0)
         stream.turn()
@@ -167,9 +166,9 @@ def test_the_columns_equal_the_derivatives_of_the_measured_force(rng):
     up, step = units(rng, 20), 1e-6
 
     def force(constants):
-        bias, scale, skew = constants.reshape(3, 3)
+        bias, scale, misalignment = constants.reshape(3, 3)
         inverse = np.eye(3)
-        inverse[1, 0], inverse[2, 0], inverse[2, 1] = skew
+        inverse[1, 0], inverse[2, 0], inverse[2, 1] = misalignment
         return (up @ inverse.T) * (1.0 + scale) + bias
 
     for k, step_of in enumerate(step * np.eye(9)):
@@ -180,7 +179,7 @@ def test_the_columns_equal_the_derivatives_of_the_measured_force(rng):
         np.testing.assert_allclose(coverage.norm_columns(up)[:, k], slope, atol=1e-9)
 
 
-def test_without_positions_all_and_with_two_opposite_faces_seven_constants_keep_their_prior_sd():
+def test_constants_that_the_positions_do_not_determine_keep_their_prior_sd():
     covariance = coverage.constants_covariance(NOTHING, np.empty(0))
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), PRIOR_SD)
     # Along an axis the variance of |f| is the sum of the variances of its bias and scale.

@@ -56,14 +56,11 @@ def swapped(source):
 @pytest.mark.parametrize(
     ('name', 'spoil', 'options', 'n'),
     [
-        ('saturation', saturated, COUNTS, 7),
-        ('units', as_it_is, COUNTS, 1),
-        ('jump', jumped, FORCE, 1),
-        ('jump', jumped, FORCE, 7),
-        ('swapped', as_it_is, FORCE, 7),
-        ('compensated', compensated, FORCE, 12),
+        ('saturation', saturated, COUNTS, 7), ('units', as_it_is, COUNTS, 1),
+        ('jump', jumped, FORCE, 1), ('jump', jumped, FORCE, 7),
+        ('swapped', as_it_is, FORCE, 7), ('compensated', compensated, FORCE, 12),
     ],
-)
+)  # fmt: skip
 def test_a_fit_with_an_allowed_refusal_gives_a_calibration(rng, name, spoil, options, n):
     assert name in REFUSALS
     sources = sources_of(rests_of(rng, n), spoil)
@@ -160,8 +157,7 @@ def test_one_bag_in_kelvins_or_with_a_constant_axis_is_refused_by_name(rng):
     in_kelvins(rests[4])
     with pytest.raises(FitError, match=r'^bag4: temperature/board reads 2\d+\S* degC .* kelvins'):
         fit(sources_of(rests), FORCE)
-    # WHY: the y axis was constant in one position, and the fit attributed the missing drift of y
-    # to all positions.
+    # WHY: y was constant in one position, and the fit reduced the drift of y in all positions.
     rests = rests_of(rng)
     rests[4].accel[:, 1] = rests[4].level[1]
     with pytest.raises(FitError, match=r'^bag4: y reads exactly \S+ for 0\.\d+ h: the axis is'):

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from builders import GRAVITY, calibration, rich_calibration, thermal_calibration
+from conftest import ROOT
 from readme_helpers import FENCE, README
 from test_layers import loaded_after
 
@@ -21,8 +22,8 @@ from thermo_comp.replay import replay
 
 
 @pytest.fixture(scope='module')
-def fitted(root):
-    bags = sorted((root / 'bags' / 'fit').glob('*.mcap'))[:3]
+def fitted():
+    bags = sorted((ROOT / 'bags' / 'fit').glob('*.mcap'))[:3]
     return tc.fit(bags, gravity=9.80665, model='golovach')
 
 
@@ -45,8 +46,8 @@ def test_importing_the_package_loads_no_large_library():
         _ = tc.lode
 
 
-def test_arrays_have_the_bits_of_a_replayed_bag(root, tmp_path, fitted):
-    bag = root / 'bags' / 'held_out.mcap'
+def test_arrays_have_the_bits_of_a_replayed_bag(tmp_path, fitted):
+    bag = ROOT / 'bags' / 'held_out.mcap'
     recording = tc.read(bag)
     out = fitted.correct(recording.time_s, recording.counts, **recording.temperatures)
     result = replay(bag, fitted, tmp_path / 'out.mcap')
@@ -119,8 +120,7 @@ def test_unusable_samples_give_rows_of_nan_and_empty_arrays_give_empty_arrays(ar
     assert late.dynamic.any()
     assert np.argmax(late.dynamic) >= np.argmax(out.dynamic)
     out = thermal_calibration().correct([], np.empty((0, 3)), board=[])
-    assert out.specific_force.shape == (0, 3)
-    assert out.covariance.shape == (0, 3, 3)
+    assert (out.specific_force.shape, out.covariance.shape) == ((0, 3), (0, 3, 3))
     assert out.dynamic.shape == (0,)
     dates = np.array(['2026-01-01T00:00:00', '2026-01-01T00:00:10'], 'M8[ns]')
     unread = thermal_calibration().correct(dates, np.ones((2, 3)), board=([], []))
@@ -152,9 +152,8 @@ def test_wrong_arguments_are_named(change, text):
         calibration().correct(**given)
 
 
-def test_a_fit_of_arrays_equals_the_fit_of_their_bags(root, tmp_path, fitted):
-    bags = sorted((root / 'bags' / 'fit').glob('*.mcap'))[:3]
-    recordings = [tc.read(bag) for bag in bags]
+def test_a_fit_of_arrays_equals_the_fit_of_their_bags(tmp_path, fitted):
+    recordings = [tc.read(bag) for bag in sorted((ROOT / 'bags' / 'fit').glob('*.mcap'))[:3]]
     again = tc.fit(recordings, gravity=9.80665, model='golovach')
     assert again.unit.serial == 'demo-0007'
     assert replace(again, provenance=fitted.provenance) == fitted
@@ -165,9 +164,9 @@ def test_a_fit_of_arrays_equals_the_fit_of_their_bags(root, tmp_path, fitted):
         tc.fit(recordings, gravity=9.80665)
 
 
-def test_the_python_code_of_the_readme_runs(root, tmp_path, fitted, monkeypatch):
+def test_the_python_code_of_the_readme_runs(tmp_path, fitted, monkeypatch):
     (snippet,) = (body for kind, body in FENCE.findall(README) if kind == 'python')
-    (tmp_path / 'bags').symlink_to(root / 'bags')
+    (tmp_path / 'bags').symlink_to(ROOT / 'bags')
     tc.save(fitted, tmp_path / 'unit.yaml')
     monkeypatch.chdir(tmp_path)
     names = {}
@@ -188,7 +187,7 @@ def test_tc_read_reads_a_table_by_its_headings(tmp_path):
         read_log(table, imu=1)
 
 
-def test_arrays_that_cannot_be_fitted_and_doubled_bags_are_refused(root, tmp_path):
+def test_arrays_that_cannot_be_fitted_and_doubled_bags_are_refused(tmp_path):
     columns = tc.Columns(np.arange(5.0), np.zeros((4, 3)), {})
     with pytest.raises(ValueError, match=r'must have the shape \(5, 3\), .* got \(4, 3\)'):
         tc.fit(columns, gravity=9.8)
@@ -201,7 +200,7 @@ def test_arrays_that_cannot_be_fitted_and_doubled_bags_are_refused(root, tmp_pat
             tc.fit([], gravity=9.8, **{name: 'curve'})
     with pytest.raises(ValueError, match=r"`prior` must be a Calibration, .* got 'a\.yaml'"):
         tc.fit([], gravity=9.8, prior='a.yaml')
-    bag = root / 'bags' / 'fit' / '01.mcap'
+    bag = ROOT / 'bags' / 'fit' / '01.mcap'
     copy = shutil.copy(bag, tmp_path / 'copy.mcap')
     for take in (lambda bags: tc.fit(bags, gravity=9.80665), open_bags):
         with pytest.raises(tc.ThermoCompError, match=r'copy\.mcap: has the same content'):

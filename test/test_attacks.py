@@ -32,12 +32,11 @@ def test_a_clock_topic_that_goes_back_or_pauses_does_not_change_samples(peer, tm
     from ros_helpers import Samples, node_arguments, node_in_thread, stamp_of
     from rosgraph_msgs.msg import Clock
 
-    path = saved(tmp_path / 'unit.yaml')
-    with node_in_thread(*node_arguments(path)) as node:
+    with node_in_thread(*node_arguments(saved(tmp_path / 'unit.yaml'))) as node:
         samples = Samples(peer, node)
         assert peer.set_parameters(use_sim_time=True)[0].successful
         clock = peer.publisher(Clock, '/clock')
-        # /clock begins, falls by 1 h, is constant for five checks, jumps by a year, and ends.
+        # /clock rises by 1 h, falls back, is constant for five checks, jumps by a year, and ends.
         hour = 3600 * 10**9
         times = [START_NS, START_NS + hour, START_NS, *[START_NS] * 5, START_NS + 8760 * hour]
         for now_ns in times:
@@ -168,8 +167,7 @@ def test_a_write_killed_at_any_line_leaves_the_old_or_the_new_calibration(tmp_pa
     for path, serial in ((old, 'old'), (new, 'new'), (target, 'old')):
         saved(path, serial)
     done = ran(sys.executable, '-c', SAVING, new, target, old, check=True)
-    lines = [line.split() for line in done.stdout.splitlines()]
-    *killed, last = lines
+    *killed, last = [line.split() for line in done.stdout.splitlines()]
     assert last == ['0', 'new']
     assert len(killed) > 30
     assert {code for code, _ in killed} == {str(signal.SIGKILL.value)}
@@ -200,8 +198,7 @@ def test_damaged_autopilot_logs_are_read_or_refused_with_one_line(kind, tmp_path
             data[at : at + cut] = rng.bytes(int(rng.integers(0, 9)))
         path.write_bytes(bytes(data))
         try:
-            log = read_autopilot(path)
-            write_log(log, tmp_path / f'{number}.mcap')
+            write_log(read_autopilot(path), tmp_path / f'{number}.mcap')
             n_read += 1
         except RecordingError as error:
             lines.append(str(error))
@@ -210,19 +207,6 @@ def test_damaged_autopilot_logs_are_read_or_refused_with_one_line(kind, tmp_path
 
 
 NODE = 'thermo_comp'
-
-
-def allowed():
-    root = ET.parse(ROOT / 'config' / 'policy.xml').getroot()  # noqa: S314 - our own file
-    (profile,) = root.iter('profile')
-    assert (profile.get('ns'), profile.get('node')) == ('/', NODE)
-    collected = {}
-    for group in profile:
-        ((what, verdict),) = group.attrib.items()
-        assert verdict == 'ALLOW'
-        names = [(entry.text or '').replace('~', f'/{NODE}') for entry in group]
-        collected[what] = {name if name.startswith('/') else f'/{name}' for name in names}
-    return collected
 
 
 def test_the_policy_permits_exactly_the_topics_and_services_of_the_node(tmp_path):
@@ -244,7 +228,16 @@ def test_the_policy_permits_exactly_the_topics_and_services_of_the_node(tmp_path
             ):
                 opened[what] |= {name for name, _ in names}
             assert ros.get_client_names_and_types_by_node(NODE, '/') == []
-    assert opened == allowed()
+    root = ET.parse(ROOT / 'config' / 'policy.xml').getroot()  # noqa: S314 - our own file
+    (profile,) = root.iter('profile')
+    assert (profile.get('ns'), profile.get('node')) == ('/', NODE)
+    allowed = {}
+    for group in profile:
+        ((what, verdict),) = group.attrib.items()
+        assert verdict == 'ALLOW'
+        names = [(entry.text or '').replace('~', f'/{NODE}') for entry in group]
+        allowed[what] = {name if name.startswith('/') else f'/{name}' for name in names}
+    assert opened == allowed
 
 
 BOMB = '\n'.join(

@@ -37,9 +37,9 @@ def test_the_commands_in_the_readme_of_the_bags_make_the_sample_bags(command, tm
         shipped = read_recording(ROOT / path.relative_to(tmp_path))
         anew = read_recording(path)
         # Only the version in `simulated_by` may differ between shipped and new bags.
-        own, theirs = (dict(bag.info.metadata) for bag in (anew, shipped))
-        assert own.pop('simulated_by').split()[0] == theirs.pop('simulated_by').split()[0]
-        assert own == theirs, path.name
+        new, old = (dict(bag.info.metadata) for bag in (anew, shipped))
+        assert new.pop('simulated_by').split()[0] == old.pop('simulated_by').split()[0]
+        assert new == old, path.name
         new, old = anew.columns, shipped.columns
         for name in ('accel_stamp_ns', 'accel'):
             np.testing.assert_array_equal(getattr(new, name), getattr(old, name), path.name)

@@ -167,25 +167,20 @@ def test_the_message_on_a_wrong_entry_names_key_value_and_rule(old, new, key, me
 @pytest.mark.parametrize(
     ('content', 'message'),
     [
-        (b'', 'mapping of keys'),
-        (b'[1, 2]', 'mapping of keys'),
+        (b'', 'mapping of keys'), (b'[1, 2]', 'mapping of keys'),
         (b'[' + b'1,' * 20_000 + b']', 'more than 20000 keys and values'),
         (b'a: &x 1\nb: *x', r'aliases are not accepted \(line 2\)'),
-        (b'[' * 100_000, 'nested deeper|nesting depth'),
-        (b'{a: ' * 100_000, 'nested deeper'),
-        (b'a: 1\na: 2', "'a' occurs twice"),
-        (b'? [1]\n: 2', 'a key must be a text'),
+        (b'[' * 100_000, 'nested deeper|nesting depth'), (b'{a: ' * 100_000, 'nested deeper'),
+        (b'a: 1\na: 2', "'a' occurs twice"), (b'? [1]\n: 2', 'a key must be a text'),
         (b'1: 2', 'a key must be a text'),
         (b'x: !!python/object:os.system ls', r'YAML tags are not accepted \(line 1\)'),
         (b'x: !!binary aGk=\n', 'YAML tags are not accepted'),
-        (b'\xff\xfe', 'not UTF-8|not valid YAML'),
-        (b'a: \x00', 'not valid YAML'),
-        (b'a: [1', 'not valid YAML'),
-        (b'a: 1\n---\nb: 2', 'one YAML document'),
+        (b'\xff\xfe', 'not UTF-8|not valid YAML'), (b'a: \x00', 'not valid YAML'),
+        (b'a: [1', 'not valid YAML'), (b'a: 1\n---\nb: 2', 'one YAML document'),
         (b'format_version: ' + b'9' * 5000, 'integer of 5000 digits'),
         (b'"\\ud800": 1', 'not valid YAML|invalid'),
     ],
-)
+)  # fmt: skip
 def test_files_without_a_calibration_are_refused(content, message):
     with pytest.raises(CalibrationError, match=message) as caught:
         parse_calibration(content)
@@ -207,15 +202,12 @@ def test_a_damaged_file_gives_a_calibration_or_a_calibration_error(data):
         assert parse_calibration(dump_calibration(value).encode()) == value
 
 
-def test_a_written_file_that_is_cut_at_any_line_is_refused():
+def test_files_that_are_cut_at_any_line_or_no_regular_files_are_refused(tmp_path):
     # WHY: a file that was still being copied was loaded, without its last columns and covariance.
     lines = dump_calibration(rich_calibration()).splitlines(keepends=True)
     for n in range(1, len(lines)):
         with pytest.raises(CalibrationError, match='the file is cut'):
             parse_calibration(''.join(lines[:n]).encode())
-
-
-def test_paths_that_are_no_regular_file_are_refused(tmp_path):
     fifo = tmp_path / 'fifo'
     os.mkfifo(fifo)
     large = tmp_path / 'large'
@@ -257,14 +249,12 @@ def test_impossible_curves_and_temperatures_are_refused(old, new, key, message):
 @pytest.mark.parametrize(
     ('key', 'value', 'message'),
     [
-        ('factor', '?', 'base64 of float32'),
-        ('factor', 'AAAA', 'base64 of float32'),
+        ('factor', '?', 'base64 of float32'), ('factor', 'AAAA', 'base64 of float32'),
         ('factor', 'AADAfw==', 'finite'),
         ('factor', '', r'must hold \d+ x \d+ numbers \(`diagonal` x `rank`\), got 0'),
-        ('diagonal', 'AACAvw==', 'must hold'),
-        ('diagonal', '', 'must hold 0 x'),
+        ('diagonal', 'AACAvw==', 'must hold'), ('diagonal', '', 'must hold 0 x'),
     ],
-)
+)  # fmt: skip
 def test_wrong_numbers_are_neither_read_nor_written(key, value, message):
     old = getattr(RICH.posterior, key)
     assert old in TEXT

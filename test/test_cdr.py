@@ -59,8 +59,7 @@ def convert(converter, *messages):
 def test_counts_are_converted_to_an_imu_message(order, sec, nanosec, frame, values):
     converter = SampleConverter(Vector3Stamped)
     written = convert(converter, *[cdr(order, (sec, nanosec), frame, values)] * 2)
-    assert written[0] == written[1]
-    assert converter.traffic.n_fallback == 2 * (order == '>')
+    assert (written[0], converter.traffic.n_fallback) == (written[1], 2 * (order == '>'))
     imu = deserialize_message(written[0], Imu)
     assert (imu.header.stamp.sec, imu.header.stamp.nanosec) == (sec, nanosec)
     assert imu.header.frame_id == frame
@@ -68,8 +67,7 @@ def test_counts_are_converted_to_an_imu_message(order, sec, nanosec, frame, valu
     force = process(sec * 10**9 + nanosec, *values)
     covariance = [force[k] for k in (3, 4, 5, 4, 6, 7, 5, 7, 8)]
     fields = doubles(written[0])
-    assert fields[25:28] == [z, x, y]
-    assert b''.join(fields[28:]) == pack('<', covariance)
+    assert (fields[25:28], b''.join(fields[28:])) == ([z, x, y], pack('<', covariance))
     # A first covariance entry of -1 marks a quantity as not measured (REP 145).
     assert b''.join(fields[:4]) == pack('<', [0.0, 0.0, 0.0, 1.0])
     assert fields[4] == fields[16] == pack('<', [-1.0])
@@ -93,8 +91,7 @@ def test_imu_fields_except_acceleration_are_copied_bit_for_bit(order, frame, ove
 def test_the_byte_swap_keeps_the_bits_of_a_signalling_nan():
     # A processor may turn a signalling NaN into a quiet NaN when it loads it as a float64.
     payload = 0x7FF0_0000_0000_0001
-    values = struct.pack('>37Q', *[payload] * 37)
-    message = cdr('>', (1, 2), 'imu', []) + values
+    message = cdr('>', (1, 2), 'imu', []) + struct.pack('>37Q', *[payload] * 37)
     written = SampleConverter(Imu).convert(message, lambda *_: tuple(map(float, range(9))))
     assert written is not None
     assert doubles(written)[:25] == [struct.pack('<Q', payload)] * 25
@@ -114,8 +111,7 @@ def test_messages_with_frame_ids_of_different_lengths_are_converted():
 @pytest.mark.parametrize('kind', [Vector3Stamped, Imu])
 @pytest.mark.parametrize('override', ['', 'other_link'])
 def test_messages_with_extra_bytes_are_converted_by_rclpy(kind, override):
-    values = [float(k) for k in range(37 if kind is Imu else 3)]
-    good = cdr('<', (3, 4), 'imu', values)
+    good = cdr('<', (3, 4), 'imu', [float(k) for k in range(37 if kind is Imu else 3)])
     fast, slow = SampleConverter(kind, override), SampleConverter(kind, override)
     (expected,), (written,) = convert(fast, good), convert(slow, good + bytes(8))
     assert (fast.traffic.n_fallback, slow.traffic.n_fallback) == (0, 1)
@@ -136,9 +132,7 @@ def test_messages_with_extra_bytes_are_converted_by_rclpy(kind, override):
 def test_unreadable_messages_are_counted_and_later_messages_converted(bad):
     converter = SampleConverter(Vector3Stamped)
     written = convert(converter, GOOD, bad, GOOD)
-    assert len(written) == 2
-    assert written[0] == written[1]
-    assert converter.traffic.n_malformed == 1
+    assert (len(written), written[0], converter.traffic.n_malformed) == (2, written[1], 1)
 
 
 def test_unreadable_first_messages_are_counted_and_samples_without_correction_give_none():

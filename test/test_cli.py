@@ -58,14 +58,28 @@ class TestOutput:
     def test_a_closed_pipe_gives_no_error(self, bag):
         command = f'{sys.executable} -m thermo_comp info {bag} | head -n 1'
         finished = ran('bash', '-c', f'set -o pipefail; {command}')
-        assert finished.stderr == ''
-        assert len(finished.stdout.splitlines()) == 1
+        assert (finished.stderr, len(finished.stdout.splitlines())) == ('', 1)
 
     def test_progress_is_shown_only_on_a_terminal_and_colour_only_without_no_color(self, bag, cli):
         for no_color in (False, True):
-            text = on_a_terminal('info', str(bag), no_color=no_color)
-            assert 'reading bag' in text
-            assert bool(re.search(r'\x1b\[(3\d|9\d|38)', text)) != no_color
+            leader, follower = pty.openpty()
+            terminal = {'COLUMNS': '80', 'TERM': 'xterm-256color', 'NO_COLOR': '1'}
+            environment = {**os.environ, **terminal}
+            if not no_color:
+                del environment['NO_COLOR']
+            process = subprocess.Popen(
+                [sys.executable, '-m', 'thermo_comp', 'info', str(bag)], cwd=ROOT,
+                env=environment, stdin=follower, stdout=follower, stderr=follower,
+            )  # fmt: skip
+            os.close(follower)
+            shown = b''
+            with suppress(OSError):  # the command has ended and closed its terminal
+                while part := os.read(leader, 65536):
+                    shown += part
+            os.close(leader)
+            assert process.wait(timeout=60) == 0
+            assert b'reading bag' in shown
+            assert bool(re.search(rb'\x1b\[(3\d|9\d|38)', shown)) != no_color
         finished = cli('info', bag)
         assert 'reading bag' not in finished.stdout + finished.stderr
 
@@ -93,25 +107,6 @@ def test_a_command_computes_in_one_thread():
         assert finished.stdout.split() == ['False', text]
 
 
-def on_a_terminal(*arguments, no_color=False):
-    leader, follower = pty.openpty()
-    environment = {**os.environ, 'COLUMNS': '80', 'TERM': 'xterm-256color', 'NO_COLOR': '1'}
-    if not no_color:
-        del environment['NO_COLOR']
-    process = subprocess.Popen(
-        [sys.executable, '-m', 'thermo_comp', *arguments], cwd=ROOT, env=environment,
-        stdin=follower, stdout=follower, stderr=follower,
-    )  # fmt: skip
-    os.close(follower)
-    shown = b''
-    with suppress(OSError):  # the command has ended and closed its terminal
-        while part := os.read(leader, 65536):
-            shown += part
-    os.close(leader)
-    assert process.wait(timeout=60) == 0
-    return shown.decode()
-
-
 class TestPlay:
     @pytest.fixture(autouse=True)
     def needs_ros(self):
@@ -123,8 +118,7 @@ class TestPlay:
         data = parsed(finished.stdout)
         info = inspect_recording(bag)
         counts = {f'/here{name}': count for name, (_, count) in info.topics.items()}
-        assert data['messages'] == counts
-        assert data['unheard'] == sorted(data['unheard'])
+        assert (data['messages'], data['unheard']) == (counts, sorted(data['unheard']))
         assert '/here/accel/counts had no subscriber' in finished.stderr
 
     def test_ros_arguments_end_at_two_dashes(self):

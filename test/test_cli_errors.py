@@ -151,8 +151,7 @@ def test_a_calibration_that_is_not_valid_gives_exit_code_1(cli, tmp_path):
     # The second calibration is right: its levels of +10 mg cancel its biases of -10 mg.
     right = axis_set(delta=30.0)
     sets = regime_set(right, right, right)
-    axes = equal_axes(300.0, -30.0)
-    valid = calibration(axes=axes, static=sets, dynamic=sets)
+    valid = calibration(axes=equal_axes(300.0, -30.0), static=sets, dynamic=sets)
     save_calibration(valid, tmp_path / 'right.yaml')
     arguments = ('evaluate', path, '-c', tmp_path / 'right.yaml')
     assert 'no claim: ' in cli(*arguments, code=1).stdout

@@ -32,7 +32,7 @@ def by_group(columns):
     return Counter(column.group for column in columns)
 
 
-def test_the_columns_of_the_bank_differ_and_bends_are_within_the_temperature_span():
+def test_columns_of_the_bank_differ_bend_within_the_span_or_are_even_about_rest():
     assert tuple(60.0 * 2.0**k for k in range(8)) == BANK_TAUS
     assert pytest.approx([60.0 * 2.0 ** (k / 2) for k in range(15)]) == FINE_TAUS
     assert by_group(bank()).keys() == by_group(bank(('case', 'tip'))).keys()
@@ -41,9 +41,6 @@ def test_the_columns_of_the_bank_differ_and_bends_are_within_the_temperature_spa
     bends = [column for column in bank(span_k=(-10.0, 2.0)) if column.group == 'bend']
     assert len(bends) == 12 * len({column.tau_s for column in bends}) == 96
     assert all(-10.0 < column.knee_k < 2.0 for column in bends)
-
-
-def test_gradient_even_about_rest_is_an_even_function_of_gradient_less_rest():
     warm = bank(('case', 'tip'), {'case': -0.5, 'tip': 0.0})
     change = [column for column in warm if column.group == 'gradient_even_about_rest']
     assert by_group(warm)['gradient_even_about_rest'] == 21
@@ -108,8 +105,7 @@ def test_the_value_of_each_kind_of_column_agrees_with_hand_numbers():
     assert values == pytest.approx(expected)
     # A factor t of a column is limited to calibrated temperatures; the column `board` has no t.
     at_edge = ColumnTable(columns, spec, 20.0, (-10.0, 22.0)).values(state)[:, 0]
-    assert at_edge[4] == pytest.approx(-0.6)
-    assert at_edge[2] == 0.5
+    assert (at_edge[4], at_edge[2]) == (pytest.approx(-0.6), 0.5)
 
 
 def test_bends_have_slopes_and_go_on_along_their_tangent_beyond_the_range():

@@ -36,17 +36,14 @@ from thermo_comp.unit.correction import Correction
 NOISE = 1e-4**2 / 0.01 + (1.0 / 6.0) / 300.0**2
 
 
-def test_the_offset_is_half_the_sum_of_signed_counts():
-    # Counts at +-g: offset = sum / 2, scale = difference / 2 (Golovach's Eq. (3), (4): exchanged).
+def test_corrected_samples_agree_with_the_formulas_of_two_faces_and_of_the_static_set():
+    # Counts at +-g: offset = sum / 2, scale = difference / 2; the paper's Eq. (3), (4) swap them.
     plus, minus = 300.0 * GRAVITY + 12.0, -300.0 * GRAVITY + 12.0
     axis = AxisReference((plus - minus) / 2.0 / GRAVITY, (plus + minus) / 2.0)
     compensator = Compensator(calibration(axes=Axes(*[axis] * 3)))
     warm(compensator)
     corrected = compensator.process(1, plus, minus, 12.0)[:3]
     assert corrected == pytest.approx((GRAVITY, -GRAVITY, 0.0), abs=1e-12)
-
-
-def test_a_corrected_sample_agrees_with_the_formula_of_the_static_set():
     axis = axis_set((0.0, 0.5, 0.01), (1.0, 1e-4), delta=2.0)
     unit = calibration(
         axes=equal_axes(300.0, 7.0),
@@ -117,11 +114,7 @@ def at_seconds(*events):
 def test_blocks_of_any_size_give_the_bits_of_single_samples(events, chunk, transition_s):
     config = CompensatorConfig(transition_time_s=transition_s, case_timeout_s=2.0)
     _, block, (compensator, *_) = assert_equal_bits(RICH, config, events, chunk)
-    assert_sound(block, compensator.counters, events)
-
-
-def assert_sound(block, counters, events):
-    """Check that the output is finite and in order, and that the counters agree with it."""
+    counters = compensator.counters
     for name in ('specific_force', 'angular_rate', 'angular_rate_variance', 'covariance'):
         assert np.isfinite(getattr(block, name)).all()
     assert (block.angular_rate_variance > 0.0).all()
@@ -130,13 +123,11 @@ def assert_sound(block, counters, events):
         assert np.linalg.eigvalsh(matrices).min() > 0.0
     assert counters.n_in == sum(kind == 'accel' for kind, _, _ in events)
     assert counters.n_out == len(block.index)
-    backward = np.diff(block.stamp_ns) <= 0
-    assert np.count_nonzero(backward) <= counters.n_time_jumps
+    assert np.count_nonzero(np.diff(block.stamp_ns) <= 0) <= counters.n_time_jumps
 
 
 def test_the_covariance_in_an_unknown_regime_contains_the_difference_of_the_sets():
-    unit = calibration(dynamic=regime_set(axis_set(delta=3.0)))
-    compensator = Compensator(unit)
+    compensator = Compensator(calibration(dynamic=regime_set(axis_set(delta=3.0))))
     warm(compensator, until_s=1)
     early = compensator.process(SECOND_NS // 2, 0.0, 0.0, 1.0)
     warm(compensator, until_s=1500, start_s=1)
@@ -206,8 +197,7 @@ def test_a_reading_with_a_near_stamp_confirms_a_sample_20_s_ahead(is_read):
 @pytest.mark.parametrize('ahead_s', [0, 10**6])
 def test_a_full_queue_has_4096_readings_and_keeps_the_newest(ahead_s):
     # WHY: case readings with a clock ahead filled the queue: new board readings were dropped.
-    config = CompensatorConfig(gravity_tolerance_m_s2=0.0)
-    compensator = Compensator(thermal_calibration(), config)
+    compensator = Compensator(thermal_calibration(), CompensatorConfig(gravity_tolerance_m_s2=0.0))
     for k in range(10_000):
         compensator.push('case', (k + ahead_s) * SECOND_NS, 20.0)
         compensator.push('board', k * SECOND_NS, 20.0)
@@ -254,15 +244,13 @@ def test_flush_updates_the_regime_without_samples():
     compensator = Compensator(calibration())
     warm(compensator, until_s=1500)
     compensator.flush(1500 * SECOND_NS)
-    flags = compensator.take_flags()
-    assert flags[-1] == (1499 * SECOND_NS, False)
+    assert compensator.take_flags()[-1] == (1499 * SECOND_NS, False)
 
 
 def test_another_transition_time_during_a_transition_causes_no_step_of_the_output():
     # The curves of both regimes differ by 0.025 counts (8.5 ug) at any temperature.
     unit = calibration(dynamic=regime_set(axis_set(delta=0.025)))
-    config = replace(UNCHECKED, transition_time_s=100.0)
-    compensator = Compensator(unit, config)
+    compensator = Compensator(unit, replace(UNCHECKED, transition_time_s=100.0))
     warm(compensator, 20.0, until_s=1200)
     for k in range(1200, 1400):
         compensator.push('board', k * SECOND_NS, 20.0)
@@ -273,13 +261,11 @@ def test_another_transition_time_during_a_transition_causes_no_step_of_the_outpu
     before = compensator.process(stamp + 1, 0.0, 0.0, 1.0)[0]
     other = replace(compensator.config, transition_time_s=50.0)
     compensator.take_over(compensator.thermal.model, other)
-    after = compensator.process(stamp + 2, 0.0, 0.0, 1.0)[0]
-    assert after == pytest.approx(before, abs=1e-9)
+    assert compensator.process(stamp + 2, 0.0, 0.0, 1.0)[0] == pytest.approx(before, abs=1e-9)
 
 
 def test_a_new_transition_time_does_not_restart_the_checks_of_gravity_and_sample_rate(rng):
-    # WHY: a change of any parameter restarted the check of |f|, and samples with a wrong |f| were
-    # published for 13 s.
+    # WHY: a changed parameter restarted the check of |f|: a wrong |f| was published for 13 s.
     compensator = Compensator(calibration(), CompensatorConfig())
 
     def published(seconds, size):
@@ -299,8 +285,7 @@ def test_a_new_transition_time_does_not_restart_the_checks_of_gravity_and_sample
     other = replace(compensator.config, transition_time_s=50.0)
     compensator.take_over(compensator.thermal.model, other)
     assert published(range(65, 70), 1.3 * count_per_g) == 0
-    other = replace(other, gravity_tolerance_m_s2=5.0)
-    compensator.take_over(compensator.thermal.model, other)
+    compensator.take_over(compensator.thermal.model, replace(other, gravity_tolerance_m_s2=5.0))
     assert published(range(70, 75), 1.1 * count_per_g) > 0
     compensator = Compensator(calibration(), CompensatorConfig(gravity_tolerance_m_s2=0.0))
     warm(compensator, until_s=10)
@@ -346,8 +331,7 @@ def test_output_that_is_not_finite_is_never_published(monkeypatch, bad):
 
 def test_a_switch_of_sets_causes_no_step():
     # The output changes by 5 counts = 1.7 mg within 300 s, at most 0.57 ug per sample at 10 Hz.
-    unit = calibration(dynamic=regime_set(axis_set(delta=5.0)))
-    compensator = Compensator(unit, UNCHECKED)
+    compensator = Compensator(calibration(dynamic=regime_set(axis_set(delta=5.0))), UNCHECKED)
     outputs = []
     for k in range(20_000):
         stamp = k * 100_000_000
@@ -357,8 +341,7 @@ def test_a_switch_of_sets_causes_no_step():
             compensator.push('case', stamp, 20.0 + ramp)
         outputs.append(compensator.process(stamp, 0.0, 0.0, 1.0)[0])
     steps = np.abs(np.diff(outputs))
-    assert outputs[0] == 0.0
-    assert outputs[-1] == pytest.approx(-5.0 / 300.0)
+    assert (outputs[0], outputs[-1]) == (0.0, pytest.approx(-5.0 / 300.0))
     assert steps.max() <= 5.0 / 300.0 / 3000.0 * 1.001
 
 

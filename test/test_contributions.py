@@ -38,37 +38,27 @@ def settled(truth):
     return windows, contributions_of(regression, posterior)
 
 
-def added(truth):
-    """Return the effects of initial lag states, tilts and offsets on the readings."""
-    with_effects, _ = table(truth)
-    without, _ = table(replace(truth, start_sd=0.0, offset_sd=0.0, tilt_sd=NOTHING.tilt_sd))
-    return (with_effects.mean - without.mean) / NOMINAL
-
-
 @pytest.mark.parametrize(
-    ('key', 'name', 'truth'),
+    ('name', 'effect', 'tolerance'),
     [
-        (
-            'start_sd',
-            'initial_lag_states',
-            replace(NOTHING, start_sd=0.5, on_bias=5.0 * NOTHING.on_bias),
-        ),
-        ('tilt_sd', 'support_tilt', replace(NOTHING, tilt_sd=5e-6)),
-        ('offset_sd', 'mounting_offsets', replace(NOTHING, offset_sd=30.0 * MICRO)),
+        ('initial_lag_states', {'start_sd': 0.5, 'on_bias': 5.0 * NOTHING.on_bias}, 0.05),
+        ('support_tilt', {'tilt_sd': 5e-6}, 0.05),
+        # |f| determines 24 combinations of the 72 offsets, of which 9 act like changes of the
+        # constants: the sd of 15 numbers is uncertain by 1 / sqrt(2 * 15) = 18 %.
+        ('mounting_offsets', {'offset_sd': 30.0 * MICRO}, 0.36),
     ],
 )
-def test_each_unknown_explains_what_it_adds_to_the_readings(key, name, truth):
+def test_the_size_of_an_effect_is_the_rms_that_it_adds_to_the_readings(name, effect, tolerance):
+    truth = replace(NOTHING, **effect)
     windows, found = settled(truth)
-    true = added(truth)
-    if key == 'tilt_sd':
+    without, _ = table(replace(truth, start_sd=0.0, offset_sd=0.0, tilt_sd=NOTHING.tilt_sd))
+    true = (table(truth)[0].mean - without.mean) / NOMINAL
+    if name == 'support_tilt':
         true = within_positions(true, windows.position)
     # The noise of a mean over 60 windows is 0.26 ug.
     hidden = truth.sigma[0] / np.sqrt(60.0)
     assert rms(true) > 5.0 * hidden
-    # |f| determines 24 combinations of the 72 offsets, of which 9 act like changes of the
-    # constants: the sd of 15 numbers is uncertain by 1 / sqrt(2 * 15) = 18 %.
-    share = {'offset_sd': 0.36}.get(key, 0.05)
-    assert getattr(found, name) == pytest.approx(rms(true), rel=share)
+    assert getattr(found, name) == pytest.approx(rms(true), rel=tolerance)
     for other in ('initial_lag_states', 'support_tilt', 'mounting_offsets', 'slow_noise'):
         if other != name:
             assert getattr(found, other) < 2.0 * hidden
@@ -97,13 +87,11 @@ def test_the_sd_of_correlated_noise_is_that_of_the_process():
 @pytest.mark.parametrize(
     ('name', 'value', 'expected'),
     [
-        ('initial_lag_states', 90.0, ['starts']),
-        ('initial_lag_states', 50.0, []),
-        ('support_tilt', 90.0, ['supports']),
-        ('support_tilt', None, []),
+        ('initial_lag_states', 90.0, ['starts']), ('initial_lag_states', 50.0, []),
+        ('support_tilt', 90.0, ['supports']), ('support_tilt', None, []),
         ('mounting_offsets', 90.0, []),
     ],
-)
+)  # fmt: skip
 def test_starts_and_tilts_larger_than_the_response_are_findings(name, value, expected):
     usual = dict.fromkeys((field.name for field in fields(Contributions)), 0.0)
     micro = None if value is None else value * MICRO_G

@@ -50,10 +50,8 @@ def test_a_bag_converted_from_a_table_has_the_values_of_the_table(tmp_path):
     report = write_log(table_log(path, column_map(gyro=gyro)), tmp_path / 'bag')
     recording = read_recording(tmp_path / 'bag')
     block = recording.columns
-    assert recording.info.input == 'imu'
-    assert recording.info.metadata['serial'] == 'unit7'
-    assert recording.info.metadata['converted_from'] == 'log.csv'
-    assert block.frame_id == 'here'
+    assert (recording.info.input, recording.info.metadata['serial']) == ('imu', 'unit7')
+    assert (recording.info.metadata['converted_from'], block.frame_id) == ('log.csv', 'here')
     assert block.accel_stamp_ns.tolist() == (columns['ms'] * 10**6).tolist()
     expected = np.column_stack([columns[k] for k in ['ax', 'ay', 'az']]) * STANDARD_GRAVITY
     np.testing.assert_array_equal(block.accel, expected)
@@ -71,31 +69,25 @@ def test_a_bag_converted_from_a_table_has_the_values_of_the_table(tmp_path):
     assert len(board.celsius) == report.messages['board'] == 10
     assert case.after.tolist() == [0, 100, 200, 300]
     assert (report.rows, report.messages['accel']) == (400, 400)
-    assert report.rate_hz == pytest.approx(100.0)
-    assert report.duration_s == pytest.approx(3.99)
+    assert (report.rate_hz, report.duration_s) == (pytest.approx(100.0), pytest.approx(3.99))
     assert 'gravity is 1 g' in report.inferred_unit
 
 
-def test_counts_with_a_stated_sensitivity_become_imu_messages(tmp_path):
+def test_counts_are_converted_with_a_stated_sensitivity_and_less_an_offset(tmp_path):
     path, columns = table(tmp_path / 'log.csv', scale=2048.0)
     accel = {'columns': ['ax', 'ay', 'az'], 'unit': 'counts', 'output': 'imu'}
-    right = column_map(accel={**accel, 'counts_per_g': 2048.0})
-    write_log(table_log(path, right), tmp_path / 'bag')
+    accel |= {'counts_per_g': 2048.0}
+    write_log(table_log(path, column_map(accel=accel)), tmp_path / 'bag')
     block = read_recording(tmp_path / 'bag').columns
     np.testing.assert_allclose(block.accel[:, 0], columns['ax'] * STANDARD_GRAVITY / 2048.0)
     wrong = table_log(path, column_map(accel={**accel, 'counts_per_g': 16384.0}))
     with pytest.raises(RecordingError, match=r'16384 counts/g are stated$'):
         write_log(wrong, tmp_path / 'other')
     assert not (tmp_path / 'other').exists()
-
-
-def test_an_offset_of_raw_words_is_subtracted(tmp_path):
-    path, columns = table(tmp_path / 'log.csv', scale=2048.0)
     rows = np.loadtxt(path, delimiter=',', skiprows=1)
     rows[:, 1:4] += 32768.0
     np.savetxt(path, rows, '%.17g', ',', header=','.join(columns), comments='')
-    accel = {'columns': ['ax', 'ay', 'az'], 'unit': 'counts', 'output': 'counts'}
-    accel |= {'counts_per_g': 2048.0, 'clip': [0, 65535]}
+    accel |= {'output': 'counts', 'clip': [0, 65535]}
     with pytest.raises(RecordingError, match='is there an `offset`'):
         write_log(table_log(path, column_map(accel=accel)), tmp_path / 'bag.mcap')
     log = table_log(path, column_map(accel={**accel, 'offset': 32768.0}))
@@ -114,8 +106,7 @@ def test_times_of_a_counter_of_32_bits_continue_after_its_overflow(tmp_path, uni
     rows = [f'{at},{row.partition(",")[2]}' for at, row in zip(ticks, lines[1:], strict=True)]
     path.write_text('\n'.join([lines[0], *rows]))
     log = table_log(path, column_map(stamp={'column': 'ms', 'unit': unit}))
-    step_ns = 10 * {'ms': 10**6, 'us': 10**3}[unit]
-    assert np.diff(log.stamp_ns).tolist() == [step_ns] * 399
+    assert np.diff(log.stamp_ns).tolist() == [10 * {'ms': 10**6, 'us': 10**3}[unit]] * 399
     report = write_log(log, tmp_path / 'bag')
     assert (report.findings['continued'].count, report.findings['continued'].lines) == (1, (202,))
     assert report.findings['backwards'].count == 0
@@ -172,8 +163,7 @@ def test_rows_with_faults_are_counted_and_readings_of_minus_127_degc_left_out(tm
     path.write_text('\n'.join(lines))
     report = write_log(table_log(path, column_map()), tmp_path / 'cold')
     assert report.findings['impossible'].count == 2  # a reading repeated in two rows counts once
-    board = read_recording(tmp_path / 'cold').columns.temperatures['board']
-    assert board.celsius.min() == 25.0
+    assert read_recording(tmp_path / 'cold').columns.temperatures['board'].celsius.min() == 25.0
 
 
 def test_stamps_of_a_fixed_rate_do_not_accumulate_rounding(tmp_path):
@@ -237,12 +227,6 @@ def test_readings_are_kept_if_they_change_or_after_ten_seconds():
 
 
 class TestColumnMap:
-    def write(self, tmp_path, **changes):
-        accel = {'columns': ['x', 'y', 'z'], 'unit': 'g', 'output': 'imu'}
-        data = {'stamp': {'column': 't', 'unit': 's'}, 'accel': accel, **changes}
-        (tmp_path / 'map.yaml').write_text(yaml.safe_dump(data))
-        return tmp_path / 'map.yaml'
-
     def test_shipped_column_maps_are_valid(self):
         paths = sorted((ROOT / 'config' / 'columns').glob('*.yaml'))
         assert paths
@@ -280,7 +264,9 @@ class TestColumnMap:
         ],
     )  # fmt: skip
     def test_mistakes_in_a_column_map_name_their_key(self, tmp_path, changes, key, message):
-        path = self.write(tmp_path, **changes)
+        path, accel = tmp_path / 'map.yaml', {'columns': [*'xyz'], 'unit': 'g', 'output': 'imu'}
+        data = {'stamp': {'column': 't', 'unit': 's'}, 'accel': accel, **changes}
+        path.write_text(yaml.safe_dump(data))
         with pytest.raises(RecordingError, match=message) as caught:
             load_column_map(path)
         assert str(path) in str(caught.value)
@@ -314,8 +300,7 @@ def test_convert_reports_rows_rate_and_topics(tmp_path, cli):
     text = f'thermo_comp: error: {tmp_path}/bag: exists already; --force overwrites it\n'
     assert cli(*arguments, code=1).stderr == text
     data = json.loads(cli(*arguments, '--force', '--json').stdout)
-    assert data['accel_messages'] == 400
-    assert data['stillness']['moving_ns'] == []
+    assert (data['accel_messages'], data['stillness']['moving_ns']) == (400, [])
     assert cli(*arguments, '--force', '-q').stdout == ''
 
 
@@ -344,7 +329,6 @@ class TestFreezer:
         assert block.temperatures['case'].celsius.min() == pytest.approx(-17.8, abs=0.1)
         assert block.temperatures['board'].celsius.min() == pytest.approx(3.6, abs=0.5)
         assert block.temperatures['barometer'].celsius.min() == pytest.approx(-17.0, abs=0.1)
-        n_barometer = len(block.temperatures['barometer'].celsius)
-        assert report.messages['barometer'] == n_barometer
+        assert report.messages['barometer'] == len(block.temperatures['barometer'].celsius)
         assert report.messages.keys() == {'accel', 'board', 'case', 'barometer'}
         assert report.messages['case'] < 0.75 * report.rows

@@ -59,8 +59,7 @@ PHONE = ','.join(f'{name} {axis} ({unit})' for name, unit in QUANTITIES for axis
 def times(kind):
     ticks = [START + timedelta(microseconds=k * 10**4) for k in range(N)]
     if kind == 'pandas':
-        zone = timezone(timedelta(hours=2))
-        return [str(tick.astimezone(zone)) for tick in ticks]
+        return [str(tick.astimezone(timezone(timedelta(hours=2)))) for tick in ticks]
     if kind == 'actipy':
         return [f'{tick:%Y-%m-%d %H:%M:%S.%f}'[:-3] + '+0000 [Europe/London]' for tick in ticks]
     if kind == 'epoch':
@@ -87,16 +86,14 @@ def test_a_table_is_read_by_its_headings(tmp_path, rng, kind, headings, unit, on
     ]
     path.write_text('\n'.join([headings, *rows]) + '\n')
     columns = guess_columns(path)
-    assert columns.stamp.unit == unit
-    assert columns.accel.unit == ('g' if one_g == 1.0 else 'm/s^2')
+    assert (columns.stamp.unit, columns.accel.unit) == (unit, 'g' if one_g == 1.0 else 'm/s^2')
     (tmp_path / 'map.yaml').write_text('\n'.join(map_lines(columns)))
     assert load_column_map(tmp_path / 'map.yaml') == columns
     log = table_log(path, columns)
     assert log.stamp_ns.tolist() == (START_NS + STEP_NS * np.arange(N)).tolist()
     np.testing.assert_allclose(log.accel, accel, atol=1e-6)
     np.testing.assert_allclose(log.gyro, rate, atol=1e-6)
-    assert set(log.temperatures) == {'board'}
-    assert log.temperatures['board'].celsius[0] == 20.0
+    assert (set(log.temperatures), log.temperatures['board'].celsius[0]) == ({'board'}, 20.0)
 
 
 @pytest.mark.parametrize('kind', ['dates', 'text', 'numbers'])
@@ -283,11 +280,11 @@ def test_the_guessed_column_map_is_printed(tmp_path, rng, cli, headings, thermom
     assert f'log.csv: columns not used: {not_used}\n' in printed
     head, *lines = printed.splitlines()
     assert 'guessed column map; if the map is wrong, edit it for --columns' in head
-    own = yaml.safe_load('\n'.join(takewhile(lambda line: line.startswith('  '), lines)))
-    assert own['stamp'] == {'column': 'time (s)', 'unit': 's'}
-    assert own['accel'] == {'columns': ['ax', 'ay', 'az'], 'unit': 'g', 'output': 'imu'}
-    assert [own.get(name, {}).get('column') for name in ('board', 'case')] == thermometers
-    (tmp_path / 'map.yaml').write_text('\n'.join(map_lines(own)))
+    guess = yaml.safe_load('\n'.join(takewhile(lambda line: line.startswith('  '), lines)))
+    assert guess['stamp'] == {'column': 'time (s)', 'unit': 's'}
+    assert guess['accel'] == {'columns': ['ax', 'ay', 'az'], 'unit': 'g', 'output': 'imu'}
+    assert [guess.get(name, {}).get('column') for name in ('board', 'case')] == thermometers
+    (tmp_path / 'map.yaml').write_text('\n'.join(map_lines(guess)))
     again = ('--columns', tmp_path / 'map.yaml', '-o', tmp_path / 'again')
     assert f'not used: {not_used}\n' in cli('convert', tmp_path / 'log.csv', *again).stdout
 
@@ -314,7 +311,7 @@ def test_equal_guessed_column_maps_are_printed_once(tmp_path, rng, cli):
 
 
 @pytest.mark.parametrize(('one_g', 'bits'), [(4096.0, 15), (524288.0, 23), (1e8, 31)])
-def test_words_of_24_and_32_bits_are_not_saturated(rng, one_g, bits):
+def test_counts_of_24_and_32_bits_are_not_saturated(rng, one_g, bits):
     rest = Rest(rng, level=(0.0, 0.0, one_g), sd=0.002 * one_g)
     rest.accel[:] = np.rint(rest.accel)
     rest.accel[100] = 2.0**bits - 1.0  # largest value of the converter
@@ -334,12 +331,10 @@ def write(path, rng, unit, **columns):
 @pytest.mark.parametrize(
     ('unit', 'text', 'step', 'time_unit', 'rate_hz'),
     [
-        (9.80665, 'm/s^2', 0.01, 's', 100),
-        (1.0, 'g', 5.0, 'ms', 200),
-        (1000.0, 'mg', 10000.0, 'us', 100),
-        (4096.0, 'counts', 5e6, 'ns', 200),
+        (9.80665, 'm/s^2', 0.01, 's', 100), (1.0, 'g', 5.0, 'ms', 200),
+        (1000.0, 'mg', 10000.0, 'us', 100), (4096.0, 'counts', 5e6, 'ns', 200),
     ],
-)
+)  # fmt: skip
 def test_the_norm_at_rest_and_a_plausible_sample_rate_show_the_units(
     tmp_path, rng, unit, text, step, time_unit, rate_hz
 ):

@@ -118,8 +118,7 @@ def test_the_gyroscope_of_an_instance_is_in_its_bag_unless_it_is_sparsely_logged
 
 def test_logs_without_sample_times_or_a_thermometer_are_read(tmp_path, rng):
     force = still(rng)
-    path = write_old(tmp_path / 'old.ulg', force, STEP_US)
-    read = read_autopilot(path)
+    read = read_autopilot(write_old(tmp_path / 'old.ulg', force, STEP_US))
     np.testing.assert_array_equal(read.accel, force)
     assert 'case' not in read.temperatures
     # A constant temperature is written every 10 s, so once in this log of 6 s.
@@ -197,7 +196,7 @@ def parameter(name, value):
     return bytes([len(key)]) + key + struct.pack('<i', value)
 
 
-def test_sensor_combined_replaces_a_missing_sensor_accel(tmp_path, rng, cli):
+def test_sensor_combined_replaces_sensor_accel_unless_px4_compensated_it(tmp_path, rng, cli):
     path = tmp_path / 'default.ulg'
     force = write_combined(path, rng)
     read = read_autopilot(path)
@@ -209,9 +208,6 @@ def test_sensor_combined_replaces_a_missing_sensor_accel(tmp_path, rng, cli):
     printed = cli('convert', path, '-o', tmp_path / 'bag.mcap').stdout
     assert 'the log has no sensor_accel' in printed
     assert 'add 4 to SDLOG_PROFILE' in printed
-
-
-def test_a_combined_sensor_that_px4_compensated_is_refused(tmp_path, rng):
     path = tmp_path / 'corrected.ulg'
     write_combined(path, rng, TC_A_ENABLE=1)
     with pytest.raises(RecordingError, match=r'TC_A_ENABLE was 1.*SDLOG_PROFILE'):

@@ -70,8 +70,7 @@ def run_of(rng, seconds=240, rate=4, swing_k=12.0):
                     celsius = 22.0 + wave * (1.0 + 0.1 * ahead) + ahead
                     noise = 0.005 * rng.standard_normal()
                     events.append((name, max(stamp + late, 0), celsius + noise))
-        sample = (rng.normal(0, 900), rng.normal(0, 900), 2900.0)
-        events.append(('accel', stamp, sample))
+        events.append(('accel', stamp, (rng.normal(0, 900), rng.normal(0, 900), 2900.0)))
     return events
 
 
@@ -119,12 +118,11 @@ def test_corrections_drawn_from_the_posterior_scatter_by_the_claimed_sd(rng):
         sd[block.static : block.end] = 1e-6
     sd[layout.misalignment :] = 2e-6
     root = rng.standard_normal((n, 5)) * sd[:, np.newaxis]
-    covariance = root @ root.T + np.diag(0.3 * sd**2)
-    posterior = posterior_of(covariance)
+    posterior = posterior_of(root @ root.T + np.diag(0.3 * sd**2))
     judged = replace(unit, posterior=posterior)
     states = states_of(unit, rng)
     slow = SlowUncertainty(judged, Correction(judged))
-    nobody = np.zeros((len(Correction(unit).memory.lags), 2))
+    no_shares = np.zeros((len(Correction(unit).memory.lags), 2))
     draws = rng.multivariate_normal(np.zeros(n), posterior.covariance(), size=300)
     weights = np.array([0.0, 0.3])
     pair = np.repeat(np.array([states[-1][1]]), 2, axis=0).T
@@ -141,7 +139,7 @@ def test_corrections_drawn_from_the_posterior_scatter_by_the_claimed_sd(rng):
     tilted[:, [1, 2, 2], [0, 0, 1]] = draws[:, layout.misalignment :]
     M = np.array([[1.0, 0.0, 0.0], [0.1, 1.0, 0.0], [-0.2, 0.15, 1.0]])
     elements = CovarianceMap((0.1, -0.2, 0.15))
-    rows = slow.at(pair, nobody)
+    rows = slow.at(pair, no_shares)
     each = zip(elements.coefficients(rows).T.tolist(), rows[:9].T.reshape(2, 3, 3), strict=True)
     for k, (coefficients, parts) in enumerate(each):
         for axis, (a, b, c) in enumerate(parts):
@@ -168,16 +166,14 @@ def test_corrections_with_random_initial_lag_states_scatter_by_the_claimed_sd(rn
     unit = full_bank(rng)
     correction = Correction(unit)
     lags = correction.memory.lags
-    states = states_of(unit, rng)
-    _, state, shares = states[0]
+    _, state, shares = states_of(unit, rng)[0]
     state = (*state[:RATE], 0.0, *state[RATE + 1 :])
     column, of_start = np.array([state]).T, np.array([shares]).T
     slow = SlowUncertainty(unit, correction).at(column, of_start)
     layout = StateLayout(correction.memory)
     places = [layout.places[lag] for lag in layout.lags]
     draws = rng.multivariate_normal(np.zeros(len(lags)), start_covariance(lags), size=4000)
-    state = np.array(state)
-    moved = np.repeat(state[:, np.newaxis], len(draws), axis=1)
+    moved = np.repeat(np.array(state)[:, np.newaxis], len(draws), axis=1)
     terms = tuple(replace(term, range=(-4000.0, 4000.0)) for term in unit.response)
     wide = replace(unit, response=terms)
     # Columns with squares of lags are nonlinear, so draw initial lag states with 0.05 of their sd.

@@ -157,8 +157,7 @@ def test_every_command_reads_a_bag_with_the_topics_of_the_driver(path, bag, tmp_
         assert len(rows) >= SECONDS * RATE - 1
     if not has_board:
         command = 'replay', bag, '-c', tmp_path / 'warm.yaml', '-o', tmp_path / 'o.csv'
-        error = cli(*command, *topics, code=1).stderr
-        assert 'temperature/board: no such topic' in error
+        assert 'temperature/board: no such topic' in cli(*command, *topics, code=1).stderr
 
 
 def warming_unit():

@@ -10,45 +10,33 @@ from typing import get_args
 import numpy as np
 import pytest
 import yaml
-from builders import term
+from builders import axis_set, calibration, regime_set, term
 
 from thermo_comp.cli.convert import Tool
 from thermo_comp.convert.exchange import export_calibration, import_calibration
 from thermo_comp.convert.tools import TOOLS
 from thermo_comp.errors import CalibrationError
-from thermo_comp.unit.calibration import (
-    Axes,
-    AxisReference,
-    AxisSet,
-    Calibration,
-    RegimeSet,
-    Unit,
-    rate_triad,
-)
+from thermo_comp.unit.calibration import Axes, AxisReference, AxisSet, Unit, rate_triad
 from thermo_comp.unit.functions import CubicSpline, Polynomial
 from thermo_comp.unit.nonlinearity import Nonlinearity, NonlinearTerm
 from thermo_comp.unit.prediction import bias_and_scale, ramp_states
 from thermo_comp.unit.rate_bias import Gyroscope, RateCurve, RateSet
 
-ONE = Polynomial((1.0,))
+
+def axes_of(scale, biases):
+    return Axes(*(AxisReference(scale, bias) for bias in biases))
 
 
 def calibration_of(bias, **change):
-    axes = [AxisSet(function, ONE) for function in bias]
-    regime = RegimeSet((5.0, 45.0), (-2.0, 2.0), *axes)
-    base = Calibration(
-        format_version=2, unit=Unit('7', 'm/s^2', 160.0, 0.005), reference_temperature_c=20.0,
-        gravity_m_s2=9.81,
-        axes=Axes(AxisReference(1.0, 0.1), AxisReference(1.0, -0.2), AxisReference(1.0, 0.3)),
-        static=regime, dynamic=regime, noise_density_m_s2_sqrt_hz=(1e-3, 1e-3, 1e-3),
-    )  # fmt: skip
-    return replace(base, **change)
+    ranges = {'temperature_range_c': (5.0, 45.0), 'rate_range_k_min': (-2.0, 2.0)}
+    regime = regime_set(*map(axis_set, bias), **ranges)
+    keys = {'unit': Unit('7', 'm/s^2', 160.0, 0.005), 'axes': axes_of(1.0, (0.1, -0.2, 0.3))}
+    return calibration(gravity_m_s2=9.81, static=regime, dynamic=regime, **(keys | change))
 
 
 @pytest.fixture
 def cubic():
-    curves = (0.0, 1e-3, 2e-5, -3e-7), (0.0, -2e-3), (0.0, 5e-4, -1e-5)
-    return calibration_of([Polynomial(curve) for curve in curves])
+    return calibration_of([(0.0, 1e-3, 2e-5, -3e-7), (0.0, -2e-3), (0.0, 5e-4, -1e-5)])
 
 
 @pytest.mark.parametrize('to', get_args(Tool))
@@ -79,7 +67,7 @@ def bias_at(calibration, axis, celsius):
     return reference.bias + curves.bias_function.value(t)
 
 
-def test_the_formula_of_px4_gives_the_bias_of_the_calibration(cubic):
+def test_formulas_of_px4_and_ardupilot_give_the_bias_of_the_calibration(cubic):
     p = numbers(export_calibration(cubic, 'px4', number=2, device_id=1376264).text, '\t')
     assert (p['TC_A_ENABLE'], p['TC_A2_ID']) == (1, 1376264)
     assert (p['TC_A2_TMIN'], p['TC_A2_TMAX']) == (5.0, 45.0)
@@ -89,9 +77,6 @@ def test_the_formula_of_px4_gives_the_bias_of_the_calibration(cubic):
             offset = sum(p[f'TC_A2_X{power}_{axis}'] * d**power for power in range(4))
             # A parameter file of PX4 has nine digits, enough for a number of single precision.
             assert offset == pytest.approx(bias_at(cubic, axis, celsius), rel=1e-8, abs=1e-9)
-
-
-def test_ardupilot_files_have_the_bias_changes_of_the_calibration(cubic):
     p = numbers(export_calibration(cubic, 'ardupilot', number=3).text, ',')
 
     def polynomial(axis, celsius):
@@ -117,13 +102,11 @@ def test_the_bias_of_a_gyroscope_is_exported_and_imported(cubic):
     gyroscope = Gyroscope((0.02, -0.01, 0.03), rates, rates, (1e-4,) * 3)
     unit = replace(cubic, gyroscope=gyroscope)
     celsius = np.linspace(*unit.static.temperature_range_c, 7)
-    t = celsius - unit.reference_temperature_c
-    changes = [Polynomial(curve).value(t) for curve in curves]
+    changes = [Polynomial(curve).value(celsius - unit.reference_temperature_c) for curve in curves]
     true = np.array(gyroscope.bias_rad_s) + np.column_stack(changes)
 
     def again(text):
-        imported = import_calibration(text, serial='7')
-        triad = rate_triad(imported)
+        triad = rate_triad(import_calibration(text, serial='7'))
         return bias_and_scale(triad, ramp_states(triad, celsius))[0]
 
     px4 = export_calibration(unit, 'px4')
@@ -152,45 +135,50 @@ def test_the_bias_of_a_gyroscope_is_exported_and_imported(cubic):
     assert 'the bias of the angular rate is lost' in export_calibration(unit, 'kalibr').notes
     with pytest.raises(CalibrationError, match='TC_G0_X3_1: is missing'):
         import_calibration(px4.text.replace('TC_G0_X3_1', 'TC_G0_Y3_1'), serial='7')
+    # WHY: the import failed for an axis whose rate polynomial has no third power.
+    rows = [(1e-3, 0.0, 0.0, 0.0), (2e-3, 1e-4, 0.0, 0.0), (0.0, 1e-4, -2e-6, 3e-8)]
+    lines = [f'TC_G0_X{p}_{axis}={row[p]!r}' for axis, row in enumerate(rows) for p in range(4)]
+    lines += ['TC_G_ENABLE=1', 'TC_G0_TREF=31', 'TC_G0_TMIN=0', 'TC_G0_TMAX=50']
+    text = export_calibration(cubic, 'px4').text + '\n'.join(lines) + '\n'
+    back = import_calibration(text, serial='7')
+    for axis, row in enumerate(rows):
+        curve = back.gyroscope.static.axes()[axis].bias_function
+        for celsius in (5.0, 20.0, 44.0):
+            theirs = sum(c * (celsius - 31.0) ** p for p, c in enumerate(row))
+            ours = back.gyroscope.bias_rad_s[axis] + curve.value(celsius - 20.0)
+            assert ours == pytest.approx(theirs, abs=1e-12)
 
 
-def test_exports_of_counts_and_of_m_s2_to_px4_have_the_offset_in_m_s2(cubic):
-    axes = Axes(*(AxisReference(300.0, 300.0 * bias) for bias in (0.1, -0.2, 0.3)))
-    scaled = []
-    for axis in cubic.static.axes():
-        bias = Polynomial(tuple(300.0 * c for c in axis.bias_function.coefficients))
-        scaled.append(replace(axis, bias_function=bias))
-    regime = RegimeSet((5.0, 45.0), (-2.0, 2.0), *scaled)
-    counts = replace(cubic, unit=Unit('7', 'counts', 32767.0, 0.005), axes=axes)
-    counts = replace(counts, static=regime, dynamic=regime)
+def test_px4_offsets_are_in_m_s2_and_contain_scale_errors_in_a_stated_attitude(cubic):
+    curves = [axis.bias_function.coefficients for axis in cubic.static.axes()]
+    counts = calibration_of(
+        [tuple(300.0 * coefficient for coefficient in curve) for curve in curves],
+        unit=Unit('7', 'counts', 32767.0, 0.005), axes=axes_of(300.0, (30.0, -60.0, 90.0)),
+    )  # fmt: skip
     ours, expected = export_calibration(counts, 'px4'), export_calibration(cubic, 'px4')
     assert any('the driver must divide counts by K' in note for note in ours.notes)
     for name, value in numbers(expected.text, '\t').items():
         assert numbers(ours.text, '\t')[name] == pytest.approx(value, rel=1e-8, abs=1e-12)
     # WHY: PX4 subtracts the offset from readings that it takes as m/s^2. The offset for a stated
     # attitude must contain the effect of the scale error.
-    axes = Axes(*(AxisReference(0.995, bias) for bias in (0.1, -0.2, 0.3)))
-    calibration = replace(cubic, axes=axes)
-    plain = export_calibration(calibration, 'px4')
+    scaled = replace(cubic, axes=axes_of(0.995, (0.1, -0.2, 0.3)))
+    plain = export_calibration(scaled, 'px4')
     for name, value in numbers(expected.text, '\t').items():
         assert numbers(plain.text, '\t')[name] == pytest.approx(value, rel=1e-8, abs=1e-12)
     assert any('constant scale is lost' in n and '5000 ppm' in n for n in plain.notes)
     up = (0.6, 0.0, 0.8)
-    level = numbers(export_calibration(calibration, 'px4', up=up).text, '\t')
+    level = numbers(export_calibration(scaled, 'px4', up=up).text, '\t')
     for axis in range(3):
         # In the attitude `up` at the reference temperature, reading - offset must be gravity.
         d = 20.0 - level['TC_A0_TREF']
         reading = 0.995 * 9.81 * up[axis] + (0.1, -0.2, 0.3)[axis]
         offset = sum(level[f'TC_A0_X{power}_{axis}'] * d**power for power in range(4))
         assert reading - offset == pytest.approx(9.81 * up[axis], abs=1e-7)
-
-
-def test_an_export_for_a_stated_attitude_contains_the_scale_drift(cubic):
     drifting = replace(cubic.static.z, scale_function=Polynomial((1.0, 1e-4)))
     regime = replace(cubic.static, z=drifting)
-    calibration = replace(cubic, static=regime, dynamic=regime)
-    plain = export_calibration(calibration, 'px4')
-    level = export_calibration(calibration, 'px4', up=(0.0, 0.0, 1.0))
+    bent = replace(cubic, static=regime, dynamic=regime)
+    plain = export_calibration(bent, 'px4')
+    level = export_calibration(bent, 'px4', up=(0.0, 0.0, 1.0))
     lost = re.compile(r'scale over temperature is lost: up to 2[45]\d\d ppm')
     assert any(map(lost.search, plain.notes))
     # If z measures +g, a scale drift of 100 ppm/K is an offset drift of 9.81e-4 m/s^2 per K.
@@ -201,16 +189,16 @@ def test_an_export_for_a_stated_attitude_contains_the_scale_drift(cubic):
 
 def test_losses_of_an_export_are_noted(cubic):
     spline = CubicSpline((-15.0, 0.0, 10.0, 25.0), (0.01, 0.0, 0.02, -0.01))
-    static = replace(cubic.static, x=AxisSet(spline, ONE))
+    static = replace(cubic.static, x=AxisSet(spline, Polynomial((1.0,))))
     dynamic = replace(static, y=replace(static.y, delta=0.1))
     square = NonlinearTerm('square', (1e-5,) * 3, (0.0,) * 3, 1e-4)
-    calibration = replace(
+    lossy = replace(
         cubic, static=static, dynamic=dynamic,
         response=(term('gradient', (0.0, 1e-3, 0.0)), term('board', tau_s=60.0)),
         misalignment=((1.0, 0.0, 0.0), (1e-3, 1.0, 0.0), (0.0, 0.0, 1.0)),
         nonlinearity=Nonlinearity((9.81, 20.0), 1e-4, (square,)),
     )  # fmt: skip
-    text = export_calibration(calibration, 'ardupilot')
+    text = export_calibration(lossy, 'ardupilot')
     for expected in (
         *('cubics replace', '1000 urad', 'response is lost (gradient): '),
         *('dynamic coefficients are lost', 'the terms nonlinear in specific force are lost'),
@@ -262,7 +250,7 @@ def tumbled():
     constants = (373.0, 32800.0), (381.0, 32650.0), (369.0, 32790.0)
     axes, unit = Axes(*starmap(AxisReference, constants)), Unit('7', 'counts', 65536.0, 0.01)
     M = (1.0, 0.0, 0.0), (0.02, 1.0, 0.0), (-0.03, 0.05, 1.0)
-    return calibration_of([Polynomial((0.0,))] * 3, unit=unit, axes=axes, misalignment=M)
+    return calibration_of([(0.0,)] * 3, unit=unit, axes=axes, misalignment=M)
 
 
 def ours(calibration, raw):
@@ -283,7 +271,7 @@ def turn(notes):
 RAW = np.array([[36400.0, 33100.0, 33300.0], [32500.0, 29000.0, 32000.0], [1.0, 65535.0, 30000.0]])
 
 
-def test_the_formula_of_imu_tk_gives_the_correction_of_the_calibration(tumbled):
+def test_formulas_of_imu_tk_imu_calib_and_kalibr_give_the_correction_of_the_calibration(tumbled):
     # A file of imu_tk has 9 numbers of T, 9 of K and 3 of B for the formula X' = T K (X - B).
     file = export_calibration(tumbled, 'imu_tk')
     numbers = [float(cell) for cell in file.text.split()]
@@ -296,9 +284,6 @@ def test_the_formula_of_imu_tk_gives_the_correction_of_the_calibration(tumbled):
     np.testing.assert_allclose(theirs, ours(tumbled, RAW) @ turn(file.notes).T, atol=1e-4)
     norms, expected = (np.linalg.norm(force, axis=1) for force in (theirs, ours(tumbled, RAW)))
     np.testing.assert_allclose(norms, expected, rtol=1e-12)
-
-
-def test_formulas_of_imu_calib_and_kalibr_give_the_correction_of_the_calibration(tumbled):
     data = yaml.safe_load(export_calibration(tumbled, 'imu_calib').text)
     theirs = RAW @ np.reshape(data['SM'], (3, 3)).T - data['bias']
     np.testing.assert_allclose(theirs, ours(tumbled, RAW), rtol=1e-10)
@@ -333,8 +318,7 @@ def test_imported_matrices_become_a_triangular_matrix_and_a_rotation():
     x = (RAW - [33124.2, 33275.2, 32364.4]) * [0.00241278, 0.00242712, 0.00241168]
     theirs = x @ np.array([[1.0, -0.00354989, -0.00890444], [0.0, 1.0, -0.0213032],
                            [0.0, 0.0, 1.0]]).T  # fmt: skip
-    rotation = turn(back.provenance.notes)
-    np.testing.assert_allclose(ours(back, RAW) @ rotation.T, theirs, atol=1e-4)
+    np.testing.assert_allclose(ours(back, RAW) @ turn(back.provenance.notes).T, theirs, atol=1e-4)
     SM = np.array([[1.02, 0.03, -0.01], [-0.02, 0.99, 0.02], [0.01, -0.03, 1.01]])
     text = f'SM: {SM.ravel().tolist()}\nbias: [0.12, -0.05, 0.2]\n'
     back = import_calibration(text, serial='7')
@@ -353,7 +337,7 @@ def test_kalibr_files_without_bias_with_rates_and_with_several_imus_are_read():
     np.testing.assert_allclose(ours(back, np.array([[1.01, 1.99, 3.06]])), [[1, 2, 3]], rtol=1e-12)
     with pytest.raises(CalibrationError, match='an IMU with --number: the file has imu0, imu1'):
         import_calibration(f'imu0:\n{imu}imu1:\n{imu}', serial='7')
-    # WHY: the calibration of a file with 400 Hz had 200 Hz, at which the node drops samples.
+    # WHY: for a file with 400 Hz the calibration had 200 Hz, so the node dropped samples.
     imu = 'imu0:\n  accelerometers:\n    M: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n'
     text = f'{imu}  update_rate: 400.0\n  accelerometer_noise_density: 0.0025\n'
     back = import_calibration(text, serial='7')
@@ -362,18 +346,3 @@ def test_kalibr_files_without_bias_with_rates_and_with_several_imus_are_read():
     assert import_calibration(imu, serial='7').unit.cycle_time_s == 0.005
     with pytest.raises(CalibrationError, match=r'imu0\.update_rate: must be 0 or more'):
         import_calibration(f'{imu}  update_rate: -1\n', serial='7')
-
-
-def test_px4_rate_polynomials_of_different_degree_are_imported(cubic):
-    # WHY: the import failed for an axis whose rate polynomial has no third power.
-    rows = [(1e-3, 0.0, 0.0, 0.0), (2e-3, 1e-4, 0.0, 0.0), (0.0, 1e-4, -2e-6, 3e-8)]
-    lines = [f'TC_G0_X{p}_{axis}={row[p]!r}' for axis, row in enumerate(rows) for p in range(4)]
-    lines += ['TC_G_ENABLE=1', 'TC_G0_TREF=31', 'TC_G0_TMIN=0', 'TC_G0_TMAX=50']
-    text = export_calibration(cubic, 'px4').text + '\n'.join(lines) + '\n'
-    back = import_calibration(text, serial='7')
-    for axis, row in enumerate(rows):
-        curve = back.gyroscope.static.axes()[axis].bias_function
-        for celsius in (5.0, 20.0, 44.0):
-            theirs = sum(c * (celsius - 31.0) ** p for p, c in enumerate(row))
-            ours = back.gyroscope.bias_rad_s[axis] + curve.value(celsius - 20.0)
-            assert ours == pytest.approx(theirs, abs=1e-12)

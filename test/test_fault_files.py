@@ -42,8 +42,7 @@ def folder(tmp_path):
 @pytest.mark.parametrize('name', COMMANDS)
 def test_a_command_on_a_full_disk_fails_in_one_line(small_disk, folder, cli, name):
     output = small_disk / name
-    finished = cli(*COMMANDS[name], output, code=1, cwd=folder)
-    (line,) = finished.stderr.strip().splitlines()[-1:]
+    (line,) = cli(*COMMANDS[name], output, code=1, cwd=folder).stderr.strip().splitlines()[-1:]
     assert line.startswith('thermo_comp: error: ')
     assert str(output) in line
     assert line.endswith('No space left on device')
@@ -71,8 +70,7 @@ def test_a_recording_on_a_full_disk_keeps_what_was_written(small_disk, cli):
     with BagWriter(bag) as writer:
         writer.write_counts('accel/counts', stamps, samples)
     options = ('--positions', '1', '--soak', '30min', '-o', small_disk)
-    finished = cli('record', bag, *options, '-q', code=1)
-    (line,) = finished.stderr.strip().splitlines()
+    (line,) = cli('record', bag, *options, '-q', code=1).stderr.strip().splitlines()
     reason = 'cannot be written: No space left on device; the part written is in'
     match = re.fullmatch(rf'thermo_comp: error: {small_disk}/01.mcap: {reason} (\S+)', line)
     assert match, line
@@ -117,10 +115,12 @@ sys.exit(main())
 """
 
 
-def run(script, *arguments, cwd):
-    command = [sys.executable, '-c', script, *arguments]
+def killed_replay(script, point, name, folder):
+    """Run a script that replays the bag HELD_OUT into `folder`/`name` and kills itself."""
+    arguments = [str(word) for word in COMMANDS['bag.mcap']]
+    command = [sys.executable, '-c', script, point, name, *arguments, name]
     environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
-    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, check=False)
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, check=False)
 
 
 @pytest.mark.parametrize('point', ['before', 'writing'])
@@ -128,8 +128,7 @@ def test_a_killed_command_leaves_the_old_file(folder, point):
     output = folder / 'bag.mcap'
     output.write_bytes(b'\x89MCAP old')
     listed = set(folder.iterdir())
-    arguments = [str(word) for word in COMMANDS['bag.mcap']]
-    killed = run(KILLED, point, output.name, *arguments, output.name, cwd=folder)
+    killed = killed_replay(KILLED, point, output.name, folder)
     assert killed.returncode == -signal.SIGKILL, killed.stderr
     assert output.read_bytes() == b'\x89MCAP old'
     (rest,) = set(folder.iterdir()) - listed
@@ -143,8 +142,6 @@ def test_a_killed_command_leaves_the_old_file(folder, point):
 def test_a_command_ended_by_sigterm_leaves_no_file(folder, name):
     # WHY: a command that was ended by SIGTERM left a hidden file as large as the bag.
     listed = set(folder.iterdir())
-    arguments = [str(word) for word in COMMANDS['bag.mcap']]
-    script = KILLED.replace('SIGKILL', 'SIGTERM')
-    ended = run(script, 'writing', name, *arguments, name, cwd=folder)
+    ended = killed_replay(KILLED.replace('SIGKILL', 'SIGTERM'), 'writing', name, folder)
     assert (ended.returncode, ended.stderr) == (143, b'')
     assert set(folder.iterdir()) == listed

@@ -12,20 +12,18 @@ from conftest import ROOT
 from fault_rows import ROWS
 
 PAGE = ROOT / 'docs' / 'faults.md'
-SIGMAS = 5.0
+
+
+def both(fault, *span_and_change):
+    return rig.chain(*(fault(name, *span_and_change) for name in ('board', 'case')))
 
 
 @pytest.mark.parametrize(
     'inject',
     [
-        rig.chain(rig.stop('board', 64.0, 84.0), rig.stop('case', 64.0, 84.0)),
-        rig.chain(rig.stop('board', 76.0, 96.0), rig.stop('case', 76.0, 96.0)),
-        rig.chain(rig.frozen('board', 112.0, 115.0), rig.frozen('case', 112.0, 115.0)),
+        *(both(rig.stop, 64.0, 84.0), both(rig.stop, 76.0, 96.0), both(rig.frozen, 112.0, 115.0)),
         rig.value('case', 44.0, 64.0, lambda v: v + 5.0),
-        rig.chain(
-            rig.value('board', 68.0, 88.0, lambda v: v + 5.0),
-            rig.value('case', 68.0, 88.0, lambda v: v + 5.0),
-        ),
+        both(rig.value, 68.0, 88.0, lambda v: v + 5.0),
     ],
     ids=['both stop early', 'both stop later', 'both freeze', 'case steps', 'both step'],
 )
@@ -34,8 +32,8 @@ def test_every_published_error_is_below_five_claimed_sd(inject):
     seconds = (stamps - rig.START_NS) * 1e-9
     sd = np.sqrt(table[:, [3, 6, 8]])
     off = (np.abs(table[:, :3] - rig.force_at(seconds)) / sd).max(axis=1)
-    assert seconds[off > SIGMAS].tolist() == []
-    # Before a fault the published sd must be small: it must not always be as large as for a fault.
+    assert seconds[off > rig.SIGMAS].tolist() == []
+    # The published sd covers a fault only while the fault lasts: before the fault it is small.
     assert sd[450:540].max() < 3e-4
 
 
@@ -47,7 +45,7 @@ def settling_s():
 
 
 def ended_s(row):
-    """Return the time [s] from which a row's messages equal the messages without the fault."""
+    """Return the time [s] from which the messages of a fault row equal those without the fault."""
     at, _ = row.shift
     if math.isfinite(at):
         return at

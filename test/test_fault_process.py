@@ -15,13 +15,12 @@ pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 
 import soak
 from fault_bench import bench
-from fault_rig import RATE_HZ, START_NS, bag, corrected, force_at, seconds_of, unit
+from fault_rig import RATE_HZ, SIGMAS, START_NS, bag, corrected, ratios_to_sd, seconds_of, unit
 from node_process import OVER_UDP
 
 from thermo_comp.unit.calibration import Unit
 from thermo_comp.unit.calibration_file import SIZE_LIMIT, dump_calibration, save_calibration
 
-SIGMAS = 5.0
 SLOW = pytest.mark.slow
 
 
@@ -38,9 +37,9 @@ def node(path):
 
 
 def sigmas(heard):
+    """Return the largest error of the received forces divided by its claimed sd."""
     seconds = (heard.stamp_ns - START_NS) * 1e-9
-    sd = np.sqrt(np.diagonal(heard.covariance, axis1=1, axis2=2))
-    return float((np.abs(heard.force - force_at(seconds)) / sd).max())
+    return ratios_to_sd(heard.force, heard.covariance, seconds).max()
 
 
 def test_a_restarted_publisher_changes_no_output(node):
@@ -66,8 +65,7 @@ def test_a_node_killed_in_a_ramp_restarts_with_larger_covariance(path):
         node.is_ended = True
     with bench(path) as node:
         first = node.play([e for e in events if 90.0 <= seconds_of(e[1]) < 91.0])
-        assert first.values['regime'] == 'unknown'
-        assert first.values['memory settled'] == 'False'
+        assert (first.values['regime'], first.values['memory settled']) == ('unknown', 'False')
         rest = node.play([e for e in events if seconds_of(e[1]) >= 91.0])
     n = len(first.force)
     # Unknown lag states after a start make the covariance larger than without a restart.
@@ -156,8 +154,7 @@ def test_bad_calibration_files_leave_the_running_calibration(path, tmp_path):
 @pytest.mark.slow
 def test_many_reloads_at_1_khz_lose_no_sample(tmp_path):
     path = tmp_path / 'fast.yaml'
-    fast = unit(unit=Unit('F-1', 'counts', 8388607.0, 1e-3))
-    save_calibration(fast, path)
+    save_calibration(unit(unit=Unit('F-1', 'counts', 8388607.0, 1e-3)), path)
     # Sending ends at the answer to the last reload, before all 60 s of samples have been sent.
     events = bag(rate_hz=1000.0, duration_s=60.0)
     n_reloads = 100
@@ -188,10 +185,8 @@ def test_many_reloads_at_1_khz_lose_no_sample(tmp_path):
     assert len(answers) >= n_reloads
     assert all(answers)
     assert len(heard.force) == n_samples
-    seconds = (heard.stamp_ns - START_NS) * 1e-9
-    sd = np.sqrt(np.diagonal(heard.covariance, axis1=1, axis2=2))
     # By noise one sample in a million exceeds 5 sd; there are many samples, so the limit is 6 sd.
-    assert (np.abs(heard.force - force_at(seconds)) < (SIGMAS + 1.0) * sd).all()
+    assert sigmas(heard) < SIGMAS + 1.0
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, pytest.param(signal.SIGTERM, marks=SLOW)])

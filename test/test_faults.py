@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 
 from fault_bench import Heard, bench, lots
-from fault_rig import CONFIG, bag, corrected, force_at, unit
+from fault_rig import CONFIG, SIGMAS, bag, corrected, ratios_to_sd, unit
 from fault_rows import ROWS, true_seconds
 
 from thermo_comp.online.compensator import Compensator
@@ -21,8 +21,6 @@ from thermo_comp.ros.diagnostics import findings_of
 from thermo_comp.ros.reader import LoadedCalibration
 from thermo_comp.unit.calibration_file import save_calibration
 
-#: A published force is wrong if its error exceeds this number of published standard deviations.
-SIGMAS = 5.0
 #: After recovery the output differs from the undisturbed output by at most 1 ug [m/s^2].
 RECOVERED = 9.80665e-6
 #: Rows of the fault table that are also tested over DDS: they depend on the order of messages.
@@ -73,7 +71,7 @@ class Direct:
 
 @cache
 def undisturbed():
-    """Return the groups of messages of the undisturbed bag, each with the `Direct` before it."""
+    """Return the groups of messages of the bag without a fault, each with the state before it."""
     run, result = Direct(), []
     for lot in (*lots(bag()), []):
         result.append((lot, deepcopy(run)))
@@ -95,8 +93,7 @@ def direct(events):
 def wrong(row, heard):
     """Return times of wrong samples outside `blind`, the span in which a fault is undetectable."""
     seconds = true_seconds(row, heard.stamp_ns)
-    sd = np.sqrt(np.diagonal(heard.covariance, axis1=1, axis2=2))
-    is_wrong = (np.abs(heard.force - force_at(seconds)) > SIGMAS * sd).any(axis=1)
+    is_wrong = (ratios_to_sd(heard.force, heard.covariance, seconds) > SIGMAS).any(axis=1)
     begin, end = row.blind
     return seconds[is_wrong & ~((begin <= seconds) & (seconds < end))]
 

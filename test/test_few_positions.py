@@ -22,16 +22,9 @@ BAGS = Path(__file__).parent.parent / 'bags'
 MICRO_G = 9.80665e-6
 
 
-def minutes(values):
-    """Return means over 60 s [ug] of values [m/s^2] at 1/4 Hz, without the rows with NaN."""
-    values = values[~np.isnan(values).any(axis=1)]
-    n = len(values) // 15
-    return values[: 15 * n].reshape(n, 15, 3).mean(axis=1) / MICRO_G
-
-
-def left_by(pair, **options):
-    """Fit two positions; return the sd of corrected minute means in a third position [ug]."""
-    bags = [BAGS / f'fit/0{number}.mcap' for number in pair]
+def left_by(**options):
+    """Fit two positions; return the sd of corrected means over 60 s in a third position [ug]."""
+    bags = [BAGS / f'fit/0{number}.mcap' for number in (1, 2)]
     calibration = tc.fit(bags, gravity=9.80665, **options)
     held_out = tc.read(BAGS / 'held_out.mcap')
     # Average samples and times over 4 s: this saves time and does not change means over 60 s.
@@ -42,22 +35,26 @@ def left_by(pair, **options):
     # A fit to two positions is uncertain by > 1 mg (sd of an axis) in a third position.
     sd = np.sqrt(np.nanmedian(np.einsum('nii->ni', corrected.covariance), axis=0))
     assert (sd > 1000.0 * MICRO_G).any()
-    return np.asarray(minutes(corrected.specific_force).std(axis=0))
+    # Each corrected sample is a mean over 4 s, so 15 of them are a minute.
+    force = corrected.specific_force[np.isfinite(corrected.specific_force).all(axis=1)]
+    minutes = force[: len(force) // 15 * 15].reshape(-1, 15, 3).mean(axis=1)
+    return minutes.std(axis=0) / MICRO_G
 
 
 @pytest.mark.slow
 def test_two_positions_determine_the_thermal_response():
     # Noise of 9 ug/sqrt(Hz) is 1.2 ug in means over 60 s; 128 means determine this sd to 6 %, and
     # superfluous columns of a fit may increase it by 10 %.
-    assert left_by((1, 2)) == pytest.approx([1.2] * 3, rel=0.3)
+    assert left_by() == pytest.approx([1.2] * 3, rel=0.3)
     # A model without lags leaves a drift in the third position.
-    assert (left_by((1, 2), model='golovach') > 10.0).all()
+    assert (left_by(model='golovach') > 10.0).all()
 
 
 OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2')
 UP = np.array([0.48, -0.6, 0.64])
 FACES = np.vstack((np.eye(3), -np.eye(3)))
 SLOPE = np.array([1.0, -0.5, 2.0])
+SOAK_SLOPE = 0.1 * MG * SLOPE  # [m/s^2/K]
 
 
 @pytest.fixture(scope='module')
@@ -69,15 +66,14 @@ def one_position():
 
 
 def turned(rng, ups, rest_s=20.0):
-    """Record a triad with bias (0.1, -0.2, 0.3) m/s^2; after each rest it moves for 1 s."""
+    """Record rests of a triad with biases of (0.1, -0.2, 0.3) m/s^2, each before 1 s of motion."""
     n = round(100 * rest_s)
     parts = []
     for up in ups:
         still = GRAVITY * up + (0.1, -0.2, 0.3) + 0.02 * rng.standard_normal((n, 3))
         parts += [still, GRAVITY * rng.standard_normal((100, 3))]
     accel = np.concatenate(parts)
-    stamp_ns = START_NS + np.arange(len(accel)) * 10_000_000
-    return source_of(stamp_ns, accel, name='turned')
+    return source_of(START_NS + np.arange(len(accel)) * 10_000_000, accel, name='turned')
 
 
 @cache
@@ -101,6 +97,23 @@ def ratios_of(calibration, low, high, slopes):
 
 def findings_of(result):
     return {finding.name: finding.message for finding in result.findings}
+
+
+def soaks(rng, ups, share=0.0, turn_on=0.0, fall=-1.0):
+    """
+    Record rests at 5, 20 and 35 degC in the directions `ups`: the board warms up by -`fall` [K].
+    The bias follows the soak temperature by SOAK_SLOPE, and the warm-up by `share` of this slope;
+    each rest has a bias offset with an sd of `turn_on` [m/s^2].
+    """
+    bags = []
+    for celsius in (5.0, 20.0, 35.0):
+        for up in ups:
+            rest = Rest(rng, level=tuple(GRAVITY * up), sd=0.1 * MG, warm=celsius, fall=fall)
+            warm_up = rest.temperature(rest.time) - celsius
+            rest.accel += np.outer(celsius - 20.0 + share * warm_up, SOAK_SLOPE)
+            rest.accel += rng.normal(0.0, turn_on, 3) if turn_on else 0.0
+            bags.append(rest.source(name=f'{len(bags)}'))
+    return bags
 
 
 def test_one_position_gives_bias_over_temperature_and_leaves_the_scale_at_its_prior(one_position):
@@ -135,31 +148,19 @@ def test_a_full_scale_that_the_bags_do_not_show_is_named(one_position):
 
 def test_after_soaks_in_one_position_the_drift_error_is_within_three_claimed_sd(rng):
     # WHY: in one attitude |f| does not separate bias and scale; a wrong bias slope had an sd of 0.
-    slope = 0.1 * SLOPE
-    bags = []
-    for celsius in (5.0, 20.0, 35.0):
-        rest = Rest(rng, level=tuple(GRAVITY * UP), sd=0.1 * MG, warm=celsius, fall=0.0)
-        rest.accel += (celsius - 20.0) * MG * slope
-        bags.append(rest.source(name=f'{celsius:g}'))
-    pulls = ratios_of(fit(bags, OPTIONS).calibration, 5.0, 15.0, MG * slope)
-    assert (pulls < 3.0).all()
+    calibration = fit(soaks(rng, [UP], fall=0.0), OPTIONS).calibration
+    assert (ratios_of(calibration, 5.0, 15.0, SOAK_SLOPE) < 3.0).all()
 
 
 @pytest.mark.slow
 def test_rests_at_three_temperatures_give_the_bias_slope_despite_a_warm_up_of_the_board(rng):
     # WHY: as the bias did not change while the board warmed up, the fit found a bias slope of 0.
-    bags = []
-    for celsius in (5.0, 20.0, 35.0):
-        for up in positions(8, 3):
-            rest = Rest(rng, level=tuple(GRAVITY * up), sd=0.1 * MG, warm=celsius, fall=-1.0)
-            rest.accel += (celsius - 20.0) * 0.1 * MG * SLOPE
-            bags.append(rest.source(name=f'{len(bags)}'))
-    result = fit(bags, OPTIONS)
+    result = fit(soaks(rng, positions(8, 3)), OPTIONS)
     calibration, at = result.calibration, np.array([6.0, 36.0])
     curves = [axis.bias_function for axis in calibration.static.axes()]
     slopes = np.array([np.diff(curve.value(at))[0] / 30.0 for curve in curves])
     # |f| of a rest has a noise of 1 ug; its temperature is uncertain by 0.1 K due to the warm-up.
-    np.testing.assert_allclose(slopes, 0.1 * MG * SLOPE, atol=0.002 * MG)
+    np.testing.assert_allclose(slopes, SOAK_SLOPE, atol=0.002 * MG)
     assert 'misfit' not in findings_of(result)
     # Soaks do not determine the weights of lags, which may be as large as the bias slope: the root
     # of their summed variances is 0.5 to 1 times the bias slope.
@@ -171,17 +172,9 @@ def test_rests_at_three_temperatures_give_the_bias_slope_despite_a_warm_up_of_th
 @pytest.mark.slow
 def test_the_drift_error_of_a_sensor_that_follows_half_of_a_warm_up_is_within_three_claimed_sd():
     # WHY: a curve fitted to the drifts within rests was wrong by 7 claimed sd over the range.
-    rng, slopes, bags = np.random.default_rng(2), 0.1 * MG * SLOPE, []
-    for celsius in (5.0, 20.0, 35.0):
-        for up in positions(6, 3):
-            rest = Rest(rng, level=tuple(GRAVITY * up), sd=0.1 * MG, warm=celsius, fall=-1.0)
-            warm_up = rest.temperature(rest.time) - celsius
-            rest.accel += np.outer(celsius - 20.0 + 0.5 * warm_up, slopes)
-            # With turn-on offsets of 0.1 mg only the drifts within the rests determine the curve.
-            rest.accel += rng.normal(0.0, 0.1 * MG, 3)
-            bags.append(rest.source(name=f'{len(bags)}'))
-    pulls = ratios_of(fit(bags, OPTIONS).calibration, -15.0, 15.0, slopes)
-    assert (pulls < 3.0).all()
+    # With turn-on offsets of 0.1 mg only the drifts within the rests determine the curve.
+    bags = soaks(np.random.default_rng(2), positions(6, 3), share=0.5, turn_on=0.1 * MG)
+    assert (ratios_of(fit(bags, OPTIONS).calibration, -15.0, 15.0, SOAK_SLOPE) < 3.0).all()
 
 
 def test_tilts_of_two_supports_are_not_taken_for_a_scale_slope_of_a_level_axis(rng):
@@ -196,8 +189,7 @@ def test_tilts_of_two_supports_are_not_taken_for_a_scale_slope_of_a_level_axis(r
     at = np.array([0.0, 10.0])
     # 15000 samples (noise 0.1 mg) determine the mean bias slope of the two rests to 1 ug/K.
     assert np.diff(z.bias_function.value(at))[0] == pytest.approx(MG, abs=0.01 * MG)
-    # At 0.03 g a drift error of 1 ug/K is a scale slope of 33 ppm/K; the errors of two rests give
-    # sqrt(2) * 33 = 47 ppm/K.
+    # At 0.03 g drift errors of 1 ug/K in two rests are a scale slope of sqrt(2) * 33 = 47 ppm/K.
     assert abs(np.diff(z.scale_function.value(at))[0]) < 10.0 * 47e-6
 
 
@@ -221,7 +213,7 @@ def test_positions_without_a_thermometer_give_constants_and_wide_temperature_slo
     out = calibration.correct([1.0], [[0.1, -0.2, GRAVITY + 0.3]])
     np.testing.assert_allclose(out.specific_force, [[0.0, 0.0, GRAVITY]], atol=0.02)
     left = np.array([0.05, 0.05, np.hypot(0.05, 2e-3 * GRAVITY)])
-    # `left` [m/s^2]: effect of the unknown temperature: its sd, 10 K, times sd of the slopes.
+    # `left` [m/s^2]: sd of the unknown temperature, 10 K, times the sd of the temperature slopes.
     sd = np.sqrt(np.diagonal(out.covariance[0]))
     np.testing.assert_allclose(sd, np.hypot(left, 0.02), rtol=0.05)
 
@@ -281,9 +273,8 @@ def test_the_claimed_variance_of_a_curve_contains_that_of_turn_ons_at_each_tempe
     unit = tc.fit(bags, gravity=GRAVITY, input='m/s^2', mounting_sd=turn_on)
     for bag in (bags[0], bags[2]):
         out = unit.correct(bag.time_s, bag.counts, board=bag.temperatures['board'])
-        # If turn-ons have variance V, a line through three temperatures has a variance of 5/6 V at
-        # its ends, a parabola V; the next turn-on adds V, nine mountings V/3 for bias, V/3 for
-        # scale.
+        # V: variance of a turn-on. At its ends a line through three temperatures has the variance
+        # 5/6 V, a parabola V. The next turn-on adds V; nine mountings add V/3 (bias), V/3 (scale).
         variance = np.diagonal(out.covariance[-dwell:].mean(axis=0)) - 1e-3**2
         assert ((1.0 + 5.0 / 6.0) * turn_on**2 < variance).all()
         assert (variance < (1.0 + 1.0 + 2.0 / 3.0) * turn_on**2).all()
@@ -314,8 +305,7 @@ def test_two_bags_without_a_pause_between_them_count_as_one_turn_on(rng):
     source = turned(rng, positions(9, 3))
     whole = tumbled(9)
     parts, others = (fit(cut(source, 9400, pause_s), OPTIONS) for pause_s in (0.0, 60.0))
-    n_turn_ons = [done.fit.windows.data.n_turn_ons for done in (whole, parts, others)]
-    assert n_turn_ons == [1, 1, 2]
+    assert [done.fit.windows.data.n_turn_ons for done in (whole, parts, others)] == [1, 1, 2]
     n_mountings = [len(done.fit.selected.score.norms.square) for done in (whole, parts, others)]
     assert n_mountings == [9, 9, 10]
     sd, sd_cut = (done.calibration.static.x.residual_sd_m_s2 for done in (whole, parts))
@@ -456,5 +446,4 @@ def test_rests_of_5_s_determine_the_white_noise_which_is_never_0(rng):
     np.testing.assert_allclose(calibration.noise_density_m_s2_sqrt_hz, 0.002, rtol=0.3)
     rest = Rest(rng)
     rest.accel[:] = GRAVITY * UP
-    noise = fit([rest.source()], OPTIONS).calibration.noise_density_m_s2_sqrt_hz
-    assert min(noise) > 0.0
+    assert min(fit([rest.source()], OPTIONS).calibration.noise_density_m_s2_sqrt_hz) > 0.0

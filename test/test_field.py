@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from builders import rich_calibration
 from conftest import ROOT, parsed
-from field_helpers import in_any_attitude, jump_of, known, no_error, rests, upright, write_log
+from field_helpers import in_any_attitude, jump_of, no_error, precise, rests, upright, write_log
 
 from thermo_comp.errors import FitError
 from thermo_comp.field.ageing import Ageing, Model, learn, rows_of, solve
@@ -35,7 +35,7 @@ def test_derivatives_of_a_rest_by_all_parameters_agree_with_finite_differences()
     layout = parameter_layout(unit)
     levels = {level for block in layout.scale for level in (block.static, block.dynamic)}
     levels |= {block.static for block in layout.bias}
-    # Every second parameter tests each kind in bias or scale, as both have odd numbers of them.
+    # Every second parameter: as blocks have odd lengths, each kind is tested in bias or in scale.
     for k in range(0, layout.n_parameters, 2):
         step = 1e-7
         moved = values.copy()
@@ -48,10 +48,8 @@ def test_derivatives_of_a_rest_by_all_parameters_agree_with_finite_differences()
     for axis, block in enumerate(layout.scale):
         factor = np.where(np.arange(3) == axis, 1.0 + 1e-6, 1.0)
         changed = with_parameters(unit, scale * factor, values, covariance)
-        residual = series_of(logged, changed).residual
-        slope = (series.residual - residual) / 1e-6
-        by_level = series.by_level[:, axis + 3] * unit.gravity_m_s2
-        assert np.allclose(slope, by_level, atol=1e-4)
+        slope = (series.residual - series_of(logged, changed).residual) / 1e-6
+        assert np.allclose(slope, series.by_level[:, axis + 3] * unit.gravity_m_s2, atol=1e-4)
         both = series.by_parameter[:, [block.static, block.dynamic]].sum(axis=1)
         # A relative change of K changes |f| like an equal change of both regimes' scale levels.
         assert np.allclose(slope, both, atol=0.02 * abs(slope).max())
@@ -97,8 +95,7 @@ def test_updates_of_ageing_units_have_small_errors_of_at_most_1_4_claimed_sd_rms
     # Units in level and in carried platforms age by random walks, turn-on offsets and one shock.
     squares, ratios = [], []
     for kind, seed in (('level', 1), ('level', 2), ('level', 4), ('carried', 1)):
-        process = field_units.Process(shock_day=11.5)
-        history = field_units.live(kind, seed, 30, process)
+        history = field_units.live(kind, seed, 30, field_units.Process(shock_day=11.5))
         unit = field_units.calibration()
         updated = update(series_of(history.rests, unit), unit)
         assert updated.judged.is_better
@@ -126,12 +123,11 @@ def test_updates_of_ageing_units_have_small_errors_of_at_most_1_4_claimed_sd_rms
 
 
 def test_an_update_does_not_change_the_constants_of_axes_that_no_rest_observes():
-    unit = known()
+    unit = precise()
     updated = update(series_of(rests(unit, upright, jump_of(300.0, 10.0)), unit), unit)
     new = updated.calibration
     assert [axis.is_determined for axis in updated.axis_changes] == [False, False, True]
-    assert new.axes.x == unit.axes.x
-    assert new.axes.y == unit.axes.y
+    assert (new.axes.x, new.axes.y) == (unit.axes.x, unit.axes.y)
     assert new.axes.z != unit.axes.z
     # In one attitude a shock of the bias and a change of gravity cause equal changes of |f| - g.
     assert [change.may_be_gravity for change in updated.changes] == [True]
@@ -143,7 +139,7 @@ def test_an_update_does_not_change_the_constants_of_axes_that_no_rest_observes()
 
 
 def test_a_jump_is_distinguished_from_ageing(rng):
-    unit = known()
+    unit = precise()
     jumped = update(series_of(rests(unit, upright, jump_of(300.0, 10.0)), unit), unit)
     (change,) = jumped.changes
     first = series_of(rests(unit, upright, no_error), unit).time[0]
@@ -153,13 +149,12 @@ def test_a_jump_is_distinguished_from_ageing(rng):
     walked = np.cumsum(steps, axis=0)
     aged = update(series_of(rests(unit, upright, lambda d: walked[round(3 * d)], 30), unit), unit)
     assert aged.changes == ()
-    along = np.hypot(aged.ageing.bias, aged.ageing.scale)
-    assert along == pytest.approx(60.0 * MICRO_G, rel=0.4)
+    assert np.hypot(aged.ageing.bias, aged.ageing.scale) == pytest.approx(60.0 * MICRO_G, rel=0.4)
 
 
 def test_the_sd_of_an_old_calibration_aged_to_the_last_rest_includes_the_random_walk(rng):
     # After 30 days a random walk of 60 ug per root day has an sd of 329 ug.
-    unit = known()
+    unit = precise()
     walk = np.cumsum(60.0 / np.sqrt(3.0) * MICRO_G * rng.standard_normal((90, 3)), axis=0)
     logged = rests(unit, upright, lambda day: walk[round(3 * day)], 30)
     x, y, z = update(series_of(logged, unit), unit).axis_changes
@@ -240,7 +235,7 @@ def on_z(rest, counts):
 def test_a_changed_curve_is_corrected_and_the_sd_of_an_unobserved_slope_grows():
     # The slope of the z bias changes by 5 ug/K; the rests are at 15 to 25 degC.
     curved = field_units.calibration()
-    unit = known(static=curved.static, dynamic=curved.dynamic)
+    unit = precise(static=curved.static, dynamic=curved.dynamic)
     logged = rests(unit, upright, no_error, days=30)
     bent = [(s, on_z(r, 300.0 * 5 * MICRO_G * (r.state[0] - 20.0))) for s, r in logged]
     result = update(series_of(bent, unit), unit)
@@ -258,10 +253,9 @@ def test_a_changed_curve_is_corrected_and_the_sd_of_an_unobserved_slope_grows():
 
 
 def test_a_contradicting_turn_on_is_left_out_and_stamps_may_be_in_wrong_order(rng):
-    unit = known()
+    unit = precise()
     logged = rests(unit, upright, jump_of(100.0, 8.0), days=15)
-    wrong = logged[80][0]
-    bad = [(s, on_z(r, 300.0 * 0.02) if s == wrong else r) for s, r in logged]
+    bad = [(s, on_z(r, 300.0 * 0.02) if s == logged[80][0] else r) for s, r in logged]
     result = update(series_of(bad, unit), unit)
     assert result.n_outliers == 1
     assert result.axis_changes[2].reading == pytest.approx(100.0 * MICRO_G, abs=20.0 * MICRO_G)
@@ -275,7 +269,7 @@ def test_a_contradicting_turn_on_is_left_out_and_stamps_may_be_in_wrong_order(rn
 
 def test_a_wrong_clock_at_the_start_of_the_node_does_not_change_the_update(tmp_path, rng):
     # Sample stamps are right; start times of no, of all or of only the last start are wrong.
-    unit = known()
+    unit = precise()
     logged = rests(unit, upright, jump_of(300.0, 10.0))
     image = {start.start_ns: int(1.6e18 + 5e8 * rng.standard_normal()) for start, _ in logged}
     last = logged[-1][0].start_ns
@@ -287,22 +281,19 @@ def test_a_wrong_clock_at_the_start_of_the_node_does_not_change_the_update(tmp_p
         assert source.name.startswith('rests until 2030-01-20T23:12:40')
         updated = update(series_of(read, unit), unit)
         expected = expected or updated
-        assert updated.calibration == expected.calibration
-        assert updated.judged == expected.judged
+        assert (updated.calibration, updated.judged) == (expected.calibration, expected.judged)
 
 
 @pytest.fixture
 def unit_file(tmp_path):
     path = tmp_path / 'unit.yaml'
-    created = Provenance(created='2029-12-31T00:00:00Z')
-    save_calibration(known(provenance=created), path)
+    save_calibration(precise(provenance=Provenance(created='2029-12-31T00:00:00Z')), path)
     return path
 
 
 @pytest.mark.usefixtures('no_figures')
 def test_the_command_update_writes_a_better_calibration(tmp_path, unit_file, cli):
-    unit = load_calibration(unit_file)
-    logged = rests(unit, upright, jump_of(300.0, 10.0))
+    logged = rests(load_calibration(unit_file), upright, jump_of(300.0, 10.0))
     log, new = write_log(tmp_path / 'rests', logged), tmp_path / 'new.yaml'
     finished = cli('update', unit_file, log, '-o', new)
     assert 'the rests do not determine x, y' in finished.stdout
@@ -315,15 +306,13 @@ def test_the_command_update_writes_a_better_calibration(tmp_path, unit_file, cli
     assert parsed(cli('evaluate', log, '-c', unit_file, '--json', code=1).stdout)['left']
     history = cli('report', '-c', unit_file, '-c', new, '-o', tmp_path / 'page.html', '--json')
     assert [change['constant'] for change in parsed(history.stdout)['history']][2] == 'bias z'
-    again = cli('evaluate', log, '-c', new)
-    assert '240 windows were used by the last update' in again.stdout
+    assert '240 windows were used by the last update' in cli('evaluate', log, '-c', new).stdout
     again = cli('update', new, log, '-o', tmp_path / 'newer.yaml', code=1)
     assert 'has been updated with all of these rests' in again.stderr
 
 
 def test_an_update_without_gain_writes_no_file(tmp_path, unit_file, cli):
-    unit = load_calibration(unit_file)
-    log = write_log(tmp_path / 'rests', rests(unit, upright, no_error))
+    log = write_log(tmp_path / 'rests', rests(load_calibration(unit_file), upright, no_error))
     finished = cli('update', unit_file, log, '-o', tmp_path / 'new.yaml', '--json', code=3)
     data = parsed(finished.stdout)
     assert data['output'] is None
@@ -332,8 +321,7 @@ def test_an_update_without_gain_writes_no_file(tmp_path, unit_file, cli):
     printed = cli('update', unit_file, log, '-o', tmp_path / 'new.yaml', code=3).stdout
     assert 'sd of the correction at the last rest, with ageing: x ' in printed
     assert not (tmp_path / 'new.yaml').exists()
-    text = cli('evaluate', log, '-c', unit_file).stdout
-    assert 'recalibration interval' in text
+    assert 'recalibration interval' in cli('evaluate', log, '-c', unit_file).stdout
 
 
 def test_wrong_arguments_and_logs_of_update_give_a_message(tmp_path, unit_file, cli):
@@ -375,15 +363,13 @@ def test_derivatives_of_a_rest_by_initial_lag_states_agree_with_finite_differenc
     logged = with_shares(rests(unit, in_any_attitude, no_error, days=4, rate=0.5 / 60.0), share)
     series, layout = series_of(logged, unit), StateLayout(Correction(unit).memory)
     lags = [lag for lag in layout.places if isinstance(lag, Lag)]
-    root = start_root(tuple(lags))
-    for k, column in enumerate(root.T):
+    for k, column in enumerate(start_root(tuple(lags)).T):
         states = np.array([r.state for _, r in logged])
         for lag, size in zip(lags, column, strict=True):
             states[:, layout.places[lag]] += step * share * size
         moved = [(s, replace(r, state=tuple(x))) for (s, r), x in zip(logged, states, strict=True)]
         slope = (series.residual - series_of(moved, unit).residual) / step
-        expected = series.by_start[:, k]
-        assert np.allclose(slope, expected, atol=0.03 * np.abs(series.by_start).max())
+        assert np.allclose(slope, series.by_start[:, k], atol=0.03 * np.abs(series.by_start).max())
     settled = series_of(with_shares(logged, 0.0), unit)
     assert not settled.by_start.any()
     assert np.array_equal(settled.noise, series.noise)
@@ -428,12 +414,11 @@ def test_unknown_initial_lag_states_are_not_taken_for_scatter_of_rests(rng, lags
 
 
 def test_the_newest_of_too_many_turn_ons_are_used_and_fewer_than_three_are_refused(monkeypatch):
-    unit = known()
+    unit = precise()
     series = series_of(rests(unit, upright, no_error), unit)
     everything = rows_of(series, MICRO_G)
     monkeypatch.setattr('thermo_comp.field.ageing._MOST_ROWS', 25)
-    newest = rows_of(series, MICRO_G)
-    assert set(newest.start) == set(everything.start[-24:])
+    assert set(rows_of(series, MICRO_G).start) == set(everything.start[-24:])
     logged = rests(unit, upright, no_error, days=1)[:8]
     with pytest.raises(FitError, match='rests of 2 starts of the node, at least 3 are needed'):
         update(series_of(logged, unit), unit)

@@ -94,12 +94,10 @@ def test_any_number_of_any_message_layout_is_read(store, rows, cells, is_little)
     [
         ('temp', r'has the fields header, names, parts.*, no `temp`'),
         ('last.celsius.x', 'a number has the fields none, no `x`'),
-        ('names', 'is not a number'),
-        ('header', 'is not a number'),
-        ('last[0]', 'of a field that is not an array'),
-        ('raw[', 'no `raw\\['),
+        ('names', 'is not a number'), ('header', 'is not a number'),
+        ('last[0]', 'of a field that is not an array'), ('raw[', 'no `raw\\['),
     ],
-)
+)  # fmt: skip
 def test_a_path_that_leads_to_no_number_is_refused(store, path, text):
     with pytest.raises(RecordingError, match=text):
         Field('lab_msgs/msg/Deep', path, store.fielddefs)
@@ -166,8 +164,7 @@ def test_a_bag_with_a_message_type_of_the_driver_is_read(tmp_path, store, storag
     recording = read_recording(tmp_path / 'bag', Topics.named(names))
     assert 'readings of board, case have no stamp' in str(recording.info.chosen)
     board, case = (recording.columns.temperatures[name] for name in ('board', 'case'))
-    # A reading without a stamp gets the stamp of the previous sample; the first reading, which
-    # precedes all samples, is left out.
+    # A reading without a stamp gets that of the sample before it; without a sample it is left out.
     assert board.celsius.tolist() == celsius[1:]
     assert board.stamp_ns.tolist() == [START_NS + (row - 1) * 10**7 for row in range(5, 50, 5)]
     assert case.celsius.tolist() == [celsiu - 1.0 for celsiu in celsius]
@@ -189,8 +186,7 @@ def test_two_fields_of_a_message_are_two_inputs_and_info_names_further_fields(tm
         open_recording(tmp_path / 'bag', Topics.named({'board': f'{topic}:temp'}), require=())
     with pytest.raises(ValueError, match='`imu` takes whole messages'):
         Topics.named({'imu': '/imu/data:linear_acceleration'})
-    topics = Topics.named({'board': '/case'})
-    findings = survey_recording(tmp_path / 'bag', topics).findings
+    findings = survey_recording(tmp_path / 'bag', Topics.named({'board': '/case'})).findings
     message = next(text for text in findings if 'no case' in text)
     assert message.endswith('with --topic case=TOPIC: /fmu/out/sensor_accel:temperature')
     both = Topics.named({'board': '/case', 'case': '/fmu/out/sensor_accel:temperature'})

@@ -180,8 +180,7 @@ def test_a_writer_that_fails_leaves_no_file(tmp_path):
     (tmp_path / 'file').touch()
     with pytest.raises(OutputError, match=r'unit\.yaml: cannot be written: .*is not a directory'):
         files.write_atomically(tmp_path / 'file' / 'unit.yaml', b'', files.CALIBRATION)
-    draft = files.Draft(tmp_path / 'new' / 'bag', files.BAG)
-    draft.drop()
+    files.Draft(tmp_path / 'new' / 'bag', files.BAG).drop()
     assert list((tmp_path / 'new').iterdir()) == []
 
 

@@ -83,12 +83,10 @@ def test_a_knee_in_the_curve_of_the_bias_is_found_only_if_there_is_one(monkeypat
 def test_a_thermometer_on_two_topics_is_used_once():
     bags = []
     for copies in (('board',), ('board', 'case')):
-        rng = np.random.default_rng(9)
-        records = [recording(up, rng) for up in UPS[:3]]
+        records = [recording(up, np.random.default_rng(9)) for up in UPS[:3]]
         bags.append([columns(each, f'rest{k}', copies) for k, each in enumerate(records)])
     first, second = (tc.fit(each, gravity=G, input='m/s^2', groups=('curve',)) for each in bags)
-    assert first.static == second.static
-    assert first.axes == second.axes
+    assert (first.static, first.axes) == (second.static, second.axes)
     assert any('temperature/case repeats' in note for note in second.provenance.notes)
     assert not any('repeats' in note for note in first.provenance.notes)
 
@@ -106,8 +104,7 @@ def columns_of(slopes, shift=0.0):
 @pytest.mark.slow
 @pytest.mark.parametrize('shift', [300.0, -20000.0])
 def test_a_changed_unit_is_updated_although_its_drift_contradicts_the_prior(shift, monkeypatch):
-    # WHY: the drift contradicted the prior, so an update used no new bag and kept the old
-    # constants, whose error was 35 claimed sd.
+    # WHY: the drift contradicted the prior: an update kept constants with errors of 35 claimed sd.
     monkeypatch.setitem(globals(), 'KNEE_C', 5.0)
     options = {'gravity': G, 'input': 'm/s^2', 'groups': ('curve',)}
     old = tc.fit(columns_of([SLOPE] * len(UPS)), mounting_sd=1e-7, **options)

@@ -58,8 +58,7 @@ def test_the_evidence_selects_the_condition_that_ends_the_dynamic_regime(end_con
     # A reading every four seconds suffices: the case changes by at most 0.1 K in 4 s.
     unit = triad('plain', 1).with_thermometers(rate_hz=0.25)
     records = []
-    plan = [Position(PROGRAM, up) for up in FACES[:4]]
-    for record in arrays(unit, plan, 11, rate_hz=2.0):
+    for record in arrays(unit, [Position(PROGRAM, up) for up in FACES[:4]], 11, rate_hz=2.0):
         step = np.outer(weight(record, end_condition), STEP * unit.scale_factor)
         records.append(replace(record, counts=record.counts + step))
     result = fit(sources_of(records), FitOptions(gravity=STANDARD_GRAVITY, **options))
@@ -67,26 +66,6 @@ def test_the_evidence_selects_the_condition_that_ends_the_dynamic_regime(end_con
     # The detector settings are estimated, so regime switches differ slightly from the true ones.
     last = result.residuals[-1]
     assert last.fitted.rms < 0.35 * last.raw.rms
-
-
-def uneven(rng):
-    """Make positions of 7, 1, 12 and 4 windows, with a gap in the third, and random weights."""
-    lengths = (7, 1, 12, 4)
-    position = np.repeat(np.arange(len(lengths)), lengths)
-    steps = rng.uniform(1.0, 9.0, len(position))
-    steps[12] = 4000.0
-    own = [steps[position == k] for k in range(len(lengths))]
-    time = np.concatenate([100.0 * k + np.cumsum(part) for k, part in enumerate(own)])
-    return position, time, rng.uniform(0.1, 3.0, len(position))
-
-
-def dense(position, time, weight, noise):
-    """Build the covariance of exponentially correlated noise in each position and white noise."""
-    same = position[:, None] == position
-    distance = np.abs(time[:, None] - time)
-    times_s = [noise.time_s * 10.0**k for k in range(noise.n_times)]
-    slow = noise.ratio * sum(np.exp(-distance / time_s) for time_s in times_s)
-    return np.where(same, slow, 0.0) + np.diag(1.0 / weight)
 
 
 @pytest.mark.parametrize(
@@ -97,11 +76,20 @@ def dense(position, time, weight, noise):
     ],
 )
 def test_products_and_determinant_equal_those_of_the_dense_matrix(rng, noise):
-    position, time, weight = uneven(rng)
+    # Four positions of 7, 1, 12 and 4 windows, with a gap in the third, and random weights.
+    position = np.repeat(np.arange(4), (7, 1, 12, 4))
+    steps = rng.uniform(1.0, 9.0, len(position))
+    steps[12] = 4000.0
+    time = np.concatenate([100.0 * p + np.cumsum(steps[position == p]) for p in range(4)])
+    weight = rng.uniform(0.1, 3.0, len(position))
     series = rng.standard_normal((len(time), 5))
     whitener = Whitener(position, time)
     white = whitener.filter(series, weight, noise)
-    covariance = dense(position, time, weight, noise)
+    # The covariance of exponentially correlated noise in each position, and of white noise.
+    distance = np.abs(time[:, None] - time)
+    times_s = [noise.time_s * 10.0**k for k in range(noise.n_times)]
+    slow = noise.ratio * sum(np.exp(-distance / time_s) for time_s in times_s)
+    covariance = np.where(position[:, None] == position, slow, 0.0) + np.diag(1.0 / weight)
     expected = series.T @ np.linalg.solve(covariance, series)
     # The tolerance allows for rounding at condition numbers of the covariance below 1e6.
     np.testing.assert_allclose(white.T @ white, expected, rtol=1e-9, atol=1e-10)
@@ -151,7 +139,7 @@ def score(drift, norms=(), by_thermometer=0.0):
     return Score(drifts, drifts, of_norms, none, none, drifts, by_thermometer=error)
 
 
-def test_few_norms_that_both_models_predict_do_not_select_the_model():
+def test_neither_few_norms_nor_errors_of_a_coarse_thermometer_select_a_model():
     # WHY: only four left-out |f| of a MEMS in six faces could be predicted with and without a
     # curve; for these four the fit rejected the curve: the force error was 7 mg.
     constants = score(20.0, [22.4, 457.7, 54.6, 26.1])
@@ -160,9 +148,6 @@ def test_few_norms_that_both_models_predict_do_not_select_the_model():
     assert is_undecided(constants, curve)
     assert not is_undecided(curve, constants)
     assert is_better(constants, score(20.0, [2.0, 40.0, 5.0, 2.0]))
-
-
-def test_a_larger_model_must_not_explain_the_errors_of_a_coarse_thermometer():
     # WHY: readings in steps of 1 K have equal errors in all bags of a temperature program: knees
     # that fitted these errors doubled the drift error in other programs.
     by_thermometer = 49.0

@@ -54,8 +54,7 @@ def good(rng):
 
 
 def test_a_complete_thermal_test_gives_only_good_findings(good):
-    findings = findings_of(*good)
-    assert {finding.level for finding in findings.values()} == {'good'}
+    assert {finding.level for finding in findings_of(*good).values()} == {'good'}
     assert findings_of(*good, has_case=False)['case'].level == 'advice'
 
 
@@ -106,8 +105,7 @@ def test_the_noise_of_soaks_is_not_taken_for_a_ramp_or_for_exchanged_sensors(goo
     assert 'swapped' not in findings
     assert 'no ramp' in findings['ramps'].message
     assert 'soaks at 3 temperatures' in findings['soaks'].message
-    drift = replace(windows, rate=0.0 * windows.rate)
-    assert 'soaks' not in findings_of(drift, up)
+    assert 'soaks' not in findings_of(replace(windows, rate=0.0 * windows.rate), up)
 
 
 def test_rests_at_room_temperature_are_sufficient_with_a_prior_of_the_unit(good):
@@ -236,8 +234,7 @@ def test_the_gradient_of_a_soak_does_not_depend_on_the_ramps(good, rng):
     lag = np.where(t < 3000.0, 600.0, 1500.0)
     gradient = -3.0 + lag * rate + 0.01 * rng.standard_normal(len(t))
     middle, sd = soak_gradient(replace(windows, rate=rate, gradient=gradient), None)
-    assert middle == pytest.approx(-3.0, abs=0.01)
-    assert sd == pytest.approx(0.01, rel=0.2)
+    assert (middle, sd) == (pytest.approx(-3.0, abs=0.01), pytest.approx(0.01, rel=0.2))
     # Without a soak or without a case thermometer the gradient in a soak is unknown.
     ramp = np.full_like(t, 0.5)
     assert soak_gradient(replace(windows, rate=ramp, gradient=gradient), None) is None

@@ -22,7 +22,7 @@ from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 
 def ratios_to_sd(seed, effect_sd):
-    """Return errors of weights / fitted and / claimed sd; `effect_sd`: sd of section biases."""
+    """Return errors of weights / fitted sd and / claimed sd; each section has a random bias."""
     truth, rng = fitting_truth.Truth(), np.random.default_rng(seed)
     windows, up = fitting_truth.table_of(truth, 12, rng, n_windows=24)
     effect = effect_sd * rng.standard_normal((N_SECTIONS, 3))
@@ -85,8 +85,7 @@ def ratio(path):
     K = np.array([axis.scale_factor for axis in calibration.axes])
     collected = []
     for p in range(data.n_positions):
-        kept = np.flatnonzero(data.position != p)
-        rows = fitting_truth.rows_of(data, kept)
+        rows = fitting_truth.rows_of(data, np.flatnonzero(data.position != p))
         rest = Regression(rows, STANDARD_GRAVITY, K / posterior.state.kappa)
         others = np.arange(data.n_positions) != p
         local = {name: getattr(posterior.state, name)[others] for name in ('up', 'offset', 'tilt')}

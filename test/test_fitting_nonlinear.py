@@ -77,8 +77,7 @@ def chosen(rng, **terms):
 
 def test_derivatives_of_nonlinear_terms_agree_with_finite_differences(rng):
     _, regression, state = table(rng, 1e-5, 1e-5, 1e-6, radius_sd=0.01)
-    sd = rng.uniform(1e-4, 1e-3, 24)
-    regression.forces = replace(regression.forces, sd=sd)
+    regression.forces = replace(regression.forces, sd=rng.uniform(1e-4, 1e-3, 24))
     coefficients = rng.standard_normal((3, 6)) * [1e-5, 1e-5, 1e-6, 1e-7, 1e-7, 1e-8]
     state = replace(state, nonlinear=coefficients)
     used = np.zeros((2, 6), dtype=bool)
@@ -236,10 +235,8 @@ def test_runs_of_a_centrifuge_determine_nonlinear_terms_that_a_later_fit_keeps()
     stations = []
     for inward in positions(9, 1):
         up = np.cross(inward, np.roll(inward, 1) + 0.1)
-        spin = Spin(time, rate, 1.0, inward)
-        stations.append(Position(program, up / np.linalg.norm(up), spin))
-    runs = arrays(unit, stations, 3, rate_hz=2.0)
-    pairs = enumerate(zip(runs, stations, strict=True))
+        stations.append(Position(program, up / np.linalg.norm(up), Spin(time, rate, 1.0, inward)))
+    pairs = enumerate(zip(arrays(unit, stations, 3, rate_hz=2.0), stations, strict=True))
     sources = [source(run, station.spin, f'run{k}') for k, (run, station) in pairs]
     result = fit(sources, FitOptions(gravity=G, model='golovach'))
     terms = {term.name: term for term in nonlinear_coefficients(result.calibration)}

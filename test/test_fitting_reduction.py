@@ -29,18 +29,9 @@ def stamps(n, rate_hz=RATE_HZ):
 
 def block(accel, seconds=None):
     n = len(accel)
-    seconds = n / RATE_HZ if seconds is None else seconds
-    readings = stamps(int(seconds) + 1, 1.0)
+    readings = stamps(int(n / RATE_HZ if seconds is None else seconds) + 1, 1.0)
     celsius = np.full(len(readings), 20.0)
     return ArrayBlock(stamps(n), accel, readings, celsius, readings, celsius + 1.0)
-
-
-def split(whole, n_parts):
-    parts = [
-        np.array_split(getattr(whole, name), n_parts)
-        for name in ('accel_stamp_ns', 'accel', 'board_stamp_ns', 'board', 'case_stamp_ns', 'case')
-    ]
-    return [ArrayBlock(*part) for part in zip(*parts, strict=True)]
 
 
 def reduced(blocks, **options):
@@ -57,7 +48,9 @@ def test_the_reduction_does_not_depend_on_blocks_or_on_the_origin_of_time(rng):
     whole = block(np.rint(still(rng, 61.0, (10.0, -3000.0, 50.0))))
     at_once = reduced([whole])
     for n_parts in (2, 7, 50):
-        other = reduced(split(whole, n_parts))
+        *columns, _ = vars(whole).values()  # all but `imu`
+        parts = zip(*(np.array_split(column, n_parts) for column in columns), strict=True)
+        other = reduced([ArrayBlock(*part) for part in parts])
         for a, b in zip(at_once.intervals, other.intervals, strict=True):
             np.testing.assert_array_equal(a.count, b.count)
             # The order of additions, and so the rounding, depends on the size of the blocks.
@@ -76,7 +69,7 @@ def test_the_reduction_does_not_depend_on_blocks_or_on_the_origin_of_time(rng):
 
 @pytest.mark.parametrize('rest_s', [30, 45])
 def test_short_rests_of_slow_samples_are_found(rng, rest_s):
-    # WHY: at 1 Hz means were over 30 s and several attitudes, so |f| of a mean was 0.07 m/s^2.
+    # WHY: at 1 Hz each mean over 30 s was of several attitudes, and so had a norm of 0.07 m/s^2.
     ups = np.repeat(positions(18, 1), rest_s, axis=0)
     samples = 9.8 * (ups + 5e-6 * rng.standard_normal(ups.shape))
     tumble = ArrayBlock(stamps(len(samples), 1.0), samples)
@@ -104,8 +97,7 @@ def test_the_estimated_interval_between_samples_is_right_to_0_1_percent(rng, cyc
 def test_windows_are_means_of_their_samples_without_the_bad_samples(rng):
     samples = still(rng, 60.0, UP)
     (interval,) = reduced([block(samples)]).intervals
-    assert interval.count.sum() == len(samples)
-    assert len(interval.time) == 6
+    assert (interval.count.sum(), len(interval.time)) == (len(samples), 6)
     np.testing.assert_allclose(interval.mean[2], samples[2000:3000].mean(axis=0), atol=1e-10)
     assert interval.time[2] == pytest.approx(24.995, abs=1e-9)
     np.testing.assert_allclose(interval.sample_sd, 0.3, rtol=0.1)
@@ -137,39 +129,32 @@ def test_positions_in_one_bag_are_separated_but_not_by_vibrations_of_a_compresso
     assert first.time[-1] < 345.0 < second.time[0]
 
 
-def test_readings_of_a_lost_thermometer_are_counted_and_left_out(rng):
+def test_readings_of_a_lost_thermometer_and_glitches_are_counted_and_left_out(rng):
     # WHY: with -127 degC in every 60th reading the error of the fit was 25 times as large.
     whole = block(still(rng, 2000.0, UP))
     whole.board[:] = 20.0 + 0.02 * rng.standard_normal(len(whole.board))
     whole.board[30::60] = -127.0
+    # WHY: each wrong sample ended a rest, and with 1 % wrong samples a fit took minutes, not 2 s.
+    whole.accel[50::100, 1] += 1500.0
+    whole.accel[100_000:100_010] += 1500.0 * np.array([[-1.0], [1.0]] * 5)
     bag = reduced([whole])
     assert bag.n_spikes == {'board': 33, 'case': 0}
     assert bag.board.value.min() > 19.0
     noise = learn_thermometer([bag.board], ThermometerSettings()).noise_sd_c
     assert noise == pytest.approx(0.02, rel=0.1)
-    (finding,) = (f for f in judge_bags([bag], FitOptions(gravity=9.8)) if f.name == 'spikes')
-    assert '33 readings' in finding.message
+    findings = {f.name: f.message for f in judge_bags([bag], FitOptions(gravity=9.8))}
+    assert '33 readings' in findings['spikes']
+    assert '2000 samples' in findings['glitches']
+    assert (bag.n_glitches, len(bag.intervals)) == (len(whole.accel) // 100, 2)
+    assert abs(bag.intervals[0].mean[:, 1].mean()) < 1.0
+    turned = block(still(rng, 200.0, UP))
+    turned.accel[9000:11_000] += 600.0 * rng.standard_normal((2000, 3))
+    assert reduced([turned]).n_glitches == 0
     at_ends = np.array([85.0, 20.0, 20.1, 20.2, 20.3, 20.4, -127.0])
     assert np.flatnonzero(is_spike(at_ends)).tolist() == [0, 6]
     assert not is_spike(np.array([np.inf, np.inf, np.inf, np.inf, 20.0, 20.0, np.inf])).all()
     # Readings of a temperature that changes by up to 18 K from reading to reading are no spikes.
     assert not is_spike(np.array([-18.0, 0.0, 12.0, 18.0, 20.0, 21.0, 21.0])).any()
-
-
-def test_glitches_are_counted_and_end_no_rest(rng):
-    # WHY: each wrong sample ended a rest, and with 1 % wrong samples a fit took minutes, not 2 s.
-    whole = block(still(rng, 2000.0, UP))
-    whole.accel[50::100, 1] += 1500.0
-    whole.accel[100_000:100_010] += 1500.0 * np.array([[-1.0], [1.0]] * 5)
-    bag = reduced([whole])
-    turned = block(still(rng, 200.0, UP))
-    turned.accel[9000:11_000] += 600.0 * rng.standard_normal((2000, 3))
-    assert reduced([turned]).n_glitches == 0
-    assert bag.n_glitches == len(whole.accel) // 100
-    assert len(bag.intervals) == 2
-    assert abs(bag.intervals[0].mean[:, 1].mean()) < 1.0
-    (finding,) = (f for f in judge_bags([bag], FitOptions(gravity=9.8)) if f.name == 'glitches')
-    assert '2000 samples' in finding.message
 
 
 def test_samples_in_bursts_are_a_rest_and_several_with_one_stamp_are_reported(rng):
@@ -180,8 +165,7 @@ def test_samples_in_bursts_are_a_rest_and_several_with_one_stamp_are_reported(rn
         # The mean rate is 100 Hz; within a burst the stamps are 0.3 ms apart.
         stamps = (number // size * size + size) * 10_000_000 + number % size * 300_000
         bag = reduced([replace(whole, accel_stamp_ns=whole.accel_stamp_ns[0] + stamps)])
-        assert len(bag.intervals) == 1
-        assert bag.cycle_s == pytest.approx(0.01, rel=0.1)
+        assert (len(bag.intervals), bag.cycle_s) == (1, pytest.approx(0.01, rel=0.1))
         assert bag.n_dropped == 0
     whole = block(still(rng, 600.0, UP))
     stamps = whole.accel_stamp_ns[np.arange(len(whole.accel)) // 10 * 10]
@@ -216,8 +200,7 @@ def test_windows_of_a_fit_have_the_stated_length(rate_hz, cell_s, window_s, rng)
     accel = np.array(UP) + 0.3 * rng.standard_normal((n, 3))
     bag = reduced([ArrayBlock(stamps(n, rate_hz), accel)])
     (interval,) = bag.intervals
-    assert bag.window_s == window_s
-    assert bag.n_cells == pytest.approx(150 / cell_s)
+    assert (bag.window_s, bag.n_cells) == (window_s, pytest.approx(150 / cell_s))
     assert interval.n_whole == len(interval.time) == 150 / window_s
     np.testing.assert_allclose(interval.count, window_s * rate_hz, atol=1.0)
     np.testing.assert_allclose(np.diff(interval.time), window_s, atol=1.0 / rate_hz)
@@ -233,8 +216,7 @@ def test_a_last_window_is_kept_if_it_is_at_least_half_full(seconds, left, rng):
 def test_fast_readings_are_averaged_but_each_change_of_a_wide_quantum_is_kept(rng):
     n = 60 * RATE_HZ
     at, celsius = stamps(n), 20.0 + 0.1 * rng.standard_normal(n)
-    accel = still(rng, 60.0, UP)
-    board = reduced([ArrayBlock(at, accel, at, celsius, at, celsius)]).board
+    board = reduced([ArrayBlock(at, still(rng, 60.0, UP), at, celsius, at, celsius)]).board
     assert len(board.value) <= n / 19
     assert board.value.mean() == pytest.approx(celsius.mean(), abs=1e-3)
     bag, noise = dense(rng, 0.05), ThermometerSettings(noise_sd_c=0.05)
@@ -311,7 +293,7 @@ def test_readings_that_alternate_at_edges_of_1_k_steps_show_their_noise(noise, f
     assert learned.noise_sd_c == pytest.approx(found, rel=0.3 if noise else 1e-6)
 
 
-def test_without_readings_the_settings_are_the_defaults_and_lags_are_three_reading_intervals(rng):
+def test_thermometer_settings_have_defaults_and_the_detector_s_follow_the_slowest_ramp(rng):
     # WHY: with readings every 60 s and a lag of 50 s the estimated rate was 0 in all ramps.
     time = np.arange(0.0, 14400.0, 60.0)
     celsius = np.interp(time, [0.0, 3600.0, 5400.0], [5.0, 5.0, 35.0])
@@ -321,14 +303,9 @@ def test_without_readings_the_settings_are_the_defaults_and_lags_are_three_readi
     empty = Readings(np.zeros(0, dtype=np.int64), np.zeros(0))
     base = DetectorSettings()
     assert learn_thermometer([empty], base.board) == base.board
-
-
-def test_the_detector_settings_follow_the_slowest_ramp(rng):
     n = 9 * 3600
-    time = np.arange(0.0, n)
-    celsius = np.interp(time, [0.0, 7200.0, 25200.0], [10.0, 10.0, 55.0])
-    celsius = celsius + 0.005 * rng.standard_normal(n)
-    readings = Readings(stamps(n, 1.0), celsius)
+    celsius = np.interp(np.arange(0.0, n), [0.0, 7200.0, 25200.0], [10.0, 10.0, 55.0])
+    readings = Readings(stamps(n, 1.0), celsius + 0.005 * rng.standard_normal(n))
     bag = reduced([block(still(rng, 30.0, UP))])
     slow = learn_detector([replace(bag, temperatures={'board': readings, 'case': readings})])
     # The setting `smallest_ramp_k_min` is 0.7 times the rate of the slowest ramp (0.15 K/min).
@@ -341,8 +318,7 @@ def test_a_rest_is_found_at_any_quantum_of_the_samples(step, rng):
     slow = 0.6 * np.sin(np.arange(60 * RATE_HZ) / 900.0)
     accel = 2900.0 + slow[:, None] + 0.05 * rng.standard_normal((len(slow), 3))
     bag = reduced([block(np.round(accel) * step)], full_scale=None)
-    assert len(bag.intervals) == 1
-    assert bag.n_still_cells == bag.n_cells
+    assert (len(bag.intervals), bag.n_still_cells) == (1, bag.n_cells)
 
 
 def test_the_rounding_sd_is_that_of_simulated_rounding_and_smaller_with_a_drift(rng):
@@ -365,9 +341,8 @@ def test_steps_of_a_converter_after_a_constant_soak_do_not_divide_a_rest_but_a_t
     rest = Rest(rng, duration_s=3600.0, sd=0.0)
     ramp = np.maximum(rest.time - 1800.0, 0.0) / 1800.0
     rest.accel = np.rint(rest.accel / 0.04 + 6.0 * np.outer(ramp, (1.0, -1.3, 0.7))) * step
-    bag = reduce_source(rest.source(), full_scale=None)
-    assert len(bag.intervals) == 1
-    # WHY: if samples changed only as the unit was turned, this change counted as an ADC step.
+    assert len(reduce_source(rest.source(), full_scale=None).intervals) == 1
+    # WHY: between two rests with constant samples, a turn counted as one step of the converter.
     rest = Rest(rng, sd=0.0)
     rest.accel[rest.time > 300.0] = (GRAVITY, 0.0, 0.0)
     assert len(reduce_source(rest.source(), full_scale=None).intervals) == 2

@@ -34,13 +34,6 @@ from thermo_comp.fitting.unknowns import Noise, State, inverse_misalignment, tan
 POSE_SD = 1e-4
 
 
-def returned(pose, rng):
-    """Draw attitudes that differ by `POSE_SD` from one of three poses, shape (n, 3)."""
-    poses = np.array([[0.577, 0.577, 0.578], [-0.577, 0.578, 0.577], [0.578, -0.577, 0.577]])
-    up = poses[pose] + POSE_SD * rng.standard_normal((len(pose), 3))
-    return up / np.linalg.norm(up, axis=1, keepdims=True)
-
-
 class Dense:
     """The posterior of a `Regression` by dense linear algebra and numerical derivatives."""
 
@@ -142,12 +135,15 @@ def solved(request):
         start_sd=0.5 if n_positions == 1 else 0.0, noise=Noise(4.0, 2000.0),
         offset_sd=2.0 * MICRO, tilt_sd=2e-7 if pose_of else 5e-6,
     )  # fmt: skip
-    pose = np.array(pose_of) if pose_of else None
-    up = None if pose is None else returned(pose, rng)
+    pose, up = (np.array(pose_of) if pose_of else None), None
+    if pose_of:
+        # The attitudes differ by `POSE_SD` from one of three poses.
+        poses = np.array([[0.577, 0.577, 0.578], [-0.577, 0.578, 0.577], [0.578, -0.577, 0.577]])
+        up = poses[pose] + POSE_SD * rng.standard_normal((len(pose), 3))
+        up /= np.linalg.norm(up, axis=1, keepdims=True)
     windows, up = table_of(truth, 10, rng, n_windows=12, step_s=400.0, up=up)
     weight = rng.uniform(0.3, 1.0, len(windows.time))
-    bag = windows.position // n_positions
-    windows = replace(windows, weight=weight, bag=bag, pose=pose)
+    windows = replace(windows, weight=weight, bag=windows.position // n_positions, pose=pose)
     regression, state = begin(windows, up)
     # In one or two poses bias, scale and M are undetermined: narrow priors limit their changes.
     narrow = {'scale_sd': 1e-5, 'misalignment_sd': 1e-5, 'bias_sd': np.full(3, 1e-4)}
@@ -158,15 +154,12 @@ def solved(request):
 
 
 def test_mode_covariance_and_evidence_agree_with_dense_linear_algebra(solved):
-    regression, prior, mode = solved
-    dense = Dense(regression, prior, mode)
-    at = dense.residual(np.zeros(dense.n))
-    gradient = dense.jacobian(np.zeros(dense.n)).T @ at * np.sqrt(mode.variance)
-    assert np.abs(gradient).max() < 1e-4
-    sd = np.sqrt(mode.variance)
+    regression, prior, fitted = solved
+    dense = Dense(regression, prior, fitted)
+    at, sd = dense.residual(np.zeros(dense.n)), np.sqrt(fitted.variance)
+    assert np.abs(dense.jacobian(np.zeros(dense.n)).T @ at * sd).max() < 1e-4
     other = least_squares(dense.residual, np.zeros(dense.n), x_scale=sd, method='trf').x
     assert np.abs(other / sd).max() < 1e-3
-    regression, prior, fitted = solved
     np.testing.assert_allclose(regression.start_root @ regression.start_root.T, START, atol=1e-12)
     beside = []
     for share in (prior.start_variance_ratio, 0.1):
@@ -281,8 +274,7 @@ def test_a_position_that_alone_determines_a_parameter_has_no_left_out_norm(rng):
     truth = Truth(misalignment=np.zeros(3))
     windows, up = table_of(truth, 6, rng, up=np.vstack((np.eye(3), -np.eye(3))))
     regression, state = begin(windows, up)
-    prior = prior_of(truth, misalignment_sd=1e-3)
-    mode = mode_of(regression, state, prior)
+    mode = mode_of(regression, state, prior_of(truth, misalignment_sd=1e-3))
     score = score_of(regression, mode)
     assert np.isnan(score.force).all()
     assert np.isnan(score.norms.square).all()
@@ -299,8 +291,7 @@ def test_no_step_of_the_solver_increases_the_objective(seed):
     rng = np.random.default_rng(seed)
     truth = Truth(start_sd=5.0, sigma=np.full(3, 5.0 * MICRO))
     windows, up = table_of(truth, 4, rng, n_windows=12, step_s=400.0)
-    windows = replace(windows, start_covariance=100.0 * START)
-    regression, state = begin(windows, up)
+    regression, state = begin(replace(windows, start_covariance=100.0 * START), up)
     prior, sizes = prior_of(truth), []
     for _ in range(10):
         solution = regression.solve(state, prior, n_steps=1)
@@ -332,8 +323,7 @@ def test_published_huygens_coefficients_come_back(rng):
     regression, state = begin(table, up)
     regression = Regression(table, GRAVITY, np.full(3, K0))
     sd, sigma = np.repeat([[1e-2], [1e-3]], 4, axis=1), np.full(3, 1e-6 * MICRO)
-    prior = prior_of(Truth(), column_sd=sd, sigma=sigma)
-    mode = mode_of(regression, state, prior).state
+    mode = mode_of(regression, state, prior_of(Truth(), column_sd=sd, sigma=sigma)).state
     for axis in range(3):
         relative = np.append(1.0, mode.weights[1, axis] / regression.rms)
         scale = K0 * mode.kappa[axis] * relative

@@ -88,16 +88,15 @@ def test_only_columns_with_an_effect_are_chosen_and_each_trial_has_a_left_out_er
     tilt = GRAVITY * chosen.posterior.state.tilt
     assert np.abs(tilt).max() < hidden
     assert np.sqrt(np.mean(tilt**2)) < 0.5 * hidden
-    _, selected, truth = calm
-    rms = {trial.groups: trial.score.rms for trial in selected.trials}
+    rms = {trial.groups: trial.score.rms for trial in chosen.trials}
     # The first trial fits only constants; its left-out error is the effect of temperature.
     assert [*rms][:2] == [(), ('curve',)]
     assert rms[()] > 2.0 * rms['curve',] > 10.0 * rms['curve', 'board']
-    (chosen,) = (trial for trial in selected.trials if trial.is_chosen)
-    assert chosen.score is selected.score
+    (best,) = (trial for trial in chosen.trials if trial.is_chosen)
+    assert best.score is chosen.score
     # Errors of the fit make the left-out error larger than white noise, by 15 % at most.
-    assert 1.0 < selected.score.rms / truth.sigma[0] < 1.15
-    assert all(is_better(trial.score, selected.score) for trial in selected.trials[:2])
+    assert 1.0 < chosen.score.rms / truth.sigma[0] < 1.15
+    assert all(is_better(trial.score, chosen.score) for trial in chosen.trials[:2])
 
 
 @pytest.mark.parametrize('where', ['one bag', 'one section', 'all'])
@@ -110,8 +109,7 @@ def test_a_group_that_explains_one_bag_or_section_is_not_chosen(where):
         'all': np.ones(len(windows.time), dtype=bool),
     }[where]  # fmt: skip
     added = np.outer(windows.columns[:, 4] * rows, [20.0, -30.0, 25.0]) * MICRO
-    table = replace(windows, mean=windows.mean + NOMINAL * added)
-    _, chosen = selected_of(truth, table, up)
+    _, chosen = selected_of(truth, replace(windows, mean=windows.mean + NOMINAL * added), up)
     assert any('idle' in trial.groups for trial in chosen.trials)
     assert ('idle' in chosen_groups(chosen)) == (where == 'all')
 
@@ -201,8 +199,7 @@ def test_the_prior_sd_of_columns_is_that_of_true_weights_below_the_steepest_plau
     prior = replace(constants(truth), column_sd=candidates.typical)
     settled = settle(regression, state, prior, candidates).prior
     assert (settled.column_sd <= candidates.largest).all()
-    per_kelvin = settled.column_sd[0, 0] / windows.kelvins[0]
-    assert per_kelvin == pytest.approx(STEEPEST[0])
+    assert settled.column_sd[0, 0] / windows.kelvins[0] == pytest.approx(STEEPEST[0])
 
 
 def test_bends_have_one_prior_sd_of_the_change_of_slope():
@@ -259,7 +256,7 @@ def test_the_bayes_factor_of_a_group_is_the_loss_of_evidence_if_the_group_is_rem
         assert row.log_evidence_change == pytest.approx(fall, rel=0.01, abs=0.02), row
 
 
-def test_outliers_do_not_shift_the_fit(calm):
+def test_outliers_do_not_shift_the_fit_and_quantised_means_are_no_outliers(calm):
     regression, calm_fit, truth = calm
     rng = np.random.default_rng(6)
     clean = regression.windows
@@ -273,9 +270,6 @@ def test_outliers_do_not_shift_the_fit(calm):
     np.testing.assert_allclose(other.posterior.prior.sigma, truth.sigma, rtol=0.2)
     sds = (fitted.posterior.prior.column_sd[0] for fitted in (calm_fit, other))
     np.testing.assert_array_equal(*(sd > 0.0 for sd in sds))
-
-
-def test_quantised_window_means_are_not_down_weighted_as_outliers():
     # Carried remainders make most means equal: a mean that differs by one step is no outlier.
     windows, up = table_of(Truth(), 9, np.random.default_rng(2))
     regression, state = begin(windows, up)

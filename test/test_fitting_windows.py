@@ -33,15 +33,11 @@ OPTIONS = FitOptions(gravity=STANDARD_GRAVITY)
 SECOND = 1_000_000_000
 
 
-def sources(n, seed=1):
-    plan = [Position(PROGRAM, up) for up in positions(n, seed)]
-    unit = triad('own-lags', seed).with_thermometers(rate_hz=0.25)
-    return [source_of(*arrays_of(record)) for record in arrays(unit, plan, seed)]
-
-
 @pytest.fixture(scope='module')
 def all_bags():
-    return [reduce_bag(source, OPTIONS) for source in sources(6)]
+    plan = [Position(PROGRAM, up) for up in positions(6, 1)]
+    records = arrays(triad('own-lags', 1).with_thermometers(rate_hz=0.25), plan, 1)
+    return [reduce_bag(source_of(*arrays_of(record)), OPTIONS) for record in records]
 
 
 @pytest.fixture(scope='module')
@@ -50,8 +46,7 @@ def bags(all_bags):
 
 
 def windows_of(bags):
-    sets = sets_of(OPTIONS, bags)
-    model = Model('response', sets, bank(), ('case',), DetectorSettings(), 20.0)
+    model = Model('response', sets_of(OPTIONS, bags), bank(), ('case',), DetectorSettings(), 20.0)
     return thermal_windows(bags, model)
 
 
@@ -67,8 +62,7 @@ def test_a_rest_partly_in_the_range_of_the_model_is_used_there_only(bags):
 
 
 def test_the_sets_differ_only_with_soaks_at_several_temperatures(bags):
-    # WHY: static curves that only 4 of 1035 windows determine had an error of 341 ug; equal curves
-    # in both regimes have 21 ug.
+    # WHY: static curves from 4 of 1035 windows erred by 341 ug, common curves of both by 21 ug.
     ramps = windows_of(bags)
     soaks = replace(ramps, weight=1.0 * (np.abs(ramps.rate) > 1e-3))
     of_sets = np.array(ramps.data.groups) == 'set'
@@ -133,7 +127,6 @@ def test_columns_sections_and_initial_lag_states_agree_with_formulas(bags):
         if column.kind in ('board', 'gradient_lag') and column.power == 0:
             np.testing.assert_allclose(data.start[:, k], fades, atol=0.15)
         assert np.abs(data.start[-1, k]) <= np.abs(data.start[:, k]).max()
-    data, t = windows.data, windows.temperature - 20.0
     for p in range(data.n_positions):
         section = data.section[data.position == p]
         assert (np.diff(section) >= 0).all()
@@ -158,8 +151,7 @@ def test_windows_with_a_silent_or_stuck_thermometer_are_left_out(bags, name, is_
         readings = Readings(readings.stamp_ns, value)
     else:
         readings = Readings(readings.stamp_ns[~lost], readings.value[~lost])
-    message = replace(bag, temperatures={**bag.temperatures, name: readings})
-    windows = windows_of([message])
+    windows = windows_of([replace(bag, temperatures={**bag.temperatures, name: readings})])
     # Windows are left out from 120 s after the last reading of a silent thermometer (time-out of
     # 60 s, 5 reading intervals, a window) or 600 s after the last change of a stuck thermometer.
     seen_s = 600.0 if is_stuck else 120.0
@@ -191,14 +183,13 @@ def test_the_derivative_of_a_column_by_its_lag_agrees_with_differences():
 @pytest.mark.parametrize(
     ('options', 'static', 'dynamic', 'is_shared'),
     [
-        ({}, Polynomial, 2, True),
-        ({'static_curve': 'quadratic'}, Polynomial, 2, True),
+        ({}, Polynomial, 2, True), ({'static_curve': 'quadratic'}, Polynomial, 2, True),
         ({'model': 'golovach'}, Polynomial, 2, False),
         ({'static_curve': 'spline'}, CubicSpline, None, False),
         ({'static_curve': 'exponential'}, Exponential, 2, False),
         ({'static_curve': 'linear', 'dynamic_curve': 'linear'}, Polynomial, 1, False),
     ],
-)
+)  # fmt: skip
 def test_curve_columns_of_a_fit_are_powers_of_temperature(
     bags, options, static, dynamic, is_shared
 ):
@@ -206,12 +197,9 @@ def test_curve_columns_of_a_fit_are_powers_of_temperature(
     assert isinstance(sets.static, static)
     assert sets.is_shared == is_shared
     assert dynamic is None or sets.dynamic.n_free == dynamic
-    t = np.linspace(-5.0, 15.0, 9)
-    weight = np.linspace(0.0, 1.0, 9)
-    columns = sets.columns(t, weight)
+    columns = sets.columns(np.linspace(-5.0, 15.0, 9), np.linspace(0.0, 1.0, 9))
     assert len(columns) == len(sets.groups) == sets.static.n_free + 1 + sets.dynamic.n_free
-    nothing = sets.columns(np.zeros(3), np.array([0.0, 0.5, 1.0]))
-    for k, column in enumerate(nothing):
+    for k, column in enumerate(sets.columns(np.zeros(3), np.array([0.0, 0.5, 1.0]))):
         expected = [0.0, 0.5, 1.0] if k == sets.level else 0.0
         np.testing.assert_allclose(column, expected, atol=1e-12)
     assert all(column[0] == 0.0 for column in columns[sets.static.n_free :])
@@ -242,9 +230,7 @@ def fitted(request, all_bags):
 
 
 def states_of(windows, calibration):
-    columns = calibration.response
-    spec = memory_of(columns)
-    layout = StateLayout(spec)
+    layout = StateLayout(memory_of(calibration.response))
     states = np.zeros((len(windows.temperature), layout.width))
     states[:, 0], states[:, 3] = windows.temperature, windows.weight
     raw = dict(zip(windows.model.columns, windows.raw.T, strict=True))
@@ -262,7 +248,7 @@ def states_of(windows, calibration):
 
 def test_a_calibration_file_corrects_windows_with_the_sd_of_the_regression(fitted):
     # In ramps of 1 K/min powers of means over 60 s differ from means of powers by some ppm.
-    result, _ = fitted
+    result, claim = fitted
     windows, calibration = result.fit.windows, result.calibration
     state, prior = result.fit.posterior.state, result.fit.posterior.prior
     correction = Correction(calibration)
@@ -275,12 +261,9 @@ def test_a_calibration_file_corrects_windows_with_the_sd_of_the_regression(fitte
     report = next(row for row in result.residuals if row.section == 'all')
     assert np.sqrt(np.mean(along**2)) < 1.3 * report.fitted.rms + 5e-6
     assert prior.sigma.min() > 0.0
-    result, claim = fitted
-    calibration = result.calibration
     layout = parameter_layout(calibration)
     covariance = calibration.posterior.covariance()
     assert covariance.shape == (layout.n_parameters, layout.n_parameters)
-    state = result.fit.posterior.state
     K = np.array([axis.scale_factor for axis in calibration.axes])
     sd = np.sqrt(np.diag(claim.covariance))
     by_file = np.sqrt(np.diag(covariance))

@@ -11,6 +11,7 @@ import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -86,12 +87,9 @@ def test_all_units_are_fitted_despite_a_killed_worker_and_only_once(client, flee
     assert float(table[0]['bias_x_ug']) == rows['A/good']['bias_x_ug']
     before = contents(out / 'units')
     again = fit_fleet(str(fleet), out, OPTIONS, scheduler='tcp://nobody:1')
-    assert again.n_done == 0
-    assert again.rows == result.rows
-    assert contents(out / 'units') == before
+    assert (again.n_done, again.rows, contents(out / 'units')) == (0, result.rows, before)
     os.utime(fleet / 'A/good/01.mcap', ns=(0, 0))
-    touched = fit_fleet(str(fleet), out, OPTIONS, scheduler=scheduler)
-    assert touched.n_done == 1
+    assert fit_fleet(str(fleet), out, OPTIONS, scheduler=scheduler).n_done == 1
     after = contents(out / 'units')
     assert {Path(name).parts[1] for name in before if before[name] != after[name]} == {'good'}
     (out / 'units/B/exchanged').rename(out / 'units/B/other')
@@ -124,8 +122,7 @@ def test_unreadable_bags_leave_earlier_results_in_place(scheduler, tmp_path):
         path.write_bytes(content)
         os.utime(path, ns=(stamp_ns, stamp_ns))
     third = fit_fleet(str(tmp_path / 'bags'), tmp_path / 'out', options, scheduler=scheduler)
-    assert third.n_done == 0
-    assert third.rows == first.rows
+    assert (third.n_done, third.rows) == (0, first.rows)
 
 
 def test_an_interrupted_fleet_run_continues(scheduler, tmp_path):
@@ -205,21 +202,17 @@ class TestScheduler:
             fit_fleet(refused, tmp_path / 'other', OPTIONS, scheduler=address)
 
 
-class _Future:
-    def __init__(self, status, error=None):
-        self.status, self._error = status, error
-
-    def exception(self):
-        return self._error
+def future_of(status, error=None):
+    return SimpleNamespace(status=status, exception=lambda: error)
 
 
 @pytest.mark.parametrize(
     ('future', 'problem'),
     [
-        (_Future('error', distributed.KilledWorker('task', None, 3)),
+        (future_of('error', distributed.KilledWorker('task', None, 3)),
          'the worker of its task died 4 times: too little memory?'),
-        (_Future('error', MemoryError('no\n room')), 'MemoryError: no room'),
-        (_Future('lost'), 'the connection to the Dask scheduler was lost'),
+        (future_of('error', MemoryError('no\n room')), 'MemoryError: no room'),
+        (future_of('lost'), 'the connection to the Dask scheduler was lost'),
     ],
 )  # fmt: skip
 def test_the_next_run_repeats_a_failed_task(future, problem, fleet, tmp_path):
@@ -282,8 +275,7 @@ def test_a_unit_is_fitted_again_with_other_options(scheduler, fleet, tmp_path):
 @pytest.mark.slow
 def test_the_prior_of_siblings_reduces_the_scale_error_of_a_unit_with_one_bag(scheduler, tmp_path):
     # Unit 0 has a single position, which does not separate bias and scale; units 1 to 3 have nine.
-    kind = unit_preset('mems', 1)
-    siblings = [sibling(kind, number) for number in range(4)]
+    siblings = [sibling(unit_preset('mems', 1), number) for number in range(4)]
     for number, unit in enumerate(siblings):
         folder, n_bags = tmp_path / 'bags' / f'u{number}', 9 if number else 1
         write_unit(folder, number, n_bags, unit=unit, serial=f's{number}')
@@ -295,8 +287,7 @@ def test_the_prior_of_siblings_reduces_the_scale_error_of_a_unit_with_one_bag(sc
     assert [source.name for source in of_type.sources] == ['s1', 's2', 's3']
     before = contents(tmp_path / 'out' / 'units')
     helped = fit_fleet(*arguments, scheduler=scheduler, with_prior=True)
-    assert helped.n_done == 1
-    assert contents(tmp_path / 'out' / 'units') == before
+    assert (helped.n_done, contents(tmp_path / 'out' / 'units')) == (1, before)
     assert [bool(row['prior']) for row in helped.rows] == [True, False, False, False]
     (before_row, *_), (row, *_) = alone.rows, helped.rows
     # Compare the norm of the errors of three axes, as one error may be small by chance.

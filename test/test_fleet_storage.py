@@ -120,8 +120,7 @@ class TestDiscovery:
         ],
     )
     def test_files_of_a_folder_are_grouped_into_bags(self, files, bags):
-        stored = [StoredFile(name, 1, '') for name in files]
-        assert list(group_files(stored)) == bags
+        assert list(group_files([StoredFile(name, 1, '') for name in files])) == bags
 
     def test_folders_give_unit_and_lot(self, tmp_path):
         for name in (
@@ -335,7 +334,6 @@ class TestRow:
     def test_the_lag_of_a_board_that_changes_before_the_case_is_negative(self, tmp_path):
         # WHY: a calibration without a measured board lag contains the default, 900 s.
         write_unit(tmp_path / 'u', 1, 4, is_exchanged=True)
-        allowed = replace(OPTIONS.fit, allow=('swapped',))
-        outcome = processed(tmp_path, fit=allowed)
+        outcome = processed(tmp_path, fit=replace(OPTIONS.fit, allow=('swapped',)))
         assert outcome.row['board_lag_s'] < -100.0
         assert parse_calibration(outcome.calibration.encode()).board_lag_s == 900.0

@@ -56,8 +56,7 @@ class TestOutliers:
         rows[17] = {**rows[17], 'bias_y_ug': 50.0 * 12.0}
         (outliers,) = summarise(rows).outliers
         assert (outliers.serial, outliers.label, outliers.unit) == ('S017', 'bias y', 'µg')
-        assert outliers.value == 600.0
-        assert outliers.z == pytest.approx(12.0, rel=0.3)
+        assert (outliers.value, outliers.z) == (600.0, pytest.approx(12.0, rel=0.3))
         rows = fleet_of(60, rng)
         for i in range(5):
             rows[i] = {**rows[i], 'dynamic_ug': 40.0}
@@ -161,27 +160,21 @@ class TestDrift:
         table, _ = write_tables(first, tmp_path)
         before = read_parquet(table)
         assert before == first
-        later = fleet_of(3, rng, day=90.0, like=first)
-        drifts = summarise(later, before).drifts
+        drifts = summarise(fleet_of(3, rng, day=90.0, like=first), before).drifts
         names = sorted(drift.earlier for drift in drifts)
         assert names == [f'earlier /u00{i}@0' for i in range(3)]
         assert summarise(first, before).drifts == ()
 
 
-def hostile(rng):
-    evil = '<script>alert(1)</script>"&$x_1$'
-    first = fleet_of(12, rng, lots=('A', evil))
-    rows = [*first, *fleet_of(12, rng, lots=('A', evil), day=400.0, like=first)]
-    for row in rows:
-        row |= {name: f'{evil}{row[name]}' for name in ('serial', 'name')}
-    rows[0] = {**rows[0], 'bias_x_ug': 1e5}
-    rows[1] = row_of(name=evil, serial=evil, verdict='refused', problem=f'3.5 {evil}')
-    return rows
-
-
 class TestPage:
     def test_text_from_bags_is_no_markup_and_the_page_needs_no_network(self, rng):
-        rows = hostile(rng)
+        evil = '<script>alert(1)</script>"&$x_1$'
+        first = fleet_of(12, rng, lots=('A', evil))
+        rows = [*first, *fleet_of(12, rng, lots=('A', evil), day=400.0, like=first)]
+        for row in rows:
+            row |= {name: f'{evil}{row[name]}' for name in ('serial', 'name')}
+        rows[0] = {**rows[0], 'bias_x_ug': 1e5}
+        rows[1] = row_of(name=evil, serial=evil, verdict='refused', problem=f'3.5 {evil}')
         page = render_fleet(rows, summarise(rows), lambda row: f'units/{row["name"]}/c.html')
         assert '<script' not in page
         assert '&lt;script&gt;alert(1)' in page
@@ -224,8 +217,7 @@ class TestTable:
             row_of(colour='red')
 
     def test_the_page_on_fleets_lists_every_column(self):
-        text = (ROOT / 'docs' / 'fleet.md').read_text()
-        rows = text.replace('\\|', '|').splitlines()
+        rows = (ROOT / 'docs' / 'fleet.md').read_text().replace('\\|', '|').splitlines()
         listed = [row for row in rows if re.match(r'\| `\w+` \| \w+ \| .* \|$', row)]
         assert listed == [f'| `{each.name}` | {each.kind} | {each.meaning} |' for each in COLUMNS]
 
@@ -234,11 +226,9 @@ class TestTable:
     'name', ['../../etc', '.', '..', 'a/../b', '/abs', 'a\0b', 'x' * 300, 'ü/ß', 'a b', '']
 )
 def test_the_result_folder_of_any_name_is_inside_the_results(name, tmp_path):
-    results = Results(tmp_path / 'out')
-    folder = results.folder_of(name)
+    folder = Results(tmp_path / 'out').folder_of(name)
     folder.mkdir(parents=True)
-    inside = (tmp_path / 'out' / 'units').resolve()
-    assert inside in folder.resolve().parents
+    assert (tmp_path / 'out' / 'units').resolve() in folder.resolve().parents
 
 
 def test_results_are_not_written_into_a_file(tmp_path):

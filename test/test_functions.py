@@ -29,15 +29,12 @@ FUNCTIONS = [functions.Polynomial((1.0,)), functions.Polynomial((0.0, 2e-3, -3e-
 temperatures = st.floats(-15.0, 15.0)
 
 
-def test_a_polynomial_and_an_exponential_agree_with_hand_numbers():
+def test_curves_agree_with_hand_numbers_and_splines_with_scipy():
     # Eq. (10): the term with a4 is a4 t^4; Golovach's paper prints a4 t.
     assert functions.Polynomial((1.0, 2.0, 0.5, 0.25, 1.0)).value(3.0) == 1 + 6 + 4.5 + 6.75 + 81
     function = functions.Exponential(-2.0, (2.0,), (10.0,))
     assert function.value(0.0) == 0.0
     assert function.value(10.0) == pytest.approx(2.0 * (np.e - 1.0), rel=1e-15)
-
-
-def test_a_cubic_spline_equals_that_of_scipy_and_is_constant_beyond_its_ends():
     values = (1.5, 0.4, 0.0, -0.2, 0.9)
     ours = functions.CubicSpline(KNOTS, values)
     reference = ReferenceSpline(KNOTS, values, bc_type='natural')
@@ -108,25 +105,20 @@ def test_a_curve_that_is_not_finite_is_refused(bad):
             functions.check_reference('bias_function', function, 0.0)
 
 
-def slope_and_lag(variances):
-    """Make a unit with a bias slope and a lag of 600 s; `variances` of its first parameters."""
+def test_the_predicted_sd_agrees_with_hand_numbers_or_is_that_of_the_residual():
     unit = calibration(
         static=regime_set(*[axis_set((0.0, 0.3), residual_sd_m_s2=3e-5)] * 3),
         dynamic=regime_set(*[axis_set((0.0, 0.3))] * 3),
         response=(term('board', (0.3, 0.0, 0.0), tau_s=600.0),),
     )
-    n_other = parameter_layout(unit).n_parameters - len(variances)
-    return replace(unit, posterior=posterior_of(np.diag([*variances, *[0.0] * n_other])))
-
-
-def test_the_predicted_sd_agrees_with_hand_numbers_or_is_that_of_the_residual():
     # Parameters of x: level and slope of the bias per set (0-3), lag (4), scale per set (5, 6).
-    unit = slope_and_lag([4e-4, 1e-6, 9e-4, 0.0, 1e-6, 1e-12, 4e-12])
+    variances = np.zeros(parameter_layout(unit).n_parameters)
+    variances[:7] = 4e-4, 1e-6, 9e-4, 0.0, 1e-6, 1e-12, 4e-12
+    unit = replace(unit, posterior=posterior_of(np.diag(variances)))
     states = ramp_states(unit, np.array([20.0, 30.0]), 0.0, np.inf)
     _, bias, _, scale = bias_scale_and_sd(unit, states)
     # Bias variance at 30 degC: 4e-4 + 100 * 1e-6 counts^2, plus the residual's (30 um/s^2)^2.
-    expected = np.sqrt([4e-4, 5e-4]) / 300.0
-    assert bias[:, 0] == pytest.approx(np.hypot(expected, 3e-5), rel=1e-6)
+    assert bias[:, 0] == pytest.approx(np.hypot(np.sqrt([4e-4, 5e-4]) / 300.0, 3e-5), rel=1e-6)
     assert bias[:, 1] == pytest.approx([3e-5, 3e-5])
     assert scale[:, 0] == pytest.approx([1e-6, 1e-6], rel=1e-6)
     # In an endless ramp of 0.6 K/min a part with a lag of 600 s is 6 K behind the board.

@@ -9,6 +9,7 @@ import json
 import numpy as np
 import pytest
 from builders import GRAVITY, axis_set, calibration, equal_axes, regime_set
+from conftest import ROOT
 
 from thermo_comp.cli.output import micro_g
 from thermo_comp.errors import RecordingError
@@ -121,8 +122,7 @@ class TestWindows:
             np.testing.assert_allclose(windows.raw_residual, drift, atol=1e-9)
             np.testing.assert_allclose(windows.residual, expected, atol=1e-9)
             np.testing.assert_allclose(windows.board, 30.0, rtol=0.0, atol=1e-6)
-        bag = resting(tmp_path / 'cold', 20.0)
-        judgement = judged(bag, calibration(), gravity=GRAVITY + 1e-3)
+        judgement = judged(resting(tmp_path / 'cold', 20.0), calibration(), gravity=GRAVITY + 1e-3)
         np.testing.assert_allclose(judgement.windows.residual, -1e-3, atol=1e-9)
 
     def test_a_window_is_the_mean_of_the_samples_that_the_node_publishes(self, tmp_path):
@@ -164,8 +164,7 @@ class TestWindows:
 
     @pytest.mark.parametrize('rate_hz', [10, 40])
     def test_residuals_of_white_noise_agree_with_their_claimed_sd(self, tmp_path, rate_hz):
-        # The calibration, at 10 Hz, has the density of the bag's white noise: 0.3 counts per
-        # sample at 10 Hz, 0.6 at 40 Hz.
+        # At both rates the noise has the density in the calibration: 0.3 counts/sample at 10 Hz.
         knows, noise = of_noise(0.3 / K), 0.3 * np.sqrt(rate_hz / 10.0)
         bag = resting(tmp_path / 'bag', 20.0, minutes=40.0, rate_hz=rate_hz, noise=noise)
         windows = judged(bag, knows, window_s=10.0).windows
@@ -232,8 +231,7 @@ class TestVerdict:
     ):
         limit = None if tolerance is None else tolerance * MICRO_G
         judgement = judge(made(residual, raw, claimed), CLAIMING, limit)
-        assert judgement.verdict == verdict
-        assert judgement.is_valid == verdict.startswith('valid')
+        assert (judgement.verdict, judgement.is_valid) == (verdict, verdict.startswith('valid'))
         assert judgement.exit_code == (0 if judgement.is_valid else 1)
         assert judgement.sections['all'].ratio == pytest.approx(residual / claimed)
         for value in (residual, raw, tolerance or claimed):
@@ -287,8 +285,7 @@ class TestVerdict:
         bag = resting(tmp_path / 'bag', 25.0)
         fitted = ResidualSummary('all', 40, 1e-3, 5e-4, 1e-3, left_out_rms_m_s2=3e-4)
         for sha256, expected in ((digest(bag), 3e-4), ('0' * 64, np.nan)):
-            sources = (Source('bag', sha256, 6000),)
-            provenance = Provenance(sources=sources, residuals=(fitted,))
+            provenance = Provenance(sources=(Source('bag', sha256, 6000),), residuals=(fitted,))
             judgement = judged(bag, dataclasses.replace(CLAIMING, provenance=provenance))
             assert judgement.left_out_rms == pytest.approx(expected, nan_ok=True)
 
@@ -319,13 +316,11 @@ class TestVerdict:
         bad = windows.force.copy()
         windows.force[:10, 2] = GRAVITY + 5000.0 * MICRO_G
         found = judge(windows, CLAIMING)
-        assert found.verdict == 'valid'
-        assert found.sections['all'].n == 30
+        assert (found.verdict, found.sections['all'].n) == ('valid', 30)
         assert found.sections['outside'].n == 10
         assert '10 windows of 60 s outside the calibrated ranges not judged: 5 mg' in found.reason
         bad[10:, 2] = GRAVITY + 500.0 * MICRO_G
-        found = judge(dataclasses.replace(windows, force=bad), CLAIMING)
-        assert found.verdict == 'recalibrate'
+        assert judge(dataclasses.replace(windows, force=bad), CLAIMING).verdict == 'recalibrate'
         for tolerance in (None, 1.0):
             found = judge(made(1.0, 1000.0, 60.0, outside=40), CLAIMING, tolerance)
             assert found.verdict == 'outside the calibrated range: not judged'
@@ -349,8 +344,7 @@ def around(n, bias, scale, noise=0.0):
     position = np.repeat(np.arange(n), 12)
     force = up[position] * GRAVITY * (1.0 + np.array(scale)) + np.array(bias)
     force += noise * rng.standard_normal(force.shape)
-    windows = made(0.0, 1000.0, 2.0, n=12 * n)
-    return dataclasses.replace(windows, position=position, force=force)
+    return dataclasses.replace(made(0.0, 1000.0, 2.0, n=12 * n), position=position, force=force)
 
 
 class TestShifts:
@@ -386,11 +380,11 @@ class TestShifts:
         np.testing.assert_allclose(judgement.axis_rms, [[0, 0, 0], [3e-5, 0, 0]], atol=1e-12)
 
 
-def test_evaluate_reports_exchanged_thermometers_and_temperatures_out_of_range(root, tmp_path):
+def test_evaluate_reports_exchanged_thermometers_and_temperatures_out_of_range(tmp_path):
     """Exchanged thermometers make a verdict invalid; temperatures out of range give a note."""
     exchanged = Topics(board='temperature/case', case='temperature/board')
     for topics, text in ((Topics(), []), (exchanged, [SWAPPED])):
-        bag = root / 'bags' / 'held_out.mcap'
+        bag = ROOT / 'bags' / 'held_out.mcap'
         result = replay(bag, CLAIMING, tmp_path / f'{len(text)}.mcap', topics=topics, serial='')
         assert result.notes == text
         verdict = judged(bag, CLAIMING, topics=topics, serial='', tolerance=1.0 + 9.0 * len(text))
@@ -398,8 +392,7 @@ def test_evaluate_reports_exchanged_thermometers_and_temperatures_out_of_range(r
         assert not (text and verdict.is_valid)
         assert verdict.reason.startswith(SWAPPED) == bool(text)
     _, upper = CLAIMING.static.temperature_range_c
-    hot = resting(tmp_path / 'hot', upper + 2.0)
-    (note,) = replay(hot, CLAIMING, tmp_path / 'hot.mcap').notes
+    (note,) = replay(resting(tmp_path / 'hot', upper + 2.0), CLAIMING, tmp_path / 'hot.mcap').notes
     assert note == f'board temperature +2.00 K {CONTINUED}'
 
 
@@ -431,8 +424,7 @@ def test_a_constant_axis_of_an_imu_is_named_if_its_noise_exceeds_a_step(
         readings = 20.0 + 1e-7 * (np.arange(600) % 2)
         for topic in (TOPICS.board, TOPICS.case):
             writer.write_temperature(topic, START_NS + np.arange(600) * 10**9, readings)
-        stamps = START_NS + np.arange(n) * 10**8
-        writer.write_imu(TOPICS.imu, stamps, force, np.zeros(9))
+        writer.write_imu(TOPICS.imu, START_NS + np.arange(n) * 10**8, force, np.zeros(9))
     unit = Unit('T-1', 'm/s^2', 80.0, 0.1)
     density = (noise * np.sqrt(0.1),) * 3
     known = calibration(unit=unit, axes=equal_axes(1.0), noise_density_m_s2_sqrt_hz=density)

@@ -10,7 +10,7 @@ import field_watch
 import numpy as np
 import pytest
 from builders import axis_set, calibration, regime_set
-from field_helpers import in_any_attitude, jump_of, known, no_error, rests, upright
+from field_helpers import in_any_attitude, jump_of, no_error, precise, rests, upright
 from report_helpers import evidence, fitted, write_bag
 from scipy.stats import norm
 
@@ -34,8 +34,7 @@ def dated(created, bias_ug=0.0, ppm=0.0, sd_ug=3.0):
     axes = replace(calibration().axes, z=AxisReference(scale, bias_ug * MICRO_G * scale))
     part = regime_set(*[axis_set(residual_sd_m_s2=sd_ug * MICRO_G)] * 3)
     unit = calibration(axes=axes, static=part, dynamic=part)
-    sources = (Source(created, created),)
-    provenance = replace(unit.provenance, created=created, sources=sources)
+    provenance = replace(unit.provenance, created=created, sources=(Source(created, created),))
     return replace(unit, provenance=provenance)
 
 
@@ -46,8 +45,7 @@ def test_changes_between_calibrations_equal_those_found_by_hand_if_they_form_a_h
     assert [drift.constant for drift in drifts] == names
     *still, z = drifts[:3]
     assert (z.earlier, z.later, z.unit) == ('2026-01-01', '2026-02-01', 'ug')
-    assert z.change == pytest.approx(20.0)
-    assert z.sd == pytest.approx(5.0)
+    assert (z.change, z.sd) == (pytest.approx(20.0), pytest.approx(5.0))
     assert z.is_sure
     assert drifts[5].change == pytest.approx(50.0)
     for change in still:
@@ -77,13 +75,11 @@ def test_evaluate_and_report_print_the_history(cli, tmp_path, monkeypatch):
     assert (x['constant'], x['earlier']) == ('bias x', '2020-01-01T00:00:00Z')
     assert x['change'] == pytest.approx(-10.0 / now.axes.x.scale_factor / MICRO_G, rel=1e-3)
     page = tmp_path / 'page.html'
-    drawn = json.loads(cli('report', *given, '-o', page).stdout)
-    assert drawn['history'] == content['history']
+    assert json.loads(cli('report', *given, '-o', page).stdout)['history'] == content['history']
     assert '2020-01-01' in page.read_text(encoding='utf-8')
     assert '<h2>History</h2>' not in render_report(evidence())
     # WHY: the calibration of another unit was left out of the history without a message.
-    unit = replace(now.unit, serial='other')
-    save_calibration(replace(now, unit=unit), tmp_path / 'other.yaml')
+    save_calibration(replace(now, unit=replace(now.unit, serial='other')), tmp_path / 'other.yaml')
     refused = cli('report', *given, '-c', tmp_path / 'other.yaml', '-o', tmp_path / 'p', code=1)
     assert 'other.yaml: unit.serial: must be ' in refused.stderr
 
@@ -173,7 +169,7 @@ def test_forecasts_agree_with_the_simulated_future_of_units():
 @pytest.mark.parametrize('attitudes', [upright, pytest.param(in_any_attitude, marks=SLOW)])
 def test_the_verdict_follows_the_true_error_on_each_day(attitudes):
     # The RMS error is 1.5 times the limit on days 20 to 34, 20 times on day 12, else 0.6 times.
-    unit = known()
+    unit = precise()
     limit = LIMIT * np.sqrt(np.mean(series_of(rests(unit, attitudes, no_error), unit).claim ** 2))
 
     def error(day):
@@ -199,7 +195,7 @@ def test_the_verdict_follows_the_true_error_on_each_day(attitudes):
 
 def test_the_drift_watch_states_the_day_and_the_temperature_range():
     of_field = field_units.calibration()
-    unit = known(static=of_field.static, dynamic=of_field.dynamic)
+    unit = precise(static=of_field.static, dynamic=of_field.dynamic)
     healthy = watch(series_of(rests(unit, upright, no_error), unit), unit)
     assert (healthy.exit_code, healthy.outside_since) == (0, None)
     assert 'within its claim up to 2030-01-20' in str(healthy)

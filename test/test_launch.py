@@ -77,7 +77,7 @@ def parameters_set(arguments):
 
 def test_a_parameter_is_set_only_where_its_argument_was_given(tmp_path):
     # WHY: defaults of launch arguments replaced values in the user's parameter file.
-    pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
+    pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
     import rclpy
     import yaml
     from builders import calibration
@@ -94,8 +94,7 @@ def test_a_parameter_is_set_only_where_its_argument_was_given(tmp_path):
     other = tmp_path / 'counts.yaml'
     save_calibration(calibration(unit=Unit('0042', 'counts', 32767.0, 0.01)), other)
     counts = {'input': 'counts', 'calibration_file': str(other)}
-    some = [{}, {'frame_id': 'body'}, {'serial': '0042', **counts}]
-    for arguments in some:
+    for arguments in [{}, {'frame_id': 'body'}, {'serial': '0042', **counts}]:
         files = []
         # ros2 launch passes the user's file first, then the values of the launch file.
         for name, values in (('mine', mine), ('launch', parameters_set(arguments))):
@@ -113,37 +112,7 @@ def test_a_parameter_is_set_only_where_its_argument_was_given(tmp_path):
         assert all(name.startswith(NOT_GIVEN) for name in unknown)
 
 
-def test_executable_parameters_topics_and_drivers_of_a_launch_file_exist():
-    pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
-    from dataclasses import fields
-
-    from thermo_comp.ros.parameters import NodeConfig
-
-    (node,) = parse(OURS).findall('node')
-    assert (node.get('pkg'), node.get('name')) == ('thermo_comp', 'thermo_comp')
-    scripts = re.findall(r"'(\w+) = thermo_comp", (ROOT / 'setup.py').read_text())
-    assert node.get('exec') in scripts
-    config = configparser.ConfigParser()
-    config.read(ROOT / 'setup.cfg')
-    assert config['install']['install_scripts'].endswith('lib/thermo_comp')
-    named = set(parameters_set(dict.fromkeys(declared(parse(OURS)), 'given')))
-    assert named == {'calibration_file', 'serial', 'input', 'topics', 'frame_id'}
-    assert named <= {field.name for field in fields(NodeConfig)}
-    # Without the type `str` a serial such as 0042 would become a number.
-    assert all(arg.get('type') == 'str' for arg in node.findall('param') if arg.get('name'))
-    topics = {topic.name for topic in (*INPUTS.values(), *OUTPUTS)}
-    defaults = {arg.get('name'): arg.get('default') for arg in parse(OURS).findall('arg')}
-    for remap in node.findall('remap'):
-        topic = remap.get('from')
-        assert topic in topics or topic.startswith('temperature/'), topic
-        argument = re.fullmatch(r'\$\(var (\w+)\)', remap.get('to', ''))
-        assert defaults[argument[1]] == topic
-    parameters = parameters_set({'driver': 'xsens'})
-    assert parameters['topics'] == str(ROOT / 'config/drivers/xsens.yaml')
-    assert 'topics' not in parameters_set({})
-
-
-def test_the_launch_file_beside_ins_has_existing_arguments_parameters_and_frames():
+def test_executables_parameters_topics_drivers_and_frames_of_launch_files_exist():
     (include,) = parse(BESIDE).findall('include')
     assert include.get('file', '').endswith(OURS.name)
     assert {element.get('name') for element in include.findall('arg')} <= declared(parse(OURS))
@@ -161,3 +130,28 @@ def test_the_launch_file_beside_ins_has_existing_arguments_parameters_and_frames
     assert ekf['imu0_remove_gravitational_acceleration'] == 'true'
     mounting = by_exec['static_transform_publisher'].get('args', '')
     assert f'--frame-id {ekf["base_link_frame"]}' in mounting
+    pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
+    from dataclasses import fields
+
+    from thermo_comp.ros.parameters import NodeConfig
+
+    (node,) = parse(OURS).findall('node')
+    assert (node.get('pkg'), node.get('name')) == ('thermo_comp', 'thermo_comp')
+    assert node.get('exec') in re.findall(r"'(\w+) = thermo_comp", (ROOT / 'setup.py').read_text())
+    config = configparser.ConfigParser()
+    config.read(ROOT / 'setup.cfg')
+    assert config['install']['install_scripts'].endswith('lib/thermo_comp')
+    named = set(parameters_set(dict.fromkeys(declared(parse(OURS)), 'given')))
+    assert named == {'calibration_file', 'serial', 'input', 'topics', 'frame_id'}
+    assert named <= {field.name for field in fields(NodeConfig)}
+    # Without the type `str` a serial such as 0042 would become a number.
+    assert all(arg.get('type') == 'str' for arg in node.findall('param') if arg.get('name'))
+    topics = {topic.name for topic in (*INPUTS.values(), *OUTPUTS)}
+    defaults = {arg.get('name'): arg.get('default') for arg in parse(OURS).findall('arg')}
+    for remap in node.findall('remap'):
+        topic = remap.get('from')
+        assert topic in topics or topic.startswith('temperature/'), topic
+        argument = re.fullmatch(r'\$\(var (\w+)\)', remap.get('to', ''))
+        assert defaults[argument[1]] == topic
+    assert parameters_set({'driver': 'xsens'})['topics'] == str(ROOT / 'config/drivers/xsens.yaml')
+    assert 'topics' not in parameters_set({})

@@ -50,8 +50,7 @@ SOURCES = sorted(PACKAGE.rglob('*.py'))
 
 
 def unit_of(path):
-    relative = path.relative_to(PACKAGE)
-    return relative.parts[0].removesuffix('.py')
+    return path.relative_to(PACKAGE).parts[0].removesuffix('.py')
 
 
 @cache
@@ -162,8 +161,7 @@ def test_tables_of_packages_and_of_groups_equal_those_of_the_source():
     text = (DOCS / 'architecture.md').read_text()
     rows = re.findall(r'^\| (\d) \| `(\w+)` \|', text, re.MULTILINE)
     assert {room: int(layer) for layer, room in rows} == LAYERS
-    text = (DOCS / 'theory.md').read_text()
-    shown = re.findall(r'^\| `(\w+)` \|', text, re.MULTILINE)
+    shown = re.findall(r'^\| `(\w+)` \|', (DOCS / 'theory.md').read_text(), re.MULTILINE)
     columns = bank(('case',), {'case': -0.5}, (-9.0, 9.0))
     # The group `part` has no columns of its own: its curves are sums of other columns.
     groups = {'part', *(column.group for column in columns)}
@@ -176,8 +174,7 @@ def test_tables_of_packages_and_of_groups_equal_those_of_the_source():
 
 @pytest.mark.parametrize('page', ['architecture.md', 'theory.md'])
 def test_the_files_that_a_page_names_exist(page):
-    text = (DOCS / page).read_text()
-    for name in re.findall(r'[\w*/]+\.py\b', text):
+    for name in re.findall(r'[\w*/]+\.py\b', (DOCS / page).read_text()):
         places = (ROOT, ROOT / 'thermo_comp', ROOT / 'test')
         # A page names a file by its path, or by its name alone if the folder is named before.
         is_path = any(list(place.glob(name)) for place in places)

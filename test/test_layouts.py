@@ -74,7 +74,7 @@ def script():
     return only['sourceCode']
 
 
-def test_foxglove_paths_name_numbers_in_the_messages(topics):
+def test_foxglove_paths_name_numbers_of_messages_and_each_panel_is_shown_once(topics):
     used = set()
     (output,) = re.findall(r'export const output = "(.*)"', script())
     fields_of_script = re.findall(r'(\w+): number', re.search(r'type Output = .*', script())[0])
@@ -88,9 +88,6 @@ def test_foxglove_paths_name_numbers_in_the_messages(topics):
         used.add(topic)
     # `regime/stamped` repeats the flags of `regime/dynamic`, which the Foxglove layout shows.
     assert used == {output, *topics} - {'/regime/stamped'}
-
-
-def test_foxglove_panels_are_shown_once_and_their_topics_exist(topics):
     (inputs,) = re.findall(r'export const inputs = (\[.*\])', script())
     assert set(json.loads(inputs)) <= set(topics)
     rendered = {p['topicToRender'] for p in panels().values() if 'topicToRender' in p}
@@ -106,16 +103,6 @@ def plotjuggler():
     return ET.fromstring(PLOTJUGGLER.read_text())  # noqa: S314 - our own file
 
 
-def source_kind(topics, series):
-    topic = max((t for t in topics if series.startswith(f'{t}/')), key=len)
-    fields = series[len(topic) + 1 :].split('/')
-    # PlotJuggler names an entry of a covariance [row;column]; messages number entries from 0 to 8.
-    if match := re.fullmatch(r'\[([012]);([012])\]', fields[-1]):
-        place = 3 * int(match[1]) + int(match[2])
-        fields = [*fields[:-2], f'{fields[-2]}[{place}]']
-    return field_kind(topics[topic], fields)
-
-
 def test_plotjuggler_curves_name_numbers_and_splitters_count_their_panels(topics):
     root = plotjuggler()
     snippets = {snippet.get('name'): snippet for snippet in root.iter('snippet')}
@@ -124,7 +111,13 @@ def test_plotjuggler_curves_name_numbers_and_splitters_count_their_panels(topics
     sources = {element.text for pattern in patterns for element in root.findall(pattern)}
     assert set(snippets) <= curves
     for series in (curves - set(snippets)) | sources:
-        assert source_kind(topics, series) in ('float64', 'bool')
+        topic = max((name for name in topics if series.startswith(f'{name}/')), key=len)
+        fields = series[len(topic) + 1 :].split('/')
+        # PlotJuggler names entries of a covariance [row;column]; messages number them from 0 to 8.
+        if match := re.fullmatch(r'\[([012]);([012])\]', fields[-1]):
+            place = 3 * int(match[1]) + int(match[2])
+            fields = [*fields[:-2], f'{fields[-2]}[{place}]']
+        assert field_kind(topics[topic], fields) in ('float64', 'bool')
     for splitter in root.iter('DockSplitter'):
         assert int(splitter.get('count')) == len(splitter)
         assert len(splitter.get('sizes').split(';')) == len(splitter)

@@ -54,13 +54,11 @@ def test_bags_of_one_environment_do_not_separate_lags_of_board_and_gradient():
 def test_a_bag_without_fan_separates_lags_of_board_and_gradient():
     unit, bags = chamber()
     rng = rng_of('alike', 'still')
-    still = record(unit, HALF, spread(1, rng)[0], rng, environment=STILL_AIR)
-    result = fitted((*bags, still))
+    result = fitted((*bags, record(unit, HALF, spread(1, rng)[0], rng, environment=STILL_AIR)))
     assert all(finding.name != 'environment' for finding in result.findings)
     assert not advice_of(result)
-    # Without fan the gradient of a ramp is 1 / 0.7 = 1.43 times as large. One such bag in ten
-    # makes the columns differ by 0.3 * 0.43 = 0.13 RMS, as sqrt(0.1 * 0.9) = 0.3: the inflation is
-    # 0.13^-2 = 60.
+    # Without fan the gradient of a ramp is 1 / 0.7 = 1.43 times as large. With one such bag in ten
+    # the columns differ by 0.43 * sqrt(0.1 * 0.9) = 0.13 RMS: the inflation is 0.13^-2 = 60.
     assert 30.0 < inflation_of(result, 'board', 'gradient_lag') < 90.0
 
 
@@ -69,8 +67,7 @@ def test_one_attitude_in_the_chamber_does_not_separate_bias_and_scale():
     rng = rng_of('alike', 'bench')
     unit = navigation(rng)
     bench = positions(unit, ROOM, spread(18, rng), rng)
-    heated = positions(unit, HALF, UP, rng)
-    one, two = (fitted((*bench, *heated[:n])) for n in (1, 2))
+    one, two = (fitted((*bench, *positions(unit, HALF, UP, rng)[:n])) for n in (1, 2))
     (message,) = advice_of(one)
     assert 'changes of the bias from changes of the scale factor' in message
     assert 'with this axis at another angle to the vertical' in message
@@ -81,7 +78,7 @@ def test_one_attitude_in_the_chamber_does_not_separate_bias_and_scale():
 @pytest.mark.parametrize(
     ('parts', 'correlation', 'n_directions', 'is_advised'),
     [
-        (('bias', 'bias'), 0.996, 1, True),  # an inflation of 125
+        (('bias', 'bias'), 0.996, 1, True),  # variance inflation factor: 125
         (('bias', 'bias'), 0.994, 9, False),  # an inflation of 84
         (('bias', 'scale'), 0.996, 6, True),
         # The finding `positions` says that five attitudes do not separate bias and scale.

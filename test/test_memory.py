@@ -25,8 +25,7 @@ def test_the_lag_of_a_ramp_agrees_with_the_closed_formula(step_s):
         bank.step(round(k * step_s * 1e9), rate * k * step_s)
     end = (n + 0.3) * step_s
     lag, extra = bank.at(round(end * 1e9), rate * end)
-    expected = [rate * tau * -math.expm1(-end / tau) for tau in TAUS]
-    assert lag == pytest.approx(expected, rel=1e-9)
+    assert lag == pytest.approx([rate * tau * -math.expm1(-end / tau) for tau in TAUS], rel=1e-9)
     assert (max(extra) > 0.0) == (step_s > 6.0)
 
 
@@ -37,8 +36,7 @@ def test_errors_of_a_lag_after_a_gap_a_jump_wrong_or_stuck_readings_agree_with_f
     bank.step(50 * SECOND_NS, 2.0)
     lost = 2.0 * (1.0 - math.exp(-0.5))
     assert bank.extra == pytest.approx([lost**2, 0.0])
-    variance = bank.at(150 * SECOND_NS, 2.0)[1]
-    assert variance == pytest.approx([lost**2 * math.exp(-2.0), 0.0])
+    assert bank.at(150 * SECOND_NS, 2.0)[1] == pytest.approx([lost**2 * math.exp(-2.0), 0.0])
     bank.note_jump(3.0)
     assert bank.extra == pytest.approx([lost**2 + 9.0, 9.0])
     bank = LagBank((100.0,))
@@ -70,8 +68,7 @@ def after_two_stages(times, board):
     """Integrate two lags in series after a soak, with the board as input; return the output."""
 
     def slope(t, parts):
-        u = np.interp(t, times, board)
-        return [(u - parts[0]) / 900.0, (parts[0] - parts[1]) / 150.0]
+        return [(np.interp(t, times, board) - parts[0]) / 900.0, (parts[0] - parts[1]) / 150.0]
 
     start = [board[0], board[0]]
     solved = solve_ivp(slope, (times[0], times[-1]), start, t_eval=times, rtol=1e-9, atol=1e-9,
@@ -98,8 +95,7 @@ def test_a_lag_of_two_stages_equals_two_parts_in_series(rng):
     assert np.abs(streamed[:, 4]).max() <= 0.4 + 1e-12
     held = streamed[:, 4] + part
     is_inside = np.abs(streamed[:, 4]) < 0.4 - 1e-9
-    still = np.diff(held)[is_inside[1:] & is_inside[:-1]]
-    np.testing.assert_allclose(still, 0.0, atol=1e-5)
+    np.testing.assert_allclose(np.diff(held)[is_inside[1:] & is_inside[:-1]], 0.0, atol=1e-5)
     on_grid = memory_on_grid(spec, 30.0, board, [board])
     np.testing.assert_allclose(on_grid[:, [0, 2, 4]], streamed[:, [0, 2, 4]], atol=1e-9)
 
@@ -165,8 +161,7 @@ def test_the_prior_of_the_initial_state_of_two_stages_is_that_of_a_random_walk(r
     tau = np.array([900.0, 150.0])
     parts = np.zeros((n, 2))
     for _ in range(900):
-        board = math.sqrt(D * step) * rng.standard_normal((n, 1))
-        parts -= board
+        parts -= math.sqrt(D * step) * rng.standard_normal((n, 1))
         parts[:, 0] *= math.exp(-step / tau[0])
         parts[:, 1] += (parts[:, 0] - parts[:, 1]) * -math.expm1(-step / tau[1])
     P = start_covariance([TWO_STAGES])
@@ -209,8 +204,7 @@ def test_initial_lag_states_have_the_prior_of_a_random_walk_and_decay(rng):
     P = start_covariance([('board', t) for t in tau])
     # The variance of n draws is uncertain by sqrt(2 / n) = 2.2 %; time step: 10 % of tau = 60 s.
     np.testing.assert_allclose(m.T @ m / n, P, rtol=0.11)
-    lags = (('board', 60.0), ('board', 3600.0), ('case', 3600.0), ('tip', 3600.0))
-    P = start_covariance(lags)
+    P = start_covariance((('board', 60.0), ('board', 3600.0), ('case', 3600.0), ('tip', 3600.0)))
     assert math.sqrt(P[1, 1]) == pytest.approx(3.0, rel=START_JITTER)
     assert math.sqrt(P[0, 0]) == pytest.approx(0.39, abs=0.005)
     assert math.sqrt(P[2, 2]) == pytest.approx(1.0, rel=START_JITTER)

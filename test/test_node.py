@@ -10,7 +10,7 @@ import pytest
 import yaml
 from conftest import ROOT
 
-pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 
 import ros_helpers as ros
 from builders import calibration, rich_calibration, thermal_calibration
@@ -137,8 +137,7 @@ def test_diagnostics_name_faults_of_samples(peer, saved):
         begin_ns = time.time_ns()
         array, status, values = wait(lambda s, _: 'no board temperature' in s.message)
         assert status.level == DiagnosticStatus.ERROR
-        assert status.name == '/thermo_comp: compensation'
-        assert status.hardware_id == 'T-1'
+        assert (status.name, status.hardware_id) == ('/thermo_comp: compensation', 'T-1')
         assert begin_ns - ros.SECOND_NS < ros.stamp_of(array) <= time.time_ns()
         assert values['sample stamp [ns]'] == 'none'
         driver = ros.drive(peer, node)
@@ -183,8 +182,7 @@ def test_diagnostics_contain_noise_density_and_bias_sd(peer, saved):
             assert bias > 0.0
             layout, covariance = parameter_layout(unit), unit.posterior.covariance()
             level = layout.scale['xyz'.index(axis)].static
-            sd = float(values[f'scale sd {axis}'])
-            assert sd >= 0.99 * math.sqrt(covariance[level, level])
+            assert float(values[f'scale sd {axis}']) >= 0.99 * math.sqrt(covariance[level, level])
             of_rate = float(values[f'noise density of rate {axis} [rad/s/sqrt(Hz)]'])
             assert of_rate == unit.gyroscope.noise_density_rad_s_sqrt_hz['xyz'.index(axis)]
             # In an unknown regime the bias sd contains the regimes' bias difference, 30 urad/s.
@@ -229,8 +227,7 @@ def test_diagnostics_name_faults_of_temperatures(peer, saved):
         wait(lambda s, _: 'board temperature 15.0 s old, but still' in s.message)
         driver.counts(ros.START_NS + 40 * ros.SECOND_NS, *ros.standing(40))
         _, status, values = wait(lambda s, _: '25.0 s old, nothing is published' in s.message)
-        assert status.level == DiagnosticStatus.ERROR
-        assert values['stale'] == '1'
+        assert (status.level, values['stale']) == (DiagnosticStatus.ERROR, '1')
 
 
 def test_a_node_with_constants_needs_no_thermometer(peer, saved):

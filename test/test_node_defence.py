@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 
 import ros_helpers as ros
 from builders import calibration
@@ -35,13 +35,10 @@ from thermo_comp.unit.calibration_file import save_calibration
 SLOW = pytest.mark.slow
 
 
-def odd(name, kind):
-    return ParameterMessage(name=name, value=ParameterValue(type=kind))
-
-
 #: Parameters that a request may contain; the node must answer each request.
 STRANGE = [
-    *[odd(name, kind) for name in ('frame_id', '', 'no such') for kind in (0, 77, 255)],
+    *[ParameterMessage(name=name, value=ParameterValue(type=kind))
+      for name in ('frame_id', '', 'no such') for kind in (0, 77, 255)],
     *[
         Parameter(name, value=value).to_parameter_msg()
         for name, value in (
@@ -74,10 +71,8 @@ def test_any_request_is_answered_and_samples_go_on(peer, unit, together):
         samples.go_on()
         good = Parameter('frame_id', value='body').to_parameter_msg()
         answer = peer.call(kind, name, kind.Request(parameters=[STRANGE[1], good]))
-        config = node._relay.running.config
-        assert config.frame_id == ('' if together else 'body')
-        many = kind.Request(parameters=[good] * (PARAMETERS_LIMIT + 1))
-        answer = peer.call(kind, name, many)
+        assert node._relay.running.config.frame_id == ('' if together else 'body')
+        answer = peer.call(kind, name, kind.Request(parameters=[good] * (PARAMETERS_LIMIT + 1)))
         result = answer.result if together else answer.results[0]
         assert f'at most {PARAMETERS_LIMIT}' in result.reason
         samples.go_on()
@@ -218,8 +213,7 @@ def test_while_a_calibration_file_hangs_other_parameters_can_be_set(peer, unit):
         node._reader._process.send_signal(signal.SIGSTOP)
         process, name = node._reader._process, 'thermo_comp/set_parameters'
         message = Parameter('calibration_file', value=str(unit)).to_parameter_msg()
-        request = srv.SetParameters.Request(parameters=[message])
-        hanging = peer._clients[name].call_async(request)
+        hanging = peer._clients[name].call_async(srv.SetParameters.Request(parameters=[message]))
         (result,) = peer.set_parameters(frame_id='body')
         assert result.successful
         samples.go_on()

@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import pytest
 
-pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 
 import rclpy
 from builders import calibration
@@ -81,8 +81,7 @@ def test_a_reload_while_samples_flow_loses_no_sample(peer, tmp_path):
     text = dump_calibration(of_bias(77.0))
     with NodeProcess(*lossless(), '-p', f'calibration_file:={first}') as node:
         flow = Flow(peer)
-        before = flow.more()
-        assert flow.bias(before - 1) == 1.0
+        assert flow.bias(flow.more() - 1) == 1.0
         assert [r.successful for r in peer.set_parameters(calibration_file=str(second))] == [True]
         flow.more()
         # WHY: a file with a lag of 1e-300 s was refused after its bias was already in use.
@@ -103,8 +102,7 @@ def test_a_reload_while_samples_flow_loses_no_sample(peer, tmp_path):
         assert peer.set_atomically(no_such=5).reason == 'there is no parameter `no_such`'
         result = peer.set_atomically(transition_time=5, calibration_file=str(tmp_path / 'none'))
         assert 'none: cannot be read: No such file' in result.reason
-        names = ['transition_time', 'frame_id']
-        request = GetParameters.Request(names=names)
+        request = GetParameters.Request(names=['transition_time', 'frame_id'])
         values = peer.call(GetParameters, 'thermo_comp/get_parameters', request).values
         assert values[0].double_value == 30.0
         assert flow.bias(flow.more() - 1) == 2.0
@@ -136,8 +134,7 @@ def test_a_reload_while_samples_flow_loses_no_sample(peer, tmp_path):
     stamps = [stamp_of(message) for message in flow.heard]
     assert stamps == list(range(stamps[0], stamps[-1] + 1, CYCLE_NS))
     biases = [flow.bias(index) for index in range(len(stamps))]
-    changes = [b for a, b in pairwise(biases) if a != b]
-    assert (biases[0], changes) == (1.0, [2.0, 3.0])
+    assert (biases[0], [b for a, b in pairwise(biases) if a != b]) == (1.0, [2.0, 3.0])
 
 
 class _Stop(BaseException):

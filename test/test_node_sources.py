@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 
 import ros_helpers as ros
 from builders import calibration
@@ -48,8 +48,7 @@ def test_samples_of_a_second_publisher_are_never_published(peer, unit):
             other.publish(strange)
 
         status = contested(peer, samples.reports, '/accel/counts', both)
-        values = {value.key: value.value for value in status.values}
-        assert values['sample publishers'] == '2'
+        assert {value.key: value.value for value in status.values}['sample publishers'] == '2'
         peer.node.destroy_publisher(other)
         peer.poll(lambda: node._relay.running.samples.count_publishers() == 1, 'one left')
         # After one of two drivers has ended, samples that it sent before may still arrive.
@@ -209,7 +208,7 @@ def test_a_driver_with_incompatible_qos_or_type_is_named(peer, unit):
 
 
 def test_reports_more_frequent_than_samples_report_no_missing_samples(peer, tmp_path):
-    # WHY: with a diagnostics_period below the sample interval, reports between samples were ERROR.
+    # WHY: with a diagnostics_period below the sample interval, some reports had level ERROR.
     slow = tmp_path / 'slow.yaml'
     # An error needs 5 cycles (1.5 s) without a sample: no busy machine pauses for so long.
     save_calibration(calibration(unit=Unit('T-1', 'counts', 32767.0, 0.3)), slow)

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from conftest import ran
 
-pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 
 from builders import calibration
 from node_process import NodeProcess, without_middleware
@@ -60,8 +60,7 @@ def test_a_node_that_cannot_start_prints_one_line(overrides, text, unit, tmp_pat
     save_calibration(calibration(unit=Unit('T-1', 'm/s^2', 160.0, 0.01)), tmp_path / 'imu.yaml')
     code = main(arguments(*(override.format(tmp=tmp_path, unit=unit) for override in overrides)))
     printed = capfd.readouterr()
-    assert code == 1
-    assert without_middleware(printed.out) == ''
+    assert (code, without_middleware(printed.out)) == (1, '')
     (line,) = printed.err.splitlines()
     assert line.startswith('thermo_comp_node: ')
     assert text in line
@@ -134,8 +133,7 @@ def test_the_node_needs_only_ros_numpy_and_yaml(unit, peer, tmp_path, monkeypatc
     monkeypatch.setenv('PYTHONPATH', str(tmp_path))
     check = f'from importlib.util import find_spec\nfor name in {ABSENT!r}:\n'
     check += '    try: find_spec(name)\n    except ModuleNotFoundError: print(name)'
-    finished = ran(sys.executable, '-c', check)
-    assert tuple(finished.stdout.split()) == ABSENT
+    assert tuple(ran(sys.executable, '-c', check).stdout.split()) == ABSENT
     heard = peer.listen(Imu, 'imu/data_raw')
     with NodeProcess('-p', f'calibration_file:={unit}') as node:
         driver = Driver(peer)
@@ -161,7 +159,7 @@ def test_the_node_needs_only_ros_numpy_and_yaml(unit, peer, tmp_path, monkeypatc
     assert (finished.stdout, finished.stderr) == ('', text)
 
 
-def test_the_node_prints_its_help_and_names_wrong_arguments(capfd):
+def test_the_node_prints_its_help_and_names_wrong_arguments_and_parameters(capfd, unit):
     assert main(['thermo_comp_node', '--help']) == 0
     assert 'example: thermo_comp_node --ros-args -p calibration_file' in capfd.readouterr().out
     assert main(['thermo_comp_node', 'unit.yaml']) == 2
@@ -170,9 +168,6 @@ def test_the_node_prints_its_help_and_names_wrong_arguments(capfd):
     printed = capfd.readouterr().err
     assert 'thermo_comp_node: ' in printed
     assert 'Traceback' not in printed
-
-
-def test_misspelt_parameters_of_the_node_are_named(unit, capfd):
     overrides = ['-p', f'calibration_file:={unit}', '-p', 'transition_tme:=3.0']
     overrides += ['-p', 'qos_overrides./imu/uncompensated.subscription.depth:=3']
     with node_in_thread(*overrides):

@@ -26,8 +26,7 @@ from thermo_comp.unit.prediction import SlowUncertainty
 
 
 def term(kind, x, y, z, slope=0.0):
-    per_kelvin = (slope * x, slope * y, slope * z)
-    return NonlinearTerm(kind, (x, y, z), per_kelvin, 1e-4)
+    return NonlinearTerm(kind, (x, y, z), (slope * x, slope * y, slope * z), 1e-4)
 
 
 SQUARE = term('square', 1e-5, -2e-5, 3e-5, 0.01)
@@ -68,8 +67,7 @@ def test_a_correction_inverts_the_terms_and_blocks_have_the_bits_of_single_sampl
     warm(compensator, 20.0 + t, until_s=120)
     corrected = compensator.process(119 * 10**9, *(300.0 * G * x).tolist())
     assert np.array(corrected[:3]) / G == pytest.approx(f, abs=1e-11)
-    bent = replace(rich_calibration(), posterior=None, nonlinearity=BENT)
-    unit = with_covariance(bent, rng)
+    unit = with_covariance(replace(rich_calibration(), posterior=None, nonlinearity=BENT), rng)
     # Forces reach 10 g on an axis; the largest force of the fit is 6 g.
     events = [
         (kind, stamp, tuple(9.0 * count for count in value) if kind == 'accel' else value)
@@ -92,10 +90,9 @@ def test_a_nonlinearity_without_terms_changes_no_bit_and_with_a_slope_needs_a_th
         assert value.needs_temperature == bool(slope)
 
 
-def test_the_variance_of_a_nonlinear_axis_includes_all_parameters(rng):
+def test_the_variance_includes_all_parameters_and_beyond_the_fit_an_unknown_square(rng):
     # The unit has no term |f| f, for which the claimed variance exceeds the exact variance.
-    unit = calibration(nonlinearity=replace(BENT, terms=(SQUARE, CUBE)))
-    unit = with_covariance(unit, rng)
+    unit = with_covariance(calibration(nonlinearity=replace(BENT, terms=(SQUARE, CUBE))), rng)
     layout, correction = parameter_layout(unit), Correction(unit)
     whole, t = unit.posterior.covariance(), 7.0
     state = np.zeros(StateLayout(correction.memory).width)
@@ -112,11 +109,7 @@ def test_the_variance_of_a_nonlinear_axis_includes_all_parameters(rng):
             along[first : first + 4] = [*powers, *(t * powers)]
             extended = np.polyval(linear[axis, ::-1], f) + f**2 * np.polyval(beyond[axis, ::-1], f)
             assert extended == pytest.approx(along @ whole @ along, rel=1e-5)
-
-
-def test_beyond_the_largest_force_the_variance_includes_an_unknown_square():
-    unit = calibration(nonlinearity=Nonlinearity((9.0, 60.0), 1e-4))
-    compensator = Compensator(unit, UNCHECKED)
+    compensator = Compensator(calibration(nonlinearity=Nonlinearity((9.0, 60.0), 1e-4)), UNCHECKED)
     variances = []
     for k, f in enumerate((50.0, 59.99, 70.0, 90.0)):
         warm(compensator, start_s=k, until_s=k + 1)

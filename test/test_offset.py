@@ -22,8 +22,7 @@ M = np.array(((1.0, 0.0, 0.0), (0.004, 1.0, 0.0), (-0.006, 0.003, 1.0)))
 
 
 def source(words, name='words'):
-    stamps = START_NS + np.arange(len(words)) * 10_000_000
-    return source_of(stamps, words, name=name)
+    return source_of(START_NS + np.arange(len(words)) * 10_000_000, words, name=name)
 
 
 def words_of(ups, rng, seconds=20.0):
@@ -106,8 +105,7 @@ def test_an_offset_is_found_only_if_positions_determine_it(rng):
     for up in (np.eye(3)[2], np.array([-0.06, -0.25, -0.97])):
         for n in (4, 6, 8):
             for _ in range(100):
-                celsius = rng.uniform(-15.0, 45.0, n)
-                drift = np.outer(celsius, 1e-4 * rng.standard_normal(3))
+                drift = np.outer(rng.uniform(-15.0, 45.0, n), 1e-4 * rng.standard_normal(3))
                 turned = up + 1e-3 * rng.standard_normal((n, 3)) + drift
                 assert not rough_centre(4e6 * turned).any()
     ups = positions(12, 5)

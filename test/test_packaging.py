@@ -30,39 +30,25 @@ def test_version_and_dependencies_are_equal_wherever_they_are_stated():
     assert re.fullmatch(r'\d+\.\d+\.\d+', thermo_comp.__version__)
     finished = ran(sys.executable, 'setup.py', '--version', check=True)
     assert finished.stdout.split()[-1] == thermo_comp.__version__
-    assert MANIFEST.get('format') == '3'
-    assert MANIFEST.findtext('name') == 'thermo_comp'
+    assert (MANIFEST.get('format'), MANIFEST.findtext('name')) == ('3', 'thermo_comp')
     assert MANIFEST.findtext('export/build_type') == 'ament_python'
     tags = ('depend', 'exec_depend', 'build_depend', 'test_depend')
-    keys = {node.text for tag in tags for node in MANIFEST.iter(tag)}
-    assert keys == KNOWN_KEYS
+    assert {node.text for tag in tags for node in MANIFEST.iter(tag)} == KNOWN_KEYS
     # Commands have further dependencies, which come from PyPI.
     keys = {node.text for node in MANIFEST.iter('exec_depend')}
-    libraries = {key for key in keys if key.startswith('python3-')}
-    assert libraries == {'python3-numpy', 'python3-yaml'}
+    assert {key for key in keys if key.startswith('python3-')} == {'python3-numpy', 'python3-yaml'}
     install = re.search(r'^INSTALL = (\[.*?^\])', (ROOT / 'setup.py').read_text(), re.M | re.S)[1]
     install = ast.literal_eval(install)
     assert isinstance(install, list)
     assert all('>=' in requirement for requirement in install), 'no floor'
 
 
-def test_the_licence_file_contains_the_whole_apache_licence():
+def test_every_source_file_states_the_apache_licence_and_has_at_most_500_lines():
     licence = (ROOT / 'LICENSE').read_text()
     assert 'Version 2.0, January 2004' in licence
     assert 'END OF TERMS AND CONDITIONS' in licence
     node = MANIFEST.find('license')
     assert (node.text, node.get('file')) == ('Apache-2.0', 'LICENSE')
-
-
-def tracked(*patterns):
-    listing = ran('git', 'ls-files', '-z', '--', *patterns)
-    names = [name for name in listing.stdout.split('\0') if name]
-    if listing.returncode or not names:
-        pytest.skip('not a git working tree: an installed or unpacked copy')
-    return [ROOT / name for name in names if (ROOT / name).exists()]
-
-
-def test_every_source_file_states_its_licence_and_has_at_most_500_lines():
     first = 'SPDX-FileCopyrightText: 2026 thermo_comp contributors'
     second = 'SPDX-License-Identifier: Apache-2.0'
     for path in tracked('*.py', 'Makefile', '.ci/run'):
@@ -71,6 +57,14 @@ def test_every_source_file_states_its_licence_and_has_at_most_500_lines():
         assert lines[:2] == [f'# {first}', f'# {second}'], path
     lengths = {path: len(path.read_text().splitlines()) for path in tracked('*.py')}
     assert {path.name: n for path, n in lengths.items() if n > 500} == {}
+
+
+def tracked(*patterns):
+    listing = ran('git', 'ls-files', '-z', '--', *patterns)
+    names = [name for name in listing.stdout.split('\0') if name]
+    if listing.returncode or not names:
+        pytest.skip('not a git working tree: an installed or unpacked copy')
+    return [ROOT / name for name in names if (ROOT / name).exists()]
 
 
 def test_hosted_ci_installs_as_the_readme_describes():

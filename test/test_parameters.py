@@ -7,8 +7,9 @@ from dataclasses import fields
 import pytest
 import yaml
 
-pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 
+from conftest import ROOT
 from make_reference import parameters_table
 from rclpy.parameter import Parameter
 from ros_helpers import bare_node, node_in_thread
@@ -30,8 +31,7 @@ def test_parameters_are_described_and_overrides_are_applied():
             assert bool(shown.floating_point_range) == isinstance(entry.default, float)
             assert bool(shown.integer_range) == isinstance(entry.default, int)
     assert parameters.descriptor('input').additional_constraints == 'one of: counts, imu'
-    assert config == NodeConfig()
-    assert config.compensator_config() == CompensatorConfig()
+    assert (config, config.compensator_config()) == (NodeConfig(), CompensatorConfig())
     table, text = parameters_table(), parameters.parameters_help()
     for entry in fields(NodeConfig):
         assert f'| `{entry.name}` |' in table
@@ -80,8 +80,8 @@ def test_an_update_ignores_other_nodes_and_one_wrong_parameter_changes_none(name
     assert parameters.updated(NodeConfig(), changes) == NodeConfig(frame_id='imu_link')
 
 
-def test_the_parameter_file_states_the_defaults(root):
-    text = (root / 'config' / 'thermo_comp.params.yaml').read_text(encoding='utf-8')
+def test_the_parameter_file_states_the_defaults():
+    text = (ROOT / 'config' / 'thermo_comp.params.yaml').read_text(encoding='utf-8')
     # The file has QoS settings only as a comment, because they do not apply to remapped topics.
     before, overrides_text = text.split('    # The defaults of the overrides:\n    #\n')
     stated = yaml.safe_load(before)['/**']['ros__parameters']
@@ -90,7 +90,7 @@ def test_the_parameter_file_states_the_defaults(root):
     assert stated == expected
     overrides = yaml.safe_load(overrides_text.replace('    # ', ''))['qos_overrides']
     assert {f'/{topic.name}' for topic in OUTPUTS} <= overrides.keys()
-    calibration = root / 'config' / 'calibration.example.yaml'
+    calibration = ROOT / 'config' / 'calibration.example.yaml'
     with node_in_thread('-p', f'calibration_file:={calibration}') as node:
         for topic, sides in overrides.items():
             for side, policies in sides.items():

@@ -82,19 +82,24 @@ def judged(calibration, study):
     return strangers.score(outs, [minutes(bag) for bag in bags], is_drift=False)
 
 
-def test_the_fitted_lag_of_each_axis_is_that_of_its_part_and_is_printed(parts):
-    unit, study, calibration, _ = parts
+def test_the_fitted_lag_of_each_axis_is_that_of_its_part_and_the_results_are_printed(parts):
+    unit, study, calibration, (text, content) = parts
     # In a ramp a lag of 10 K changes the bias by 100 ug, an error of the lag of 1 % by 1 ug.
     assert np.array(taus_of(calibration)) == pytest.approx(unit.part_s[:, None], rel=0.01)
     # The noise of |f| in a mean over 60 s is 0.65 ug.
     assert judged(calibration, study).norm < 2.0
-    unit, *_, (text, content) = parts
     (line,) = (line for line in text.splitlines() if 'one part, which' in line)
     printed = [float(word) for word in line.split('by ')[1].split(' s')[0].split(', ')]
     content = json.loads(content)
     assert content['part_lags_s'] == pytest.approx(unit.part_s, rel=0.01)
     assert printed == pytest.approx(content['part_lags_s'], abs=0.5)
     assert content['part_case_shares'] == [0.0, 0.0, 0.0]
+    effects = content['contributions_m_s2']
+    assert effects['thermal_response'] > 100.0 * effects['initial_lag_states'] > 0.0
+    (line,) = (line for line in text.splitlines() if line.startswith('thermal response'))
+    assert float(line.split()[-1]) == pytest.approx(effects['thermal_response'] / UG, abs=0.5)
+    (pair,) = (p for p in content['likeness'] if p['groups'] == ['board', 'gradient_lag'])
+    assert f'(correlation {pair["correlation"]:.5f};' in text
 
 
 @pytest.mark.slow
@@ -152,8 +157,7 @@ def test_lags_of_a_noisy_sensor_are_fitted_to_bags_of_one_warm_up():
     unit = cases.navigation(rng, part_s=np.array([657.0, 797.0, 1389.0]))
     unit = replace(unit, density=30.0, bias_curve=5.0 * unit.bias_curve, counts=0.0)
     bags = cases.positions(unit, thaw, spread(12, rng), rng)
-    study = cases.Study('', bags, {}, {'input': 'm/s^2'})
-    taus = np.array(taus_of(strangers.fitted(study)))
+    taus = np.array(taus_of(strangers.fitted(cases.Study('', bags, {}, {'input': 'm/s^2'}))))
     assert taus == pytest.approx(unit.part_s[:, None], rel=0.03)
 
 
@@ -208,8 +212,7 @@ def test_the_lags_of_parts_are_found_beside_an_effect_of_the_gradient():
 def test_a_bump_of_the_bias_over_temperature_is_fitted_by_knees():
     # The bump of the bias lasts for 2 min, and must not be taken for motion.
     _, study = study_of('bump', bump=np.array([450.0, -400.0, 500.0]), bump_c=17.0)
-    calibration = strangers.fitted(study, groups=('curve', 'part', 'bend'))
-    judgement = judged(calibration, study)
+    judgement = judged(strangers.fitted(study, groups=('curve', 'part', 'bend')), study)
     # The bump of the bias, a bell curve (sd 0.85 K), is fitted by straight lines of 0.5 K each.
     assert judgement.norm < 60.0
     assert judgement.norm_ratio < 1.5
@@ -264,8 +267,7 @@ def test_six_faces_in_three_soaks_determine_the_curve_at_other_temperatures():
     )  # fmt: skip
     for stated in ({}, {'mounting_sd': 3e-4}):
         # Means over 25 min have a noise of 4 ug; rounding to 0.5 mg adds errors of some 40 ug.
-        calibration = strangers.fitted(study, **stated)
-        assert judged(calibration, study).vector < 100.0
+        assert judged(strangers.fitted(study, **stated), study).vector < 100.0
 
 
 @pytest.mark.slow
@@ -343,24 +345,11 @@ def test_units_of_a_type_share_the_lags_of_the_bank(parts):
 
     def sibling(k, ratio):
         terms = tuple(replace(term, tau_s=ratio * term.tau_s) for term in calibration.response)
-        unit = replace(calibration.unit, serial=f'u{k}')
-        return replace(calibration, unit=unit, response=terms)
+        return replace(calibration, unit=replace(calibration.unit, serial=f'u{k}'), response=terms)
 
-    units = [sibling(k, ratio) for k, ratio in enumerate((0.93, 0.98, 1.02, 1.07))]
-    mean = population(units)
+    mean = population([sibling(k, ratio) for k, ratio in enumerate((0.93, 0.98, 1.02, 1.07))])
     assert {term.tau_s for term in mean.response if term.tau_s} <= {*FINE_TAUS}
     bag = slow(study.tests[''][0])
     off = strangers.corrected(mean, bag).force - strangers.corrected(calibration, bag).force
     # The effect of a lag is 200 ug (10 K, 20 ug/K), and differs by up to 7 % between the units.
     assert np.sqrt(np.mean(off**2)) < 5.0 * UG
-
-
-def test_the_effects_of_unknowns_and_the_most_similar_terms_are_printed(parts):
-    *_, (text, content) = parts
-    content = json.loads(content)
-    effects = content['contributions_m_s2']
-    assert effects['thermal_response'] > 100.0 * effects['initial_lag_states'] > 0.0
-    (line,) = (line for line in text.splitlines() if line.startswith('thermal response'))
-    assert float(line.split()[-1]) == pytest.approx(effects['thermal_response'] / UG, abs=0.5)
-    (pair,) = (p for p in content['likeness'] if p['groups'] == ['board', 'gradient_lag'])
-    assert f'(correlation {pair["correlation"]:.5f};' in text

@@ -221,21 +221,15 @@ def test_the_warm_up_after_power_on_is_not_taken_for_swapped_topics():
         assert not tracker.lead.is_reversed
 
 
-def in_ramp(tracker, case_of, order, seconds=300):
-    """Heat the board by 1 K/min with a reading each second; `case_of` gives the case's reading."""
-    rng = np.random.default_rng(8)
-    for second in range(seconds):
-        board = 20.0 + second / 60.0 + 0.005 * rng.standard_normal()
-        readings = {'board': board, 'case': case_of(board, second, rng)}
-        for name in order:
-            tracker.read(name, second * SECOND_NS, readings[name])
-    return tracker.sample(seconds * SECOND_NS)
-
-
 @pytest.mark.parametrize('order', [('board', 'case'), ('case', 'board')])
 def test_one_topic_given_for_both_thermometers_is_named_and_claimed(order):
-    tracker = tracker_of()
-    state = in_ramp(tracker, lambda board, *_: board, order)
+    # In a ramp of 1 K/min both thermometers have the same reading each second.
+    tracker, rng = tracker_of(), np.random.default_rng(8)
+    for second in range(300):
+        celsius = 20.0 + second / 60.0 + 0.005 * rng.standard_normal()
+        for name in order:
+            tracker.read(name, second * SECOND_NS, celsius)
+    state = tracker.sample(300 * SECOND_NS)
     assert tracker.copies['case'].is_copy
     # In a ramp of 1 K/min the case of a unit with a board lag of 900 s is 15 K above the board.
     assert abs(state[GRADIENT]) < 0.1
@@ -256,6 +250,5 @@ def test_two_thermometers_at_one_temperature_are_not_taken_for_one(quantum):
     for second in range(20_000):
         true = 20.0 + 10.0 * math.sin(second / 1000.0)
         for name in ('board', 'case'):
-            reading = rounded(true + 0.02 * rng.standard_normal())
-            tracker.read(name, second * SECOND_NS, reading)
+            tracker.read(name, second * SECOND_NS, rounded(true + 0.02 * rng.standard_normal()))
         assert not tracker.copies['case'].is_copy

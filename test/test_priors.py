@@ -34,15 +34,13 @@ OPTIONS = FitOptions(STANDARD_GRAVITY, groups=('curve', 'board', 'product'))
 def source(record):
     # A reading every 8 s is sufficient in ramps of 1 K/min, and saves most of the time of a fit.
     arrays = arrays_of(record, 8)
-    later = [array + 10**18 if array.dtype == np.int64 else array for array in arrays]
-    return source_of(*later)
+    return source_of(*[array + 10**18 if array.dtype == np.int64 else array for array in arrays])
 
 
 @cache
 def test_of(number, first, last):
     """Record positions `first` to `last` - 1 (of twelve) of sibling `number`."""
-    ups = positions(12, number)[first:last]
-    stations = [Position(PROGRAM, up) for up in ups]
+    stations = [Position(PROGRAM, up) for up in positions(12, number)[first:last]]
     return tuple(arrays(sibling(KIND, number, 0.15), stations, 100 * number + first))
 
 
@@ -63,12 +61,11 @@ def siblings():
 def sd_of_levels(calibration):
     variance = np.diag(calibration.posterior.covariance())
     places = [block.static for block in parameter_layout(calibration).bias]
-    K = [axis.scale_factor for axis in calibration.axes]
-    return np.sqrt(variance[places]) / np.abs(K)
+    return np.sqrt(variance[places]) / np.abs([axis.scale_factor for axis in calibration.axes])
 
 
 @pytest.mark.slow
-def test_a_population_has_the_mean_of_its_units_and_their_scatter():
+def test_a_population_has_mean_and_scatter_of_its_units_and_keeps_equal_curves_equal():
     prior = population(siblings())
     K = np.array([[unit.axes.x.scale_factor, unit.axes.z.scale_factor] for unit in siblings()])
     assert prior.axes.x.scale_factor == pytest.approx(np.exp(np.log(K[:, 0]).mean()))
@@ -82,14 +79,24 @@ def test_a_population_has_the_mean_of_its_units_and_their_scatter():
     slopes = np.array(slopes)
     mean = prior.static.x.bias_function.free_coefficients[0] / prior.axes.x.scale_factor
     assert mean == pytest.approx(slopes[:, 0].mean())
-    variance = np.diag(prior.posterior.covariance())
-    at = parameter_layout(prior).bias[0].static + 1
-    sd = np.sqrt(variance[at]) / prior.axes.x.scale_factor
+    covariance, layout = prior.posterior.covariance(), parameter_layout(prior)
+    at = layout.bias[0].static + 1
+    sd = np.sqrt(covariance[at, at]) / prior.axes.x.scale_factor
     # Expected variance of a fourth unit: 4/3 of the variance of three units, times 6 / (6 - 2) for
     # Student's distribution with 6 degrees of freedom, plus the claimed variance.
     own = np.array(own) / K[:, 0] ** 2
     expected = np.var(slopes, axis=0, ddof=1).mean() * 4.0 / 3.0 * 6.0 / 4.0 + own.mean()
     assert sd == pytest.approx(np.sqrt(expected), rel=1e-3)
+    # WHY: in the prior from siblings equal curves of both regimes were not fully correlated: a fit
+    # had an error of 3.1 ug with this prior, and of 0.7 ug without a prior.
+    for block in (*layout.bias, *layout.scale):
+        curves = range(block.static + 1, block.dynamic), range(block.dynamic + 1, block.response)
+        for static, dynamic in zip(*curves, strict=True):
+            contrast = np.zeros(layout.n_parameters)
+            contrast[[static, dynamic]] = 1.0, -1.0
+            # 1e-24: largest variance that rounding to single precision leaves unused coefficients.
+            limit = 1e-5 * covariance[static, static] + 1e-24
+            assert float(contrast @ covariance @ contrast) <= limit
 
 
 def test_the_scatter_of_an_axis_is_averaged_over_the_axes_of_three_units(rng):
@@ -124,30 +131,13 @@ def test_chance_correlations_between_parameters_of_twelve_units_are_reduced(rng)
     assert share_left(independent, level) == pytest.approx(1.0 - pair**2)
     assert share_left(independent, bias) > 0.5
     # The prior keeps a correlation that all twelve units show.
-    common = rng.standard_normal((12, 1)) + 0.01 * independent
-    assert share_left(common, bias) < 0.1
+    assert share_left(rng.standard_normal((12, 1)) + 0.01 * independent, bias) < 0.1
 
 
 @pytest.mark.slow
-def test_equal_curves_of_both_sets_stay_equal_in_a_population():
-    # WHY: in the prior from siblings equal curves of both regimes were not fully correlated: a fit
-    # had an error of 3.1 ug with this prior, and of 0.7 ug without a prior.
-    prior = population(siblings())
-    covariance, layout = prior.posterior.covariance(), parameter_layout(prior)
-    for block in (*layout.bias, *layout.scale):
-        curves = range(block.static + 1, block.dynamic), range(block.dynamic + 1, block.response)
-        for static, dynamic in zip(*curves, strict=True):
-            contrast = np.zeros(layout.n_parameters)
-            contrast[[static, dynamic]] = 1.0, -1.0
-            # 1e-24: largest variance that rounding to single precision leaves unused coefficients.
-            limit = 1e-5 * covariance[static, static] + 1e-24
-            assert float(contrast @ covariance @ contrast) <= limit
-
-
-@cache
-def helped():
-    """Fit one position with the siblings' prior; return all priors tried, the initial one last."""
-    seen = []
+def test_a_fit_begins_with_the_widest_of_its_priors(monkeypatch):
+    # WHY: a fit that began with a narrow prior found mounting offsets of 190 ug, a local minimum.
+    seen = []  # all priors that the fit of one position tries, the initial one last
 
     def fitted_with(*given):
         (prior,) = (argument for argument in given if isinstance(argument, Prior))
@@ -157,21 +147,13 @@ def helped():
 
     few = [source(record) for record in test_of(9, 0, 1)]
     options = replace(OPTIONS, serial='unit-9', prior=population(siblings()))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr('thermo_comp.fitting.initialisation.fit_all', fitted_with)
-        fit(few, options)
-    return seen
-
-
-@pytest.mark.slow
-def test_a_fit_begins_with_the_widest_of_its_priors():
-    # WHY: a fit that began with a narrow prior found mounting offsets of 190 ug, a local minimum.
-    *tried, widest = (prior.root.T @ prior.root for prior in helped())
+    monkeypatch.setattr('thermo_comp.fitting.initialisation.fit_all', fitted_with)
+    fit(few, options)
+    *tried, widest = (prior.root.T @ prior.root for prior in seen)
     assert len(tried) > 2
     root = np.sqrt(np.diag(widest))
     for precision in tried:
-        narrower = (precision - widest) / np.outer(root, root)
-        assert np.linalg.eigvalsh(narrower).min() > -1e-6
+        assert np.linalg.eigvalsh((precision - widest) / np.outer(root, root)).min() > -1e-6
 
 
 @pytest.mark.slow

@@ -101,8 +101,7 @@ def edited(draw):
     which = draw(st.sampled_from(range(len(TREES))))
     tree = Edited(json.loads(json.dumps(TREES[which])))
     own = [place for k, place in EDITS if k == which]
-    places = draw(st.lists(st.sampled_from(own), min_size=1, max_size=3))
-    for *way, last in places:
+    for *way, last in draw(st.lists(st.sampled_from(own), min_size=1, max_size=3)):
         try:
             branch = reduce(getitem, way, tree)
             value = branch[last]
@@ -190,8 +189,7 @@ def test_whatever_file_is_accepted_gives_finite_numbers_over_its_whole_range(tre
     assert counters.n_unsound == 0
     # Samples have output unless they came too fast, or temperatures were too old or missing.
     assert n_sound or counters.n_too_fast or counters.n_stale or counters.n_no_temperature
-    status = compensator.status()
-    assert all(map(math.isfinite, status.state))
+    assert all(map(math.isfinite, compensator.status().state))
 
 
 numbers = st.sampled_from([0.0, 1.0, -1.0, 2941.0, 32766.0, 32767.0, -32767.0, 1e300, 5e-324])

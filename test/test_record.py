@@ -182,13 +182,11 @@ def test_a_bag_left_by_a_crash_is_reported_and_completed(session, cli, tmp_path)
     # WHY: after a killed run the next run did not report the hidden file with its last bag.
     bags = tmp_path / 'bags'
     words = ('-c', CRASH, session, bags, START_NS + 200 * 10**9)
-    killed = ran(sys.executable, *words)
-    assert killed.returncode == -signal.SIGKILL
+    assert ran(sys.executable, *words).returncode == -signal.SIGKILL
     (left,) = leftovers(bags)
     assert leftovers(bags) == {left: 1}
     arguments = ('record', session, '--positions', '1', '--soak', '80s', '-o', bags)
-    errors = cli(*arguments, code=None).stderr
-    assert f'{left} is bag 1 of a crashed run; --finish' in errors
+    assert f'{left} is bag 1 of a crashed run; --finish' in cli(*arguments, code=None).stderr
     assert left.exists()
     for bag in numbered_bags(bags):
         bag.unlink()
@@ -202,8 +200,7 @@ def test_a_bag_left_by_a_crash_is_reported_and_completed(session, cli, tmp_path)
         assert reader.info.metadata['serial'] == 'lab-7'
     broken = bags / '.07.999999999-abcdef.partial.mcap'
     broken.write_bytes(b'no bag')
-    printed = cli(*arguments, '--finish', code=None).stderr
-    assert 'the bag cannot be completed' in printed
+    assert 'the bag cannot be completed' in cli(*arguments, '--finish', code=None).stderr
     assert broken.exists()
 
 
@@ -230,7 +227,7 @@ class Recording:
 
 @pytest.fixture
 def play():
-    pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
+    pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
     from thermo_comp.ros.player import play
 
     return play

@@ -118,21 +118,29 @@ def survey(path, temperature, *, gap_s=0.0, backwards=False):
 
 
 def up_and_down(low, high):
-    seconds = np.arange(3600.0)
-    return np.interp(seconds, [0, 600, 1800, 2400, 3600], [low, low, high, high, low])
+    return np.interp(np.arange(3600.0), [0, 600, 1800, 2400, 3600], [low, low, high, high, low])
 
 
-def test_a_good_recording_has_no_findings(tmp_path):
+def test_a_survey_finds_no_fault_in_a_good_bag_and_the_duration_is_the_span_of_stamps(tmp_path):
     result = survey(tmp_path / 'bag', up_and_down(5.0, 35.0))
-    assert result.findings == []
-    assert result.n == 18000
-    assert result.rate_hz == pytest.approx(5.0)
-    assert result.n_still == 1
-    assert result.still_s == pytest.approx(3600.0, abs=15.0)
+    assert (result.findings, result.n, result.rate_hz) == ([], 18000, pytest.approx(5.0))
+    assert (result.n_still, result.still_s) == (1, pytest.approx(3600.0, abs=15.0))
     board = result.thermometers['board']
     assert (board.lowest, board.highest) == (5.0, 35.0)
     assert board.steepest_heating_k_min == pytest.approx(1.5, rel=0.01)
     assert board.steepest_cooling_k_min == pytest.approx(-1.5, rel=0.01)
+    # WHY: the duration was the last stamp less the first: -0.2 s.
+    result = survey(tmp_path / 'back', up_and_down(5.0, 35.0), gap_s=-3600.0)
+    assert result.duration_s == pytest.approx(3600.0, abs=1.0)
+    assert result.still_s <= result.duration_s
+    with BagWriter(tmp_path / 'empty') as writer:
+        writer.write_temperature(TOPICS.board, [START_NS], [20.0])
+    result = survey_recording(tmp_path / 'empty')
+    assert result.n == 0
+    assert any('no accelerometer samples' in f for f in result.findings)
+    board = survey(tmp_path / 'flips', 20.0 + (np.arange(3600) % 2)).thermometers['board']
+    assert board.quantum == 1.0
+    assert board.steepest_heating_k_min < 0.1
 
 
 @pytest.mark.parametrize(
@@ -160,20 +168,3 @@ def test_a_good_recording_has_no_findings(tmp_path):
 def test_faults_of_a_recording_are_reported(tmp_path, temperature, options, text):
     findings = survey(tmp_path / 'bag', temperature, **options).findings
     assert [part for part in text if not any(part in found for found in findings)] == []
-
-
-def test_the_duration_is_the_span_of_stamps_and_bags_without_samples_are_surveyed(tmp_path):
-    # WHY: the duration was the last stamp less the first: -0.2 s.
-    result = survey(tmp_path / 'bag', up_and_down(5.0, 35.0), gap_s=-3600.0)
-    assert result.duration_s == pytest.approx(3600.0, abs=1.0)
-    assert result.still_s <= result.duration_s
-    with BagWriter(tmp_path / 'empty') as writer:
-        writer.write_temperature(TOPICS.board, [START_NS], [20.0])
-    result = survey_recording(tmp_path / 'empty')
-    assert result.n == 0
-    assert any('no accelerometer samples' in f for f in result.findings)
-    flips = 20.0 + (np.arange(3600) % 2)
-    result = survey(tmp_path / 'flips', flips)
-    board = result.thermometers['board']
-    assert board.quantum == 1.0
-    assert board.steepest_heating_k_min < 0.1

@@ -54,12 +54,6 @@ def small_bag(compression, use_chunking=True):
         return path.read_bytes(), position, length
 
 
-def every_cut(content, position, length):
-    """List the bytes at which to cut: all in the last chunk, and every 17th after this chunk."""
-    end = position + length
-    return [*range(position, end), *range(end, len(content), 17), len(content) - 1]
-
-
 def test_a_bag_cut_in_its_last_chunk_is_read_up_to_the_cut(tmp_path):
     content, position, length = small_bag('none')
     messages = regular_messages(24)
@@ -67,15 +61,16 @@ def test_a_bag_cut_in_its_last_chunk_is_read_up_to_the_cut(tmp_path):
     at = position + 9 + 40
     last = []
     while at < position + length:
-        size = struct.unpack_from('<Q', content, at + 1)[0] + 9
-        at += size
+        at += struct.unpack_from('<Q', content, at + 1)[0] + 9
         last.append(at)
     n_before = len(messages) - len(last)
     assert 0 < n_before < len(messages)
     path = tmp_path / 'bag.mcap'
-    for cut in every_cut(content, position, length):
+    # The bag is cut at each byte of the last chunk, and at every 17th byte after this chunk.
+    end = position + length
+    for cut in (*range(position, end), *range(end, len(content), 17), len(content) - 1):
         path.write_bytes(content[:cut])
-        n_whole = n_before + sum(end <= cut for end in last)
+        n_whole = n_before + sum(place <= cut for place in last)
         recording = read(path)
         assert_columns(recording.columns, messages[:n_whole])
         assert recording.info.truncated is not None, cut
@@ -133,8 +128,7 @@ def test_messages_overwritten_by_zeros_are_not_returned(tmp_path):
             result = outcome(path)
             if isinstance(result, Recording):
                 assert result.info.truncated is not None
-                n = result.columns.n_messages
-                assert_columns(result.columns, messages[:n])
+                assert_columns(result.columns, messages[: result.columns.n_messages])
 
 
 def test_the_message_names_the_cut_file_of_a_directory(tmp_path):
@@ -244,7 +238,7 @@ def test_false_lengths_in_a_file_need_little_memory(tmp_path, record, reason):
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000
 
 
-def test_a_damaged_last_chunk_is_left_out(tmp_path):
+def test_a_damaged_chunk_summary_or_metadata_is_left_out_or_refused(tmp_path):
     content, position, length = small_bag('zstd')
     damaged = bytearray(content[: position + length])
     damaged[position + length // 2] ^= 255
@@ -255,9 +249,6 @@ def test_a_damaged_last_chunk_is_left_out(tmp_path):
     assert_columns(recording.columns, regular_messages(24)[: recording.info.n_messages])
     path.write_bytes(damaged[:-5])
     assert 'ends inside a chunk' in str(read(path).info.truncated)
-
-
-def test_a_nonsensical_summary_large_metadata_and_wrong_times_are_ignored_or_refused(tmp_path):
     content = bytearray(small_bag('none')[0])
     path = tmp_path / 'bag.mcap'
     footer = len(content) - 37

@@ -256,6 +256,5 @@ def test_a_scan_with_a_right_or_false_index_equals_a_plain_loop(data, cut, tail,
     kept = drawn.draw(st.sampled_from([wanted, wanted[:-1], wanted[1:], []]))
     index = index_of([*kept, *((at, 0, 1, 0) for at in places)])
     others.clear()
-    messages = locate(np.frombuffer(data, np.uint8), memoryview(index), keep)
-    assert listed(messages) == wanted
+    assert listed(locate(np.frombuffer(data, np.uint8), memoryview(index), keep)) == wanted
     assert others == wanted_others

@@ -111,8 +111,7 @@ def test_directories_written_by_rosbags_are_read(messages, storage, compression)
         rec.write_rosbag2(path, messages, storage=storage, compression=compression)
         recording = read(path)
         rec.assert_columns(recording.columns, messages)
-        assert recording.info.storage == storage
-        assert recording.info.n_messages == len(messages)
+        assert (recording.info.storage, recording.info.n_messages) == (storage, len(messages))
 
 
 @settings(max_examples=10, deadline=None)
@@ -164,16 +163,7 @@ def test_blocks_end_where_the_frame_changes_and_together_have_all_messages(tmp_p
     rec.assert_columns(read(tmp_path / 'bag.mcap').columns, messages)
 
 
-def test_too_many_overlapping_chunks_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr('thermo_comp.recording.mcap_file._MAX_HELD_BYTES', 4000)
-    messages = rec.regular_messages(200)
-    combed = [message for begin in range(40) for message in messages[begin::40]]
-    rec.write_mcap(tmp_path / 'bag.mcap', combed, chunk_size=400)
-    with pytest.raises(RecordingError, match=r'too many of its chunks overlap in time'):
-        read(tmp_path / 'bag.mcap')
-
-
-def test_raw_messages_of_overlapping_chunks_are_in_order_of_log_time(tmp_path):
+def test_overlapping_chunks_are_read_by_log_time_and_too_many_are_refused(tmp_path, monkeypatch):
     messages = rec.regular_messages(60)
     shuffled = [m for pair in zip(messages[1::2], messages[::2], strict=False) for m in pair]
     for row, message in enumerate(messages):
@@ -186,6 +176,12 @@ def test_raw_messages_of_overlapping_chunks_are_in_order_of_log_time(tmp_path):
     assert serialized == [rec.serialize(m) for m in wanted]
     frames = [block.frame_id for block in blocks for _ in range(len(block))]
     assert frames == [m.frame_id for m in wanted]
+    monkeypatch.setattr('thermo_comp.recording.mcap_file._MAX_HELD_BYTES', 4000)
+    messages = rec.regular_messages(200)
+    combed = [message for begin in range(40) for message in messages[begin::40]]
+    rec.write_mcap(tmp_path / 'bag.mcap', combed, chunk_size=400)
+    with pytest.raises(RecordingError, match=r'too many of its chunks overlap in time'):
+        read(tmp_path / 'bag.mcap')
 
 
 def test_the_files_of_a_split_bag_are_read_in_order(tmp_path):
@@ -247,16 +243,7 @@ def celsius_of(temperatures):
     return {name: part.celsius.tolist() for name, part in temperatures.items()}
 
 
-def test_further_thermometers_are_found_beside_the_board(tmp_path):
-    names = ('board', 'case', 'lid', 'Tip', 'accel', 'a/b')
-    topics = [f'imu0/temperature/{name}' for name in names]
-    path = written(tmp_path / 'bag', *topics, 'temperature/lid', counts='imu0/accel/counts')
-    temperatures = read_recording(path).columns.temperatures
-    assert celsius_of(temperatures) == {'board': [20.0], 'case': [21.0], 'lid': [22.0]}
-    assert temperatures['lid'].after.tolist() == [2]
-
-
-def test_topics_can_be_named_by_input(tmp_path):
+def test_topics_can_be_named_by_input_and_further_thermometers_are_found(tmp_path):
     path = written(tmp_path / 'bag', 't1', 't2', 't3', 'temperature/lid', counts='raw')
     names = {'counts': '/raw', 'board': 't1', 'temperature/case': 't2', 'temperature/magnet': 't3'}
     found = read_recording(path, Topics.named(names))
@@ -273,6 +260,12 @@ def test_topics_can_be_named_by_input(tmp_path):
             Topics.named({wrong: '/t1'})
     with pytest.raises(ValueError, match='`case` needs the name of a topic'):
         Topics.named({'case': '/'})
+    names = ('board', 'case', 'lid', 'Tip', 'accel', 'a/b')
+    topics = [f'imu0/temperature/{name}' for name in names]
+    path = written(tmp_path / 'imu0', *topics, 'temperature/lid', counts='imu0/accel/counts')
+    temperatures = read_recording(path).columns.temperatures
+    assert celsius_of(temperatures) == {'board': [20.0], 'case': [21.0], 'lid': [22.0]}
+    assert temperatures['lid'].after.tolist() == [2]
 
 
 def test_the_only_topic_of_a_type_is_used_and_of_two_both_are_named(tmp_path):

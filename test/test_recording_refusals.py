@@ -53,15 +53,13 @@ def test_messages_of_a_wrong_layout_are_refused(tmp_path, data, reason):
 
 def test_ros_1_messages_in_an_mcap_file_are_read(tmp_path):
     path = tmp_path / 'bag.mcap'
-    numbers = struct.pack('<3d', 1.5, -2.5, 3.5)
-    data = struct.pack('<IIII', 9, 12, 34, 4) + b'link' + numbers
+    data = struct.pack('<IIII', 9, 12, 34, 4) + b'link' + struct.pack('<3d', 1.5, -2.5, 3.5)
     kind = declared('ros1', 'geometry_msgs/Vector3Stamped')
     path.write_bytes(whole_file(kind, short_message(data)))
     with open_recording(path, require=('accel',)) as reader:
         (block,) = reader.blocks(raw=True)
     assert block.accel.tolist() == [[1.5, -2.5, 3.5]]
-    assert block.accel_stamp_ns.tolist() == [12 * 10**9 + 34]
-    assert block.frame_id == 'link'
+    assert (block.accel_stamp_ns.tolist(), block.frame_id) == ([12 * 10**9 + 34], 'link')
     message = rec.Message(rec.ACCEL, 1, 12 * 10**9 + 34, 'link', (1.5, -2.5, 3.5))
     assert block.raw['accel'].data.tobytes() == rec.serialize(message)
 

@@ -82,8 +82,7 @@ def test_replay_of_constants_needs_no_thermometer(tmp_path):
     stamps = START_NS + np.arange(n) * 10_000_000
     with BagWriter(bag) as writer:
         writer.write_counts(TOPICS.counts, stamps, 2940.0 + rng.standard_normal((n, 3)), 'imu')
-    constants = calibration(axes=equal_axes(510.0, 5.0))
-    replay(bag, constants, tmp_path / 'out')
+    replay(bag, calibration(axes=equal_axes(510.0, 5.0)), tmp_path / 'out')
     source = read_recording(bag, require=('accel',)).columns
     block, flags = output_of(tmp_path / 'out')
     np.testing.assert_allclose(block.accel, (source.accel - 5.0) / 510.0, rtol=1e-14)
@@ -167,7 +166,7 @@ def test_memory_does_not_grow_with_the_bag(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize('imu', [False, True])
 def test_an_output_table_has_the_values_of_the_output_bag(tmp_path, imu):
-    pq = pytest.importorskip('pyarrow.parquet', reason='no pyarrow: install the extra `parquet`')
+    pq = pytest.importorskip('pyarrow.parquet', reason='pyarrow is the extra `parquet`')
     bag = thermal_test(tmp_path / 'bag', rate_hz=2.0, is_imu=imu)
     unit = {'unit': Unit('T-1', 'm/s^2', 100.0, 0.1)} if imu else {}
     calibration = dataclasses.replace(rich_calibration(), **unit)
@@ -226,8 +225,7 @@ def test_the_option_all_topics_copies_every_topic(tmp_path, storage):
             for role, raw in block.raw.items():
                 name = reader.topics[role]
                 writer.write_raw(name, reader.info.topics[name][0], raw.log_ns, raw)
-        definition = ('ros2msg', 'string data')
-        writer.write_raw('odd', 'odd_msgs/msg/Odd', stamps, messages, definition)
+        writer.write_raw('odd', 'odd_msgs/msg/Odd', stamps, messages, ('ros2msg', 'string data'))
         flags = [bytes((0, 1, 0, 0, k % 2)) for k in range(len(stamps))]
         writer.write_raw('gps/ok', BOOL, stamps, flags)
         writer.write_raw(IMU_OUT.name, BOOL, stamps, [bytes((0, 1, 0, 0, 0))] * len(stamps))

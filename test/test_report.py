@@ -61,11 +61,6 @@ def page_of(evidence, folder, **keys):
     return Page(path.read_text(encoding='utf-8'))
 
 
-def bare():
-    """Gather the data for a report on a calibration alone, without bags."""
-    return evidence_of_bags([], fitted().calibration)
-
-
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory):
     return write_bag(tmp_path_factory.mktemp('report') / 'held_out.mcap')
@@ -81,7 +76,7 @@ def page():
     return Page(certificate())
 
 
-def test_the_certificate_of_a_fit_has_the_expected_statements_and_residuals(page):
+def test_the_certificate_has_its_statements_and_residuals_and_runs_no_script(page):
     assert not page.open  # every tag is closed
     for fact in (
         *('Unit thermostatted-0001', evidence().calibration.provenance.created),
@@ -97,9 +92,6 @@ def test_the_certificate_of_a_fit_has_the_expected_statements_and_residuals(page
     assert shown == [*LEFT_OUT_RMS, None]
     assert 'left out, µg RMS' in page.text
     assert 'Left out: RMS of |f| − g of each position by a fit to the other pos' in page.text
-
-
-def test_the_page_loads_no_file_runs_no_script_and_has_unique_ids(page):
     assert not page.names() & {'script', 'img', 'link', 'iframe', 'object', 'embed', 'form'}
     for tag, attributes in page.tags:
         for name, value in attributes.items():
@@ -139,13 +131,11 @@ def test_a_page_without_calibration_shows_temperatures_derivatives_and_regime(op
     known = truth.grid_s > 10 * 60
     assert np.mean(dynamic[known] == ideal[known]) > 0.9
     directions = [s.direction for s in shown.stretches if s.direction]
-    assert directions[0] == 1
-    assert directions[-1] == -1
+    assert (directions[0], directions[-1]) == (1, -1)
     page = page_of(seen, tmp_path)
     assert 'no calibration was judged' in page.text
     assert 'means over 60 s at rest' in page.text
-    without = replace(seen, windows=None)
-    assert 'means over' not in page_of(without, tmp_path / 'without').text
+    assert 'means over' not in page_of(replace(seen, windows=None), tmp_path / 'without').text
     assert [figure.name for figure in figures_of(seen)] == ['temperatures', 'dynamics']
     assert all(figure.question in page.text for figure in figures_of(seen))
 
@@ -209,7 +199,7 @@ def test_a_bag_is_read_for_a_page_in_limited_memory(tmp_path):
 
 def test_a_calibration_without_bags_gives_a_page_and_figures_as_png(tmp_path):
     folder = tmp_path / 'new' / 'figures'
-    page = page_of(bare(), tmp_path, figures=folder)
+    page = page_of(evidence_of_bags([], fitted().calibration), tmp_path, figures=folder)
     assert 'no recording was judged' in page.text
     assert '01.mcap' in page.text
     assert f'{1:064x}' in page.text

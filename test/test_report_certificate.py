@@ -92,8 +92,7 @@ def test_rounding_changes_a_value_by_at_most_half_a_digit(value, expanded):
 
 
 def test_statements_of_a_laboratory_are_printed_and_missing_statements_are_blank(tmp_path):
-    info = load_certificate_info(lab(tmp_path), 'thermostatted-0001')
-    page = render_report(evidence(), info)
+    page = render_report(evidence(), load_certificate_info(lab(tmp_path), 'thermostatted-0001'))
     for text in (
         *('2026-017', 'Inertial Lab', '1 Street', 'L-1', 'A Customer', 'A. Person', 'ACME'),
         *('TRI-3', 'certificate 3 of 2025', '2e-05 m/s²', 'absolute gravimeter', '2026-03-01'),
@@ -170,12 +169,10 @@ def test_the_uncertainty_budget_adds_up_to_the_claimed_sd_or_a_larger_residual(t
     parts = [standards[name] for name in ('noise', 'attitude', LACK, 'model')]
     assert float(np.linalg.norm(parts)) == pytest.approx(claim)
     assert standards['repeatability'] == 0.0
-    info = load_certificate_info(lab(tmp_path))
-    stated = budget(evidence(), info)
+    stated = budget(evidence(), load_certificate_info(lab(tmp_path)))
     by_name = {contribution.name: contribution.standard for contribution in stated}
     assert by_name['gravity'] == 2e-5
-    expected = math.hypot(claim, 2e-5, by_name['thermometers'])
-    assert combined(stated) == pytest.approx(expected)
+    assert combined(stated) == pytest.approx(math.hypot(claim, 2e-5, by_name['thermometers']))
     judgement, claim = evidence().judgement, combined(budget(evidence(), CertificateInfo()))
     doubtful = replace(evidence(), judgement=replace(judgement, left_out_rms=3.0 * claim))
     standards = {source.name: source.standard for source in budget(doubtful, CertificateInfo())}
@@ -235,7 +232,7 @@ def test_the_budget_of_a_unit_with_a_kink_names_the_lack_of_fit():
     assert combined(lines) == pytest.approx(claim)
 
 
-def test_without_a_stated_uncertainty_of_gravity_that_of_scale_factors_is_withheld(tmp_path):
+def test_the_uncertainty_of_scale_factors_contains_that_of_gravity_or_is_withheld(tmp_path):
     # WHY: U = 0.00037 was printed for the scale factor, as if gravity had no error.
     rows = {result.quantity: result for result in results(evidence(), CertificateInfo(), ())}
     assert rows['scale factor x'].expanded == '–'
@@ -247,13 +244,18 @@ def test_without_a_stated_uncertainty_of_gravity_that_of_scale_factors_is_withhe
     assert 'withheld' not in render_report(evidence(), info)
     # WHY: the file of the calibration did not store gravity's sd, so U was withheld after a fit.
     unit = replace(evidence().calibration, gravity_sd_m_s2=2e-5)
-    read = parse_calibration(dump_calibration(unit).encode())
-    stated = replace(evidence(), calibration=read)
+    stated = replace(evidence(), calibration=parse_calibration(dump_calibration(unit).encode()))
     page = render_report(stated)
     assert 'withheld' not in page
     # WHY: gravity's sd was in all expanded uncertainties, but its line in the page was blank.
     assert re.search(r'Standard uncertainty of gravity<[^0-9]*2e-05 m/s²', page)
     assert {source.name: source.standard for source in budget(stated, info)}['gravity'] == 2e-5
+    info = load_certificate_info(lab(tmp_path, 'gravity: {standard_uncertainty_m_s2: 9.80665e-3}'))
+    rows = {result.quantity: result for result in results(evidence(), info, ())}
+    scale = fitted().calibration.axes.x.scale_factor
+    # Gravity, with a relative uncertainty of 1e-3, dominates the scale's uncertainty U = 2e-3.
+    assert float(rows['scale factor x'].expanded) == pytest.approx(2e-3 * scale, rel=0.05)
+    assert rows['bias x'] in results(evidence(), CertificateInfo(), ())
 
 
 def float_of(cell):
@@ -261,8 +263,7 @@ def float_of(cell):
 
 
 def test_the_table_over_temperature_agrees_with_the_calibration(tmp_path):
-    info = load_certificate_info(lab(tmp_path))
-    tables = over_temperature(evidence(), info)
+    tables = over_temperature(evidence(), load_certificate_info(lab(tmp_path)))
     assert [table.axis for table in tables] == ['x', 'y', 'z']
     calibration = fitted().calibration
     for k, table in enumerate(tables):
@@ -325,15 +326,6 @@ def test_values_and_deviations_have_equal_decimals_if_u_is_withheld(is_known, tm
 )
 def test_temperatures_of_the_table_are_round_numbers(ends, expected):
     assert table_temperatures(*ends).tolist() == expected
-
-
-def test_the_uncertainty_of_gravity_is_part_of_that_of_the_scale_factors(tmp_path):
-    info = load_certificate_info(lab(tmp_path, 'gravity: {standard_uncertainty_m_s2: 9.80665e-3}'))
-    rows = {result.quantity: result for result in results(evidence(), info, ())}
-    scale = fitted().calibration.axes.x.scale_factor
-    # Gravity, with a relative uncertainty of 1e-3, dominates the scale's uncertainty U = 2e-3.
-    assert float(rows['scale factor x'].expanded) == pytest.approx(2e-3 * scale, rel=0.05)
-    assert rows['bias x'] in results(evidence(), CertificateInfo(), ())
 
 
 def test_conformity_is_stated_only_with_a_tolerance():

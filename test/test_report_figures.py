@@ -34,8 +34,7 @@ def test_drawn_bias_and_scale_curves_agree_with_formulas():
         for delta in (0.0, 0.5)
     )
     response = (term('board', (0.3, 0.0, 0.0), (0.0, 1e-6, 0.0), tau_s=600.0),)
-    unit = calibration(static=static, dynamic=dynamic, response=response)
-    soak, heating = curves(unit)
+    soak, heating = curves(calibration(static=static, dynamic=dynamic, response=response))
     assert (soak.program.label, heating.program.label) == ('soak', 'heating at 1 K/min')
     count = 1.0 / 300.0 / MICRO_G
     t = soak.temperature - 20.0
@@ -68,7 +67,7 @@ def test_position_errors_and_the_map_of_the_sphere_agree_with_hand_numbers():
     assert schuler_peak(MICRO_G) == pytest.approx(12.742, rel=1e-4)
     assert figures.equal_area((0.0, 0.0, 1.0), 1) == (0.0, 0.0)
     assert figures.equal_area((0.0, 1.0, 0.0), -1) == (0.0, 1.0)
-    # The cap above 45 deg is 1 - sin 45 of the hemisphere; its map is this share of the disc.
+    # The cap above 45 deg has the share 1 - sin 45 of the hemisphere's area, and of the disc's.
     x, y = figures.equal_area((np.sqrt(0.5), 0.0, np.sqrt(0.5)), 1)
     assert x**2 + y**2 == pytest.approx(1.0 - np.sqrt(0.5))
 
@@ -76,14 +75,12 @@ def test_position_errors_and_the_map_of_the_sphere_agree_with_hand_numbers():
 def test_the_drawn_trace_covers_the_bag_without_a_gap_also_without_a_case():
     bag = fitted().bags[0]
     stretches = shown_bag(bag, 0, DetectorSettings()).stretches
-    assert stretches[0].regime == Regime.UNKNOWN
-    assert stretches[0].start == 0.0
+    assert (stretches[0].regime, stretches[0].start) == (Regime.UNKNOWN, 0.0)
     assert stretches[-1].stop == pytest.approx((bag.end_ns - bag.start_ns) * 1e-9)
     for before, after in pairwise(stretches):
         assert before.stop == after.start
         assert (before.regime, before.direction) != (after.regime, after.direction)
-    bag = replace(bag, temperatures={'board': bag.board})
-    shown = shown_bag(bag, 0, DetectorSettings())
+    shown = shown_bag(replace(bag, temperatures={'board': bag.board}), 0, DetectorSettings())
     assert shown.leader == 'board'
     assert not np.isfinite(shown.case_rate).any()
     assert any(stretch.regime == Regime.DYNAMIC for stretch in shown.stretches)
@@ -149,17 +146,14 @@ def test_the_figure_of_rates_shows_the_bias_of_the_gyroscope():
     unit = rich_calibration()
     with drawing():
         figure = figures.draw_rates(replace(evidence(), calibration=unit))
-    gyroscope = unit.gyroscope
-    for axes, curve in zip(figure.axes, gyroscope.static.axes(), strict=True):
-        soak = axes.get_lines()[0]
-        celsius, drawn = np.array(soak.get_data(), dtype=float)
+    for axes, curve in zip(figure.axes, unit.gyroscope.static.axes(), strict=True):
+        celsius, drawn = np.array(axes.get_lines()[0].get_data(), dtype=float)
         bias = np.degrees(curve.bias_function.value(celsius - 20.0)) * 1e3
         slope = np.polyfit(celsius, bias, 1)[0]
         # The figure shows the gyroscope's bias minus its linear fit over temperature [mdeg/s].
         np.testing.assert_allclose(drawn, bias - slope * (celsius - 20.0), atol=1e-9)
         assert f'{slope:+.3g}'.replace('-', '\u2212') in axes.get_title(loc='left')
-    names = [figure.name for figure in figures_of(replace(evidence(), calibration=unit))]
-    assert 'rates' in names
+    assert 'rates' in [figure.name for figure in figures_of(replace(evidence(), calibration=unit))]
     assert 'rates' not in [figure.name for figure in figures_of(evidence())]
 
 

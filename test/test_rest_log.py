@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 
 from builders import calibration
 from diagnostic_msgs.msg import DiagnosticArray
@@ -217,8 +217,7 @@ def test_the_size_of_a_rest_log_is_limited_per_day_and_in_total(tmp_path, monkey
     log = RestLog(str(tmp_path))
     for day in range(6):
         for k in range(40):
-            stamp = rest(day * 8640 + k).stamp_ns
-            log.put(stamp, encode(START), encode(rest(day * 8640 + k)))
+            log.put(rest(day * 8640 + k).stamp_ns, encode(START), encode(rest(day * 8640 + k)))
     log.close(10.0)
     sizes = [file.stat().st_size for file in sorted(tmp_path.glob('*.rests'))]
     assert len(sizes) == 6
@@ -285,8 +284,7 @@ def test_a_killed_node_damages_at_most_one_line_of_its_rest_log(tmp_path, unit, 
     last = rests[len(before)][1]
     begin = round((last.stamp_ns - START_NS) / SECOND_NS - 5.0) * RATE_HZ
     assert np.allclose(last.mean, samples[begin : begin + 10 * RATE_HZ].mean(axis=0), atol=1e-5)
-    assert last.n == 10 * RATE_HZ
-    assert last.state[0] == pytest.approx(21.0, abs=1e-6)
+    assert (last.n, last.state[0]) == (10 * RATE_HZ, pytest.approx(21.0, abs=1e-6))
     assert len({start.start_ns for start, _ in rests}) == 2
     assert {start.serial for start, _ in rests} == {'T-1'}
 

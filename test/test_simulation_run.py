@@ -96,15 +96,13 @@ def test_the_sum_of_counts_without_noise_is_the_integral_of_the_truth(unit):
     truth = run.truth
     s = truth.specific_force @ np.linalg.inv(unit.M).T
     charge = truth.bias + np.array(unit.scale_factor) * truth.scale * s
-    short = np.cumsum(charge - run.counts, axis=0)
-    assert np.ptp(short, axis=0).max() < 1.0 + 1e-6
+    assert np.ptp(np.cumsum(charge - run.counts, axis=0), axis=0).max() < 1.0 + 1e-6
     assert np.linalg.norm(truth.specific_force) == pytest.approx(STANDARD_GRAVITY)
 
 
 def test_simulated_white_noise_has_the_stated_density(unit):
     """The one-sided spectrum is ``2 density^2``, the sd of 60 s means ``density / sqrt(60)``."""
-    still = replace(unit, drift=())
-    run = simulate(still, parse_cyclogram('soak'), UP, rate_hz=50.0, seed=3)
+    run = simulate(replace(unit, drift=()), parse_cyclogram('soak'), UP, rate_hz=50.0, seed=3)
     accel = run.counts / np.array(unit.scale_factor) / MICRO_G
     frequency, power = welch(accel, fs=50.0, nperseg=16384, axis=0)
     # A sample contains the last rounding remainder: noise rises with f^2, 1 (ug)^2/Hz at 0.4 Hz.
@@ -191,17 +189,7 @@ def test_presets_agree_with_a_numerical_integrator(name):
     np.testing.assert_allclose(states, solved.y.T, atol=2e-5)
 
 
-def test_creep_decays_with_its_time_constant():
-    step = np.full((7201, 1), 10.0)
-    step[0] = 0.0
-    history = PartHistory(('case',), step, np.zeros(1), 1.0)
-    bias, scale = CreepEffect('case', 7200.0, bias=(1.0, 2.0, 0.0)).change(history)
-    # The tolerance is the length of the step, 1 s, relative to the time constant.
-    np.testing.assert_allclose(bias[-1], np.array([10.0, 20.0, 0.0]) * math.exp(-1.0), atol=2e-3)
-    np.testing.assert_array_equal(scale, 0.0)
-
-
-def test_the_steady_state_obeys_the_heat_balance():
+def test_the_steady_state_obeys_the_heat_balance_also_with_a_thermostat():
     network = unit_preset('bare-quartz', 5).network
     warm = network.equilibrium(12.0)
     to_air = next(link for link in network.links if AIR in (link.a, link.b))
@@ -211,11 +199,7 @@ def test_the_steady_state_obeys_the_heat_balance():
     temperatures = response.temperatures(np.array([0.0, 1800.0, 3600.0]))
     np.testing.assert_allclose(temperatures, np.tile(warm, (3, 1)), atol=ROUNDING)
     assert network.equilibrium(network.air_for('board', 20.0))[board] == pytest.approx(20.0)
-
-
-def test_a_thermostat_keeps_its_part_within_0_2_k_by_the_power_that_leaks():
-    unit = unit_preset('thermostatted', 2)
-    network = unit.network
+    network = unit_preset('thermostatted', 2).network
     heat = network.thermostat
     oven, head = network.nodes.index('oven'), network.nodes.index('head')
     for air in (5.0, 20.0, 35.0):
@@ -230,8 +214,7 @@ def test_a_thermostat_keeps_its_part_within_0_2_k_by_the_power_that_leaks():
         assert network.settled(air)[len(network.nodes)] == pytest.approx(leak)
     program = parse_cyclogram('fast')
     response = response_of(network, program.time_s, program.temperature_c)
-    grid = np.arange(0.0, program.duration_s, 30.0)
-    assert np.ptp(response.temperatures(grid)[:, head]) < 0.2
+    assert np.ptp(response.temperatures(np.arange(0.0, program.duration_s, 30.0))[:, head]) < 0.2
 
 
 PROGRAM = parse_cyclogram('20 10min, 30@1 20min, 24@0.5 10min')
@@ -292,18 +275,23 @@ def test_plans_have_the_stated_durations_and_attitudes():
     assert (ups['held-out'] @ ups['chamber-18'].T).max() < 0.999
 
 
-def test_the_effect_of_heat_flow_is_even_and_zero_at_rest_and_may_saturate():
+def test_the_effect_of_heat_flow_is_even_and_may_saturate_and_creep_decays():
     up = np.stack([np.linspace(0, 3, 50), np.zeros(50)], axis=1)
     effect = FlowEffect('a', 'b', 1.25, bias=(1.0, 0.0, 0.0))
     warm, cold = (effect.change(_history(sign * up))[0] for sign in (1.0, -1.0))
     np.testing.assert_allclose(warm, cold)
-    assert warm[-1, 0] == pytest.approx(3.0**1.25)
-    assert warm[0, 0] == 0.0
+    assert (warm[-1, 0], warm[0, 0]) == (pytest.approx(3.0**1.25), 0.0)
     up = np.stack([np.array([0.0, 0.5, 50.0]), np.full(3, 2.0)], axis=1)
     up[:, 0] += 2.0
-    effect = FlowEffect('a', 'b', 2.0, 0.5, True, 1, bias=(1.0, 0.0, 0.0))
-    bias, _ = effect.change(_history(up))
+    bias, _ = FlowEffect('a', 'b', 2.0, 0.5, True, 1, bias=(1.0, 0.0, 0.0)).change(_history(up))
     np.testing.assert_allclose(bias[:, 0], [0.0, 1.0, 2.0], atol=1e-3)
+    step = np.full((7201, 1), 10.0)
+    step[0] = 0.0
+    history = PartHistory(('case',), step, np.zeros(1), 1.0)
+    bias, scale = CreepEffect('case', 7200.0, bias=(1.0, 2.0, 0.0)).change(history)
+    # The tolerance is the length of the step, 1 s, relative to the time constant.
+    np.testing.assert_allclose(bias[-1], np.array([10.0, 20.0, 0.0]) * math.exp(-1.0), atol=2e-3)
+    np.testing.assert_array_equal(scale, 0.0)
 
 
 def test_a_switched_load_warms_its_part_by_the_steady_heat_balance():
@@ -369,11 +357,10 @@ def test_units_of_equal_seeds_are_equal_and_start_at_the_reference_temperature(n
 
 @pytest.mark.parametrize('seed', range(8))
 def test_the_presets_bare_quartz_and_mems_have_the_published_slopes(seed):
-    # Q-Flex: scale slope 68 ppm/K at 5 degC, 87 at 35 degC; bias slope 0.3 to 5 ug/K.
-    # MEMS: bias slope 90 to 550 ug/K.
+    # Q-Flex: scale slopes of 68 ppm/K at 5 degC, 87 at 35 degC. Bias slopes: 0.3 to 5 ug/K, of a
+    # MEMS 90 to 550 ug/K.
     unit = unit_preset('bare-quartz', seed)
-    board = np.array([4.5, 5.5, 19.5, 20.0, 20.5, 34.5, 35.5])
-    bias, scale = _static(unit, board)
+    bias, scale = _static(unit, np.array([4.5, 5.5, 19.5, 20.0, 20.5, 34.5, 35.5]))
     cold, hot = (scale[1] - scale[0]) * 1e6, (scale[6] - scale[5]) * 1e6
     # The slopes of simulated units differ by 1 % (1 sd) from the published slopes.
     np.testing.assert_allclose(cold, 68.0, atol=1.5)
@@ -402,6 +389,5 @@ def test_the_converter_is_exact_to_one_count_a_day_and_saturates_at_16_bits():
     charge = np.array([[4e4, -4e4, 0.5], [0.5, 0.5, 0.5], [0.5, 0.5, 0.5]])
     counts, _ = balanced(charge, np.zeros(3, dtype=np.int64))
     np.testing.assert_array_equal(counts, [[32767, -32768, 0], [0, 0, 1], [1, 1, 0]])
-    charge = np.full((5, 3), 10.4)
-    counts, _ = rounded(charge, first_charge(0))
+    counts, _ = rounded(np.full((5, 3), 10.4), first_charge(0))
     np.testing.assert_array_equal(counts, 10)

@@ -49,8 +49,7 @@ def ramp(given, rate, hours, environment=units.CHAMBER):
 def test_a_node_lags_a_ramp_by_its_time_constant_and_the_hidden_node_depends_on_the_air():
     # A node with x' = (u - x) / tau lags a ramp u by rate * tau after many time constants.
     lags = np.array([500.0, 900.0, 1500.0])
-    given = unit(board_s=700.0, part_s=lags)
-    _, states = ramp(given, 0.01, 12)
+    _, states = ramp(unit(board_s=700.0, part_s=lags), 0.01, 12)
     case, board = states[-1, units.CASE], states[-1, units.BOARD]
     assert case - board == pytest.approx(0.01 * 700.0, rel=1e-6)
     assert board - states[-1, units.PARTS] == pytest.approx(0.01 * lags, rel=1e-6)
@@ -100,7 +99,7 @@ def test_simulated_samples_have_the_stated_noise_bias_scale_and_misalignment():
     assert error.std(axis=0) == pytest.approx([sd] * 3, rel=0.03 + 4.0 / np.sqrt(2 * n))
 
 
-def test_a_support_tilts_with_the_square_of_temperature():
+def test_a_support_tilts_with_temperature_squared_and_a_cold_start_is_at_air_temperature():
     axis = np.array([1e-6, 0.0, 0.0])
     bag = record(unit(), units.program(20, 10, (35, 1, 60)), LEVEL, rng_of('tilt'), tilt=axis)
     case = np.interp(bag.time_s - 1.0, *bag.temperatures['case'])
@@ -108,9 +107,6 @@ def test_a_support_tilts_with_the_square_of_temperature():
     # The tolerance is the error of interpolation between case readings 5 s apart.
     assert angle == pytest.approx(1e-6 * (case - 20.0) ** 2, abs=5e-7)
     assert np.linalg.norm(bag.force, axis=1) == pytest.approx(GRAVITY)
-
-
-def test_a_cold_start_begins_at_the_temperature_of_the_air():
     given = unit(heat_k=2.0)
     cold = record(given, cases.FROST, LEVEL, rng_of('cold'), is_cold=True)
     warm = record(given, cases.FROST, LEVEL, rng_of('cold'))
@@ -120,14 +116,11 @@ def test_a_cold_start_begins_at_the_temperature_of_the_air():
         assert board - case == pytest.approx(heat, abs=0.1)
 
 
-def test_the_sum_of_samples_with_carried_remainders_is_exact_to_half_a_count():
+def test_carried_remainders_give_exact_sums_and_flicker_noise_a_flat_allan_deviation():
     words = np.full((1000, 3), 0.3)
     kept, lost = (units.quantised(words, carries) for carries in (True, False))
     assert np.abs(np.cumsum(kept, axis=0) - np.cumsum(words, axis=0)).max() <= 0.5
     assert not lost.any()
-
-
-def test_flicker_noise_has_a_flat_allan_deviation():
     noise = units.flicker_noise(40_000, 2.0, 3.0, rng_of('flicker'))
     for size in (10, 100, 1000):
         means = noise.reshape(-1, size, 3).mean(axis=1)
@@ -243,19 +236,16 @@ def test_the_scipy_cubic_fits_a_cubic_bias_in_many_attitudes_and_its_drift_in_on
 
 def test_a_scipy_fit_to_one_attitude_does_not_change_the_scatter_of_forces():
     # WHY: without bounds, a fit to one attitude found scale factors that made all forces equal.
-    rng = rng_of('few')
-    samples = GRAVITY * LEVEL + 0.3 * rng.standard_normal((200, 3))
+    samples = GRAVITY * LEVEL + 0.3 * rng_of('few').standard_normal((200, 3))
     few = Minutes(samples, np.full(200, 20.0), np.full((200, 3), np.nan))
-    force = by_norm([few])(few)
-    assert force.std(axis=0) == pytest.approx(samples.std(axis=0), rel=0.4)
+    assert by_norm([few])(few).std(axis=0) == pytest.approx(samples.std(axis=0), rel=0.4)
 
 
 def test_the_bias_score_is_error_over_bound_and_error_over_claimed_sd():
     # In the calibration the bias of x has an error of 1 count, 1 / 300 m/s^2.
     bias = np.array([0.1, -0.2, 0.3])
     axes = Axes(*(AxisReference(300.0, 300.0 * b) for b in bias + np.array([1 / 300.0, 0.0, 0.0])))
-    bound = cases.Bound(unit(counts=300.0), bias, np.full(3, 1e-3))
-    study = cases.Study('', (), {}, bound=bound)
+    study = cases.Study('', (), {}, bound=cases.Bound(unit(counts=300.0), bias, np.full(3, 1e-3)))
     # The calibration claims a bias sd of 2e-3 m/s^2; the turn-on sd, 5e-3 m/s^2, is not counted.
     again = axis_set(residual_sd_m_s2=5e-3)
     known = regime_set(x=again, y=again, z=again)
@@ -274,15 +264,13 @@ def test_a_minute_is_a_mean_whose_claimed_sd_is_its_noise():
     time_s = np.arange(1.0, 151.0)
     samples = np.repeat(time_s[:, None], 3, axis=1)
     mean = minutes(Bag('', time_s, samples, {'board': (time_s, 2.0 * time_s)}))
-    assert mean.samples[:, 0].tolist() == [30.5, 90.5]
-    assert mean.board.tolist() == [61.0, 181.0]
+    assert (mean.samples[:, 0].tolist(), mean.board.tolist()) == ([30.5, 90.5], [61.0, 181.0])
     assert np.isnan(mean.force).all()
     # The calibration claims only white noise and rounding of counts.
     samples = np.tile(300.0 * GRAVITY * LEVEL, (30000, 1))
     samples[::2] += 1.0
     samples[1::2] -= 1.0
-    bag = Bag('', np.arange(1, 30001) * 0.01, samples, {})
-    out = strangers.corrected(calibration(), bag)
+    out = strangers.corrected(calibration(), Bag('', np.arange(1, 30001) * 0.01, samples, {}))
     assert np.sqrt(np.diagonal(out.claim, axis1=1, axis2=2)) == pytest.approx(1e-4 / np.sqrt(60.0))
     assert out.white == pytest.approx([1e-8 / 60.0] * 3)
     assert out.force == pytest.approx(np.tile(GRAVITY * LEVEL, (5, 1)))
@@ -310,7 +298,19 @@ def test_the_ratio_is_1_for_the_claimed_covariance_and_infinite_if_minutes_are_m
         assert scores.ratio == pytest.approx(expected)
 
 
-def test_misses_names_exactly_the_limits_that_a_row_violates():
+@pytest.mark.parametrize('name', ['units', 'cases', 'baselines', 'limits'])
+def test_the_simulation_and_the_limits_import_nothing_of_the_package(name):
+    source = (ROOT / 'benchmarks' / f'strangers_{name}.py').read_text(encoding='utf-8')
+    imports = [line for line in source.splitlines() if 'import ' in line]
+    assert imports
+    assert not [line for line in imports if 'thermo_comp' in line]
+
+
+def test_each_case_has_a_limit_and_misses_names_exactly_the_violated_limits():
+    names = (*strangers.RECORDED, *cases.CASES)
+    assert all(any(key.startswith(name) for key in LIMITS) for name in names)
+    assert all(any(key.startswith(name) for name in names) for key in LIMITS)
+    assert all(isinstance(limit, Limit) for limit in LIMITS.values())
     baselines = {'cubic': Score(50.0, 100.0), 'constants': Score(40.0, 200.0)}
 
     def missed(fit, title='ageing'):
@@ -328,21 +328,6 @@ def test_misses_names_exactly_the_limits_that_a_row_violates():
                     Result('third-node joint: its attitude', 1, {'fit': joint})])  # fmt: skip
     assert misses(rows[0], rows) == []
     assert misses(rows[1], rows) == ['vector / alone: its attitude 0.75 > 0.5']
-
-
-@pytest.mark.parametrize('name', ['units', 'cases', 'baselines', 'limits'])
-def test_the_simulation_and_the_limits_import_nothing_of_the_package(name):
-    source = (ROOT / 'benchmarks' / f'strangers_{name}.py').read_text(encoding='utf-8')
-    imports = [line for line in source.splitlines() if 'import ' in line]
-    assert imports
-    assert not [line for line in imports if 'thermo_comp' in line]
-
-
-def test_each_case_has_a_limit_and_each_limit_has_a_case():
-    names = (*strangers.RECORDED, *cases.CASES)
-    assert all(any(key.startswith(name) for key in LIMITS) for name in names)
-    assert all(any(key.startswith(name) for name in names) for key in LIMITS)
-    assert all(isinstance(limit, Limit) for limit in LIMITS.values())
 
 
 def carried_bag():

@@ -74,8 +74,7 @@ def test_the_dynamic_weight_is_linear_over_the_transition_time(transition_s, n_s
         weights.append(tracker.weight_at((1199 + k) * SECOND_NS))
     assert tracker.detector.regime == Regime.DYNAMIC
     steps = np.diff(weights)
-    moving = steps[steps != 0.0]
-    np.testing.assert_allclose(moving, [1.0 / n_steps] * n_steps, atol=1e-9)
+    np.testing.assert_allclose(steps[steps != 0.0], [1.0 / n_steps] * n_steps, atol=1e-9)
     assert (weights[0], weights[-1]) == (0.0, 1.0)
 
 

@@ -41,8 +41,7 @@ def state(thermometer):
 
 def settled(noise=0.001, n=600, **changes):
     thermometer = Thermometer(ThermometerSettings(noise, **changes))
-    rng = np.random.default_rng(5)
-    run(thermometer, np.arange(n), read(np.full(n, 20.0), noise, 0.0, rng))
+    run(thermometer, np.arange(n), read(np.full(n, 20.0), noise, 0.0, np.random.default_rng(5)))
     return thermometer
 
 
@@ -106,7 +105,7 @@ def test_errors_in_a_ramp_are_bounded(errors, sensor, temperature_k, rate_k_min)
     assert 60.0 * math.sqrt(np.mean(rows[:, 2])) < rate_k_min
 
 
-def test_a_change_between_steps_of_1_k_determines_the_temperature():
+def test_a_change_of_1_k_steps_shows_the_temperature_and_without_noise_it_is_exact():
     # Readings with steps of 1 K change from 20 to 21 degC when the temperature is 20.5 degC.
     thermometer = Thermometer(ThermometerSettings(0.01, 1.0))
     for k in range(600):
@@ -116,6 +115,19 @@ def test_a_change_between_steps_of_1_k_determines_the_temperature():
     assert thermometer.temperature == pytest.approx(20.5, abs=0.03)
     # At a change of the reading the estimate's sd is the noise plus the change between readings.
     assert 0.005 < math.sqrt(thermometer.var_temperature) < 0.03
+    thermometer = Thermometer(ThermometerSettings())
+    for k in range(100):
+        assert thermometer.update(k * SECOND_NS, 20.25)
+        assert (thermometer.temperature, thermometer.rate) == (20.25, 0.0)
+        assert thermometer.acceleration[0] == 0.0
+    assert type(thermometer.temperature) is float
+    # After minutes of readings the prior of the rate (sd 3 K/min) has no effect.
+    thermometer = Thermometer(ThermometerSettings())
+    for k in range(600):
+        thermometer.update(k * SECOND_NS, 20.0 + 0.01 * k)
+    assert thermometer.temperature == pytest.approx(25.99, abs=1e-5)
+    assert thermometer.rate == pytest.approx(0.01, abs=1e-6)
+    assert abs(thermometer.acceleration[0]) < 1e-7
 
 
 @pytest.mark.parametrize(('quantum', 'lag_s'), [(0.1, 120.0), (0.5, 180.0), (1.0, 600.0)])
@@ -132,22 +144,6 @@ def test_equal_readings_each_minute_keep_the_error_below_1_5_quanta(quantum, lag
     # In the ramp of 1 K/min the estimated rate is right although a reading comes once a minute.
     rows = np.flatnonzero((t > 2.0 * lag_s) & (t < 1200.0))
     assert np.abs(out[rows, 1] - 1.0 / 60.0).max(initial=0.0) < max(quantum, 0.3) / 60.0
-
-
-def test_the_estimate_of_a_constant_temperature_or_a_ramp_without_noise_is_exact():
-    thermometer = Thermometer(ThermometerSettings())
-    for k in range(100):
-        assert thermometer.update(k * SECOND_NS, 20.25)
-        assert (thermometer.temperature, thermometer.rate) == (20.25, 0.0)
-        assert thermometer.acceleration[0] == 0.0
-    assert type(thermometer.temperature) is float
-    # After minutes of readings the prior of the rate (sd 3 K/min) has no effect.
-    thermometer = Thermometer(ThermometerSettings())
-    for k in range(600):
-        thermometer.update(k * SECOND_NS, 20.0 + 0.01 * k)
-    assert thermometer.temperature == pytest.approx(25.99, abs=1e-5)
-    assert thermometer.rate == pytest.approx(0.01, abs=1e-6)
-    assert abs(thermometer.acceleration[0]) < 1e-7
 
 
 UPPER = np.triu_indices(3)
@@ -175,8 +171,7 @@ def test_prediction_correction_and_blend_equal_matrix_algebra():
     gain = covariance[:, 0] / (covariance[0, 0] + 0.2)
     np.testing.assert_allclose(out[:3], mean + gain * (5.0 - mean[0]), rtol=1e-13)
     np.testing.assert_allclose(out[3:], (covariance - np.outer(gain, covariance[0]))[UPPER])
-    assert innovation == 5.0 - mean[0]
-    assert spread == pytest.approx(covariance[0, 0] + 0.2)
+    assert (innovation, spread) == (5.0 - mean[0], pytest.approx(covariance[0, 0] + 0.2))
     rng = np.random.default_rng(2)
     states, samples = [], []
     for n in (300_000, 100_000):
@@ -199,8 +194,7 @@ def test_readings_that_are_not_finite_or_not_newer_do_not_change_the_state(stamp
     thermometer = settled()
     before = state(thermometer)
     assert not thermometer.update(stamp_s * SECOND_NS, reading)
-    assert state(thermometer) == before
-    assert thermometer.n_in_row == 600
+    assert (state(thermometer), thermometer.n_in_row) == (before, 600)
 
 
 def test_a_far_reading_has_little_weight_and_a_lasting_step_is_accepted_after_four():
@@ -233,8 +227,7 @@ def test_a_gap_increases_the_variance_or_restarts_and_changed_ns_is_the_stamp_of
     thermometer = settled()
     for k in range(600, 700):
         thermometer.update(k * SECOND_NS, 20.0)
-    assert thermometer.changed_ns == 600 * SECOND_NS
-    assert thermometer.stamp_ns == 699 * SECOND_NS
+    assert (thermometer.changed_ns, thermometer.stamp_ns) == (600 * SECOND_NS, 699 * SECOND_NS)
 
 
 def test_the_noise_is_estimated_if_the_setting_is_too_small():

@@ -150,8 +150,7 @@ def test_a_state_beyond_the_edge_of_a_column_is_limited_and_increases_the_sd():
     of_y = [27, 29, 32]  # coefficients of 1, y and y^2 in the variance of y
     assert beyond[of_y].tolist() == edge[of_y].tolist()
     excess = correction.excess(outside, is_dynamic=False)
-    assert excess.relative == pytest.approx(2.0)
-    assert excess[:3] == (0.0, 0.0, 2.0)
+    assert (excess.relative, excess[:3]) == (pytest.approx(2.0), (0.0, 0.0, 2.0))
 
 
 def sd_at(unit, board, behind=0.0, force=0.0):
@@ -162,8 +161,7 @@ def sd_at(unit, board, behind=0.0, force=0.0):
     state[BOARD] = board
     for lag in layout.lags:
         state[layout.places[lag]] = behind
-    line = correction.line(tuple(state), tuple(state), np.zeros(N_ROWS), 0.0)
-    a, b, c = line[12:15]
+    a, b, c = correction.line(tuple(state), tuple(state), np.zeros(N_ROWS), 0.0)[12:15]
     return math.sqrt(a - correction.noise[0] + b * force + c * force**2)
 
 
@@ -276,13 +274,13 @@ def test_the_claimed_sd_grows_with_the_distance_from_the_range():
     unit = rich_calibration()
     correction = Correction(unit)
     slow = SlowUncertainty(unit, correction)
-    nobody = np.zeros((len(correction.memory.lags), 1))
+    no_shares = np.zeros((len(correction.memory.lags), 1))
     for sign in (1.0, -1.0):
         variances = []
         for beyond in (0.0, 0.1, 1.0, 3.0, 7.4, 7.6, 15.0, 40.0):
             state = np.zeros((StateLayout(correction.memory).width, 1))
             state[BOARD] = 20.0 + sign * (15.0 + beyond)
-            line = correction.line(state, state, slow.at(state, nobody), 0.0)
+            line = correction.line(state, state, slow.at(state, no_shares), 0.0)
             variances.append(line[list(VARIANCES), 0])
         assert (np.diff(variances, axis=0) > 0.0).all()
         # If the true curve is constant outside the range, the error is within the claimed sd.
@@ -293,8 +291,7 @@ def test_the_claimed_sd_grows_with_the_distance_from_the_range():
 def test_rates_and_squares_beyond_their_range_increase_the_sd_by_their_distance():
     # WHY: in a ramp the variance of a unit fitted to soaks was multiplied by several hundred,
     # although it contained the variance of the lag.
-    axis = axis_set(residual_sd_m_s2=1e-5)
-    soaks = regime_set(axis, rate_range_k_min=(-0.1, 0.1))
+    soaks = regime_set(axis_set(residual_sd_m_s2=1e-5), rate_range_k_min=(-0.1, 0.1))
     sds = []
     for response in ((), (term('board', tau_s=600.0),)):
         correction = Correction(calibration(static=soaks, dynamic=soaks, response=response))
@@ -311,5 +308,4 @@ def test_rates_and_squares_beyond_their_range_increase_the_sd_by_their_distance(
     correction = Correction(unit)
     state = np.zeros(StateLayout(correction.memory).width)
     state[BOARD], state[correction.layout.places[unit.response[0].source]] = 20.0, 10.0
-    excess = correction.excess(state, is_dynamic=False)
-    assert 99.0 < excess.relative < 150.0
+    assert 99.0 < correction.excess(state, is_dynamic=False).relative < 150.0

@@ -42,7 +42,7 @@ def prior_of(lower, upper, *lacks):
     return Parts(regime_sets=lambda: (regime, regime))
 
 
-def test_axes_never_along_gravity_at_some_temperatures_have_a_larger_sd():
+def test_axes_never_along_gravity_have_a_larger_sd_and_in_an_update_keep_that_of_the_prior():
     # Six positions, one per face, cover 0 to 40 degC; one position with x up covers -40 to 0 degC.
     faces = [*np.eye(3), *-np.eye(3), np.eye(3)[0]]
     fit = fit_of([0, 40] * 6 + [-40, 0], faces, np.repeat(np.arange(7), 2))
@@ -54,6 +54,13 @@ def test_axes_never_along_gravity_at_some_temperatures_have_a_larger_sd():
         assert point.sd_m_s2 == pytest.approx((0.0, sd, sd), abs=1e-12)
     (finding,) = thermal_ranges.judge_unseen_axes(fit, None)
     assert 'below -4 degC no position has gravity along y and z' in finding.message
+    lacks = LackOfFit(0.0, (1e-3, 1e-3, 1e-3)), LackOfFit(40.0, (1e-3, 1e-3, 1e-3))
+    fit = fit_of([10, 30], [[1.0, 0.0, 0.0]], [0, 0])
+    new = (LackOfFit(20.0, (2e-4, 2e-4, 2e-3)),)
+    (points, _) = thermal_ranges.with_unseen_axes(fit, (new, new), prior_of(0.0, 40.0, *lacks))
+    by_temperature = {point.temperature_c: point.sd_m_s2 for point in points}
+    assert by_temperature[20.0] == pytest.approx((2e-4, 1e-3, 2e-3))
+    assert by_temperature[0.0] == pytest.approx((1e-3, 1e-3, 2e-3))
 
 
 @pytest.mark.parametrize('only_x', [False, True])
@@ -65,16 +72,6 @@ def test_no_sd_is_added_if_the_same_axes_are_along_gravity_at_all_temperatures(o
     # A prior determines all axes within its temperature range, from 0 to 40 degC.
     (lack, _) = thermal_ranges.with_unseen_axes(fit, ((), ()), prior_of(0.0, 40.0))
     assert bool(lack) == only_x
-
-
-def test_an_update_keeps_the_lack_of_fit_of_axes_that_it_does_not_observe():
-    lacks = LackOfFit(0.0, (1e-3, 1e-3, 1e-3)), LackOfFit(40.0, (1e-3, 1e-3, 1e-3))
-    fit = fit_of([10, 30], [[1.0, 0.0, 0.0]], [0, 0])
-    new = (LackOfFit(20.0, (2e-4, 2e-4, 2e-3)),)
-    (points, _) = thermal_ranges.with_unseen_axes(fit, (new, new), prior_of(0.0, 40.0, *lacks))
-    by_temperature = {point.temperature_c: point.sd_m_s2 for point in points}
-    assert by_temperature[20.0] == pytest.approx((2e-4, 1e-3, 2e-3))
-    assert by_temperature[0.0] == pytest.approx((1e-3, 1e-3, 2e-3))
 
 
 def kinked(bag, unit):
@@ -114,8 +111,7 @@ def test_rests_in_one_pose_at_four_temperatures_determine_the_drift_of_level_axe
     study = list(cases.returned(unit))[poses - 1]
     calibration = strangers.fitted(study)
     (held,) = map(slow, study.tests[''])
-    force = strangers.corrected(calibration, held).force
-    drift = force - strangers.minutes(held).force
+    drift = strangers.corrected(calibration, held).force - strangers.minutes(held).force
     drift -= np.nanmean(drift, axis=0)
     # Attitude errors of 0.2 mrad RMS cause errors of about 0.2 mg; the tolerance is twice that.
     assert np.sqrt(np.nanmean(drift**2)) < 2.0 * 2e-4 * GRAVITY
@@ -139,9 +135,7 @@ def test_only_an_attitude_to_which_the_unit_was_returned_is_a_pose():
 
 def test_rests_in_one_pose_use_the_mounting_sd_that_the_user_stated():
     # WHY: a fit of rests in one pose used a smaller sd of mountings than the user had stated.
-    study = next(cases.returned(1))
-    calibration = strangers.fitted(study, mounting_sd=0.01)
-    for axis in calibration.static.axes():
+    for axis in strangers.fitted(next(cases.returned(1)), mounting_sd=0.01).static.axes():
         assert axis.residual_sd_m_s2 == pytest.approx(0.01)
 
 
@@ -149,12 +143,10 @@ def test_rests_in_one_pose_use_the_mounting_sd_that_the_user_stated():
 @pytest.mark.parametrize(
     ('draw', 'unit', 'is_cold'),
     [
-        (cases.consumer_grade, 3, False),
-        (cases.consumer_grade, 4, False),
-        (navigation, 2, True),
-        (navigation, 2, False),
+        (cases.consumer_grade, 3, False), (cases.consumer_grade, 4, False),
+        (navigation, 2, True), (navigation, 2, False),
     ],
-)
+)  # fmt: skip
 def test_the_claimed_sd_is_right_if_one_ramp_cannot_separate_bias_and_scale(draw, unit, is_cold):
     # WHY: the drift in the only ramp, or a lag's effect in warm-ups, was taken for scale changes.
     rng = rng_of('bench beside a ramp', unit)
@@ -241,8 +233,7 @@ def test_a_lag_is_corrected_at_twice_the_rates_of_the_fit():
 
 def test_the_claimed_sd_of_a_mems_with_a_single_turn_on_is_0_3_to_1_5_mg():
     # WHY: a bias change of 0.6 mg at a turn-on of a MEMS was 5 times the claimed sd.
-    rng = np.random.default_rng(3)
-    bag, *_ = turned(rng, ((0.0, 20.0), (9000.0, 20.0)), 'one')
+    bag, *_ = turned(np.random.default_rng(3), ((0.0, 20.0), (9000.0, 20.0)), 'one')
     unit = tc.fit([bag], gravity=GRAVITY, input='m/s^2')
     # The bias of a MEMS of noise `NOISE` changes by 0.1 to 1 mg at a turn-on.
     assert 0.3 * 1e-3 * GRAVITY < unit.static.x.residual_sd_m_s2 < 1.5e-3 * GRAVITY

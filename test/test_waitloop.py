@@ -15,7 +15,7 @@ from subprocess import PIPE
 
 import pytest
 
-pytest.importorskip('rclpy', reason='rclpy is absent: install the extra `ros`')
+pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 
 from builders import calibration
 from geometry_msgs.msg import Vector3Stamped

@@ -13,23 +13,15 @@ LAG_S = 900.0
 BOARD_LAG_S = 600.0
 
 
-def lagged(t, corners, lag):
-    """Return a temperature lagging a chamber; corners: (time [s], new chamber rate [K/min])."""
-    out = np.zeros(len(t))
-    before = 0.0
+def lagged(t, corners, lag, other=0.0):
+    """
+    Return a temperature that lags a chamber by two time constants [s] in series, or by one.
+    `corners`: pairs of a time [s] and the rate of the chamber [K/min] from this time on.
+    """
+    out, before = np.zeros(len(t)), 0.0
     for at, rate in corners:
         x = np.maximum(t - at, 0.0)
-        out += (rate - before) / 60.0 * (x - lag * (1.0 - np.exp(-x / lag)))
-        before = rate
-    return out
-
-
-def lagged_twice(t, corners, lag, other):
-    out = np.zeros(len(t))
-    before = 0.0
-    for at, rate in corners:
-        x = np.maximum(t - at, 0.0)
-        decay = lag**2 * np.exp(-x / lag) - other**2 * np.exp(-x / other)
+        decay = lag**2 * np.exp(-x / lag) - (other**2 * np.exp(-x / other) if other else 0.0)
         out += (rate - before) / 60.0 * (x - lag - other + decay / (lag - other))
         before = rate
     return out
@@ -58,13 +50,9 @@ def regimes(settings, t, case, board):
     case_thermometer, board_thermometer = Thermometer(settings.case), Thermometer(settings.board)
     detector = RegimeDetector(settings)
     nothing = [None] * len(t)
-    rows = zip(
-        np.round(t * 1e9).astype(np.int64).tolist(),
-        nothing if case is None else case.tolist(),
-        nothing if board is None else board.tolist(),
-        strict=True,
-    )
-    for stamp_ns, c, b in rows:
+    stamps = np.round(t * 1e9).astype(np.int64).tolist()
+    readings = (nothing if values is None else values.tolist() for values in (case, board))
+    for stamp_ns, c, b in zip(stamps, *readings, strict=True):
         if b is not None:
             board_thermometer.update(stamp_ns, b)
         if c is not None and not case_thermometer.update(stamp_ns, c):
