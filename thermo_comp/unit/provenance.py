@@ -52,8 +52,8 @@ class ResidualSummary:
     max_m_s2: _Error
     left_out_rms_m_s2: Annotated[
         _Error | None,
-        'RMS of |f| - g in positions, each corrected by a fit to the others; null if the others '
-        'do not determine |f| in each position.',
+        'RMS error of the magnitude of the force in positions, each corrected by a fit to the '
+        'others; null if the others do not determine this magnitude in each position.',
     ] = None
     left_out_drift_m_s2: Annotated[
         _Error | None,
