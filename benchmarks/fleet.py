@@ -185,7 +185,7 @@ def bytes_written() -> int:
 
 
 def scaling(folder: Path, n_units: int, repeats: int, model: str) -> None:
-    """Compare a fit by two workers with fits of the same and of half as many units by one."""
+    """Compare fits of n units by one and by two workers, and of n / 2 units by one worker."""
     write_fleet(folder / 'fleet', n_units, 12, PROGRAM)
     fit = FitOptions(gravity=STANDARD_GRAVITY, model=model)
     options = FleetOptions(fit, certificates=False)

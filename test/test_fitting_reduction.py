@@ -158,7 +158,7 @@ def test_readings_of_a_lost_thermometer_and_glitches_are_counted_and_left_out(rn
 
 
 def test_samples_in_bursts_are_a_rest_and_several_with_one_stamp_are_reported(rng):
-    # WHY: no samples were averaged between bursts: a unit at rest was reported as worn or driven.
+    # WHY: cells between two bursts were empty: a unit at rest was reported as worn or driven.
     whole = block(still(rng, 600.0, UP))
     number = np.arange(len(whole.accel))
     for size in (20, 100, 200):

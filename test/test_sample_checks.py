@@ -299,7 +299,7 @@ def test_the_residual_is_that_of_the_latest_windows_and_motion_gives_no_verdict(
 
 
 def steps(rng, *, offset, at_s=20.0, ramp_s=0.0, rate_hz=2.5, scatter=0.0):
-    """Change |f| at `at_s`; return the time from the change to the refusal [s], and the result."""
+    """Change |f| at `at_s`; return the time until the refusal [s], and the check's result."""
     monitor = GravityCheck(GRAVITY, tolerance=0.1)
     up = np.array([0.3, -0.5, math.sqrt(1 - 0.34)])
     for k in range(round((at_s + 10.0) * rate_hz)):

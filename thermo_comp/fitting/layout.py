@@ -227,7 +227,7 @@ class Tangent:
     scale: Floats
 
     def normal(self, products: Floats) -> Normal:
-        """Return normal equations by `products` of base series, (n_positions, n_base, n_base)."""
+        """Build normal equations from `products` of base series, (n_positions, n_base, n_base)."""
         first, with_combined = self.n_local, products[:, None] @ self.combined
         place = self.place[first:]
         n, bias = len(place), slice(1, 1 + self.n_bias)

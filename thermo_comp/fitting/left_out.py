@@ -81,7 +81,7 @@ class Folds:
         (positive if `other` is better), and the standard error of the log ratio, over the folds
         that are scored for both models; None without such folds.
 
-        The result is the more significant of two estimates of the log ratio, or 0 if their signs
+        The more significant of two estimates of this log ratio is returned, or 0 if their signs
         differ. The mean over the folds depends little on a few folds of large errors; the log
         ratio of sums of squares (with a jackknife error) depends little on folds of small errors.
         """

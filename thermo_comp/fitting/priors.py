@@ -126,10 +126,10 @@ def informative_priors(
         # The sds of bias and scale are equal, as data sheets state similar numbers for both, and
         # few rests do not separate bias and scale.
         tried += [(ageing, 0.0) for ageing in (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)]
-        # Priors for a unit whose effects of temperature have changed, too. A `share` of 1, 1e3 and
-        # 1e6 increases the prior sd 1.4, 30 and 1000 times, as the sd may be a thousandth of the
-        # effect. `_root` limits the added sd to the size of the effect: with a larger sd, effects
-        # at temperatures without rests would be unknown.
+        # Priors for a unit whose temperature effects have changed, besides bias and scale factor.
+        # A `share` of 1, 1e3 and 1e6 increases the prior sd 1.4, 30 and 1000 times, as the sd may
+        # be a thousandth of the effect. `_root` limits the added sd to the size of the effect:
+        # with a larger sd, effects at temperatures without rests would be unknown.
         tried += [(ageing, share) for share in (1.0, 1e3, 1e6) for ageing in (3e-5, 3e-4, 3e-3)]
     K, places = constants_of(calibration).scale, parameter_layout(calibration)
     layout = regression.layout(regression.windows.parts)

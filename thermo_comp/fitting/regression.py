@@ -58,7 +58,7 @@ class PosteriorMode:
 
     @property
     def effective_parameters(self) -> Floats:
-        """Effective parameters of each column's weights, summed over the axes, shape (2, m)."""
+        """Effective number of weights of each column, summed over the axes, shape (2, m)."""
         padded = np.append(self.determined, 0.0)
         return np.asarray(padded[self.layout.weights].sum(axis=1))
 

@@ -301,7 +301,7 @@ class Series:
         return np.asarray(np.add.reduceat(values, self._first, axis=0) / count)
 
     def of(self, base: Base) -> Floats:
-        """Return the base series in the order of `base`, shape (n, n_base)."""
+        """Return the series that `base` lists, in its order, as columns, shape (n, n_base)."""
         at_start = self._starts[:, base.columns[base.lagged]]
         return np.hstack((self._ones, self.columns[:, base.columns], at_start, self._others))
 

@@ -309,7 +309,7 @@ class State:
 
     @cached_property
     def pose_tangents(self) -> Floats:
-        """Two unit vectors perpendicular to each pose, shape (n_poses, 3, 2)."""
+        """Two unit vectors perpendicular to each vector of `pose`, shape (n_poses, 3, 2)."""
         return tangent_basis(self.pose)
 
     @property

@@ -5,10 +5,11 @@ Owns the player: publishes a bag on the node's input topics, with `/clock`, at a
 time or as fast as the subscribers acknowledge messages.
 
 Topics have the relative names of the node's inputs. Messages keep the bag's order and their bytes;
-ROS 1 messages are rewritten in CDR, temperatures of other types as Temperature. After `WINDOW`
-messages of a topic the player waits until every reliable subscriber has acknowledged them. Fast
-DDS requests acknowledgements every 3 s, but with every message while a history is full; therefore
-the histories are small, and transient-local durability keeps them full.
+ROS 1 messages are rewritten in CDR, temperature readings of other types as
+sensor_msgs/Temperature. After `WINDOW` messages of a topic the player waits until every reliable
+subscriber has acknowledged them. Fast DDS requests acknowledgements every 3 s, but with every
+message while a history is full; therefore the histories are small, and transient-local durability
+keeps them full.
 """
 
 from __future__ import annotations

@@ -92,9 +92,10 @@ class FlowEffect(Effect):
 
     With ``x = |T_hot - T_cold| / knee`` and ``flow = x ** exponent`` the first signal is ``flow``,
     less that in the reference state, times ``d ** power``; d is the temperature of `cold` less
-    that in the reference state [K]. The second signal is the first signal times d. The exponent is
-    1.25 for convection in a gap, 1 for the load of a heat pump, 2 for the losses of a heat pump.
-    If `is_limited`, like the supply of a heat pump, ``flow / (1 + flow)`` replaces ``flow``.
+    that in the reference state [K]. The second signal is the first times the difference d. The
+    exponent is 1.25 for convection in a gap, 1 for the load of a heat pump, 2 for the losses of a
+    heat pump. If `is_limited`, like the supply of a heat pump, ``flow / (1 + flow)`` replaces
+    ``flow``.
     """
 
     hot: str

@@ -40,7 +40,7 @@ class ChangeDetector:
     """
     Baseline, swing and departure of the rate of change of one sensor's temperature.
 
-    `rate` [K/s] is the output of the filter with the longer memory, or of `Thermometer` if noise
+    `rate` [K/s] is the output of the filter with the longer memory, or `Thermometer.rate` if noise
     never changes a reading. `swing` [K/s]: amplitude of the oscillation of the rate in a soak.
     """
 

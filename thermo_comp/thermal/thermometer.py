@@ -281,7 +281,7 @@ class Thermometer:
         if jump > half:
             edge = 0.5 * (reading + self.reading) + 0.5 * move
             return edge, min(noise + (move * move + 4.0 * var_move) / 12.0, self._flat)
-        # A repeated reading has no new information: its cell only bounds the variance.
+        # A repeated reading only shows that the temperature is in the cell of this reading.
         box = half * half / 3.0
         if variance > box:
             return reading, variance * box / (variance - box)
