@@ -31,7 +31,7 @@ def model_of(
     Return the model of the prior calibration; without a prior, the model named in `options` with
     all columns whose thermometers the bags contain.
 
-    `parts`: part of the unit whose lag each axis has, or None for the bank of lags
+    `parts`: the part of the unit, with its lag, of each axis, or None for the bank of lags
     """
     prior, reference = options.prior, options.reference_temperature
     if prior is not None:
@@ -45,7 +45,7 @@ def model_of(
         {name for name, readings in bag.temperatures.items() if len(readings.value)}
         for bag in bags
     )
-    # Thermometers of the model: the case's, recorded or not, and others that every bag contains.
+    # Thermometers of the model beside the board's: case (recorded or not), and those in every bag.
     sensors = 'case', *sorted(set.intersection(*recorded) - {'board', 'case'})
     detector = options.detector or learn_detector(bags)
     columns: tuple[Column, ...] = ()
@@ -71,8 +71,8 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     fit = _with_lags(windows, problem)
     has_case = all(len(bag.case.value) for bag in bags)
     has_choice = has_case and options.prior is None and options.detector is None
-    # Compare detectors if the chosen model has a curve for each regime, or if such a model has an
-    # almost equal score (`is_near`) and less than 80 % of the chosen model's noise on each axis.
+    # Compare detectors if the chosen model, or a model with an almost equal score (`is_near`) and
+    # less than 80 % of the chosen model's noise on each axis, has a curve for each regime.
     trials = fit.selected.trials
     chosen = next(trial for trial in trials if trial.is_chosen)
     limit = 0.8 * chosen.posterior.prior.sigma
@@ -84,12 +84,12 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     if not has_choice or not may_have_sets:
         return fit
     # The alternative detector ends the dynamic regime once the case temperature is constant, the
-    # default detector once the board temperature is constant, too.
+    # default detector once the temperatures of case and board are constant.
     model = fit.windows.model
     closed = replace(model, detector=replace(model.detector, end_condition='case'))
     undisturbed = fit.windows.data.undisturbed
     early = regress(windows_of(bags, closed, options, undisturbed=undisturbed), problem)
-    # Left-out halves of the program detect superfluous columns, not the better of two detectors.
+    # Errors of left-out program halves show superfluous columns, not which detector is better.
     return early if is_better(fit.selected.score, early.selected.score, by_halves=False) else fit
 
 
@@ -108,7 +108,7 @@ def windows_of(
 def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
     """
     Fit models with one lag per axis (`find_parts`) until the left-out drift of a fit is at most
-    `Parts.most_drift`; if there is no such fit, fit the model of `windows`, too. Return the best
+    `Parts.most_drift`; if there is no such fit, also fit the model of `windows`. Return the best
     fit. With a prior calibration, or for Golovach's model, fit only the model of `windows`.
     """
     bags, options = problem.bags, problem.options

@@ -50,7 +50,7 @@ def build_calibration(
     earlier: Calibration | None = None,
     nonlinearity: Nonlinearity | None = None,
 ) -> Calibration:
-    """Return a fit's calibration; its valid ranges contain those of the prior `earlier`."""
+    """Return a fit's calibration; its valid ranges contain those of the calibration `earlier`."""
     (windows, regression, *_), posterior = fit, fit.posterior
     model, prior, state, layout = windows.model, posterior.prior, posterior.state, claim.layout
     # Response columns whose weights have rows in the covariance; a weight may be 0.
@@ -64,8 +64,8 @@ def build_calibration(
     lag_s = earlier.board_lag_s if earlier else ranges.usable_board_lag(windows)
     sensors = {*model.sensors[:1], *(column.sensor for column in columns)}
     window_s = windows.typical_count * float(np.median([bag.cycle_s for bag in bags]))
-    # Slow noise fitted to a drift that no column describes may absorb most of the white noise,
-    # too: then differences of windows, in which a drift cancels, give the white noise.
+    # Slow noise fitted to a drift that no column describes may absorb most of the white noise. If
+    # it does, the white noise is that of differences of windows, in which a drift cancels.
     sigma, white = prior.sigma, white_noise_of(regression.windows, regression.nominal_scale)
     sigma = np.where(sigma < 0.7 * white, white, sigma)
     blank = Calibration(

@@ -10,8 +10,8 @@ fit in the mixture is its evidence, limited by the evidence of |f| in the positi
 prior density of the offset sd (half-Student [1]_ without a prior calibration). The covariance
 includes the error of local gravity, which changes all scale factors by the same ratio.
 
-If the model lacks an effect, the best weights differ between sections of the chamber program, and
-the error in another program is as large as these differences: a jackknife [2]_ estimates them.
+If the model lacks an effect, the best weights of columns differ between sections of the chamber
+program. A jackknife [2]_ estimates these differences, as large as the error in another program.
 
 References
 ----------
@@ -46,8 +46,8 @@ class Claim:
     """
     The published uncertainty of a unit.
 
-    layout: indices in the covariance of the fit's unknowns, and of further weights that are 0
-    covariance: of the unknowns that belong to the unit (not to a position), (n_unit, n_unit)
+    layout: row in `covariance` of each unknown of the fit, and of further weights of value 0
+    covariance: covariance of the unknowns of the unit (not of positions), (n_unit, n_unit)
     offset_sd: sd of the bias offset of a new mounting or turn-on [m/s^2]
     """
 
@@ -64,8 +64,8 @@ def claim_of(fit: Fit, gravity_sd: float = 0.0, known_offset_sd: float = 0.0) ->
     offsets by a prior calibration, or 0 [m/s^2]
     """
     regression, chosen = fit.regression, fit.posterior
-    # The rests of a mounting share an offset, but the regression has an offset for each rest. With
-    # `n_rests` times the variance, their mean over a mounting has the variance of one offset.
+    # The rests of a mounting share an offset, but the regression has an offset for each rest. If
+    # these have `n_rests` times the variance, their mean over a mounting has that of one offset.
     mounting = regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
     prior = replace(chosen.prior, offset_sd=chosen.prior.offset_sd * n_rests**0.5)
@@ -90,8 +90,8 @@ def claim_of(fit: Fit, gravity_sd: float = 0.0, known_offset_sd: float = 0.0) ->
         by_offset = np.array([point.by_offset(axis) for axis in range(3)])
         covariance = covariance + turn_on_variance * (by_offset.T @ by_offset)
     if fit.typical is not None:
-        # `_widened` computes the covariance at the most likely sd of mounting offsets: add the
-        # variance of the mixtures, of the jackknife and of the turn-ons to this covariance.
+        # `_widened` computes the covariance at the most likely sd of mounting offsets: add to it
+        # the increases of the covariance by mixtures, jackknife and turn-ons.
         excess = covariance - posterior.covariance
         layout, covariance = _widened(regression, posterior, fit.typical, fit.of_means)
         at = _places(posterior.layout, layout)
@@ -108,9 +108,9 @@ def _over_offsets(
 ) -> tuple[Floats, float, float]:
     """
     Return three results: the covariance of the unit's unknowns, by mixtures over the sds of
-    offsets; the sd of the bias offset of a new mounting after a new turn-on [m/s^2]; and, if all
-    bags are of one turn-on, the variance of their common bias offset, for which the regression has
-    no unknown, or else 0.
+    offsets; the sd of the bias offset of a new mounting after a new turn-on [m/s^2]; and the
+    variance of the bias offset that all bags of a single turn-on share, for which the regression
+    has no unknown (0 for several turn-ons).
 
     `offset_sd`: sd of mounting offsets in the fit; `known_sd`: sd of offsets by a prior
     calibration, or 0 [m/s^2]
@@ -120,7 +120,7 @@ def _over_offsets(
     is_single = windows.n_turn_ons == 1 < n_mountings
     if scale <= 0.0:
         # An sd stated by the user includes mounting and turn-on offsets. The mean offset of m
-        # mountings has the variance sd^2 / m in the regression, but sd^2 if they share an offset.
+        # mountings has the variance sd^2 / m in the regression, but sd^2 if all share one offset.
         variance = offset_sd**2 * (1.0 - 1.0 / n_mountings) if is_single else 0.0
         return posterior.covariance, offset_sd, variance
     kind = 'mounting' if is_single or windows.has_turn_ons else 'both'
@@ -158,9 +158,9 @@ def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Fl
     # Smallest usual ratio of offset sd to `scale`. By data sheets, the bias of navigation-grade
     # triads repeats to 10 ug at best between turn-ons, better between mountings of a turn-on.
     smallest_ratio = 0.01 if kind == 'mounting' else min(1e-4 / scale, 1.0)
-    # Largest usual ratio: of mountings within a turn-on; of a single turn-on, which shows no
-    # repeatability (a value between 0, for a bias that repeats perfectly, and `LARGE_OFFSETS`);
-    # and, 'both', of several turn-ons, or of mountings that each begin with a turn-on.
+    # Largest usual ratio of offset sd to `scale`. 'mounting': mountings within a turn-on;
+    # 'turn-on': a single turn-on, which does not show how well the bias repeats (a value between 0
+    # and `LARGE_OFFSETS`); 'both': several turn-ons, or mountings that each begin with a turn-on.
     largest_ratio = {'mounting': 1.0, 'turn-on': 2.0, 'both': LARGE_OFFSETS}[kind]
     # The log evidence is smooth over the grid's step, a third of a decade of the sd.
     ratio = 10.0 ** np.linspace(-3.45, 2.25, 19)
@@ -220,7 +220,7 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
     kelvins = regression.windows.kelvins
     active = groups[prior.column_sd.any(axis=0)]
     # Columns to add are those of lags and curves (few temperatures do not determine all powers),
-    # and those active in only one of bias and scale (one attitude does not separate their drifts).
+    # and those active in only one of bias and scale, whose drifts one attitude does not separate.
     curves = [PART if PART in active else CURVE]
     may = np.isin(groups, [*LAGS, *curves]) | prior.column_sd.any(axis=0)
     inactive = regression.inactive(posterior, may & typical.any(axis=0))
@@ -236,7 +236,7 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
     sd = np.where(is_of_lags, sd, np.minimum(sd, typical))
     if CURVE in active:
         # A lag only delays the curve: the prior sd of a lag's weight is at most the curve's slope
-        # (RMS of the axes), including the slopes that inactive curve columns may add.
+        # (RMS over axes), including the slopes that inactive curve columns may add.
         is_curve = (groups == CURVE) & (kelvins > 0.0)
         square = np.mean(posterior.state.weights**2, axis=1) + sd**2
         slopes = np.sqrt(np.sum(square[:, is_curve] / kelvins[is_curve] ** 2, axis=1))
@@ -244,7 +244,7 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
         typical = np.minimum(typical, of_curve)
         # A curve column that the data do not determine may change the curve's slope by 50 %.
         sd = np.where(groups == CURVE, np.minimum(sd, 0.5 * of_curve), sd)
-    # n lags must not have more prior variance than one: each weight gets 1 / n of the variance.
+    # n lags together must have at most the prior variance of one lag: each limit is divided by n.
     is_lag = is_of_lags & (sd > 0.0)
     share = np.sqrt(np.maximum(is_lag.sum(axis=1, keepdims=True), 1))
     sd = np.where(is_lag, np.minimum(sd, typical / share), sd)
@@ -261,14 +261,14 @@ def _over_mountings(
 ) -> tuple[Floats, float]:
     """
     Mix fits with the sds `tried` of mounting offsets, shape (k,); `log_prior`: log prior density
-    of these sds. Return the covariance of the unit's unknowns, and the RMS of the sd [m/s^2].
+    of these sds. Return the covariance of the unit's unknowns, and the RMS of the sds [m/s^2].
     """
     prior, mounting = posterior.prior, regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
     priors = [replace(prior, offset_sd=sd) for sd in tried.tolist()]
     fits = [regression.solve(posterior.state, each, n_steps=1) for each in priors]
-    # With a large sd of mounting offsets attitudes absorb model errors, which raises the evidence:
-    # limit the rise of its logarithm to that of the log evidence of |f|, plus `CLEAR_GAIN`.
+    # With a large sd of mounting offsets attitudes absorb model errors, so the log evidence rises:
+    # limit its rise to the rise of the log evidence of |f|, plus `CLEAR_GAIN`.
     of_data = np.array([fit.log_evidence for fit in fits])
     of_norms = _norm_evidence(regression, posterior, tried, fits[-1].root)
     nearest = int(np.argmin(np.abs(np.log(tried * n_rests**0.5 / prior.offset_sd))))
@@ -288,9 +288,9 @@ def _mixture(
     """
     Return the unit's covariance about the mode by a mixture over `priors`, and their weights.
 
-    The equations of all priors are linearised at the mode. Bias and scale that the attitudes do
-    not separate differ by percents between priors; at another point the covariance would attribute
-    a part of their large sds to directions that the data determine well.
+    The equations of all priors are linearised at the mode `posterior`. Bias and scale that the
+    attitudes do not separate differ by percents between the priors' modes: linearised there, the
+    equations would give a part of the sds of bias and scale to well determined combinations.
     """
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
@@ -331,7 +331,7 @@ def _norm_evidence(
     means = block_means(np.column_stack((along, errors)), weight, first)
     along, errors, weight = means[:, :-1], means[:, -1], np.add.reduceat(weight, first)
     if prior.informative is None:
-        # The prior of the constants is so wide that their fitted values can replace its mean.
+        # The prior of the constants is so wide that its mean can be set to the fitted constants.
         weights = layout.axis[:, 2:].ravel()
         constants = np.setdiff1d(np.arange(layout.n_unit), weights)
         of_prior = np.hstack((

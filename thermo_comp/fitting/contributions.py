@@ -79,7 +79,7 @@ def _rms(values: Floats) -> float:
 
 def judge_contributions(values: Contributions, noise: float) -> Iterator[Finding]:
     """
-    Report unknowns of bags with larger effects than the thermal response of the unit and `noise`,
+    Report unknowns of bags whose effects exceed both the thermal response of the unit and `noise`,
     the white noise of a window [m/s^2].
     """
     steady = 'keep the unit switched on at a constant temperature for hours before each recording'
