@@ -28,7 +28,7 @@ SAME_DIRECTION_DEG = 5.0
 
 
 def force_columns(up: Floats) -> Floats:
-    """Differentiate the force at unit vectors (n, 3) w.r.t. a triad's constants: (n, 3, 9)."""
+    """Differentiate the force in attitudes `up`, (n, 3), by a triad's constants: (n, 3, 9)."""
     columns, axes = np.zeros((len(up), 3, 9)), np.arange(3)
     columns[:, axes, axes] = 1.0
     columns[:, axes, 3 + axes] = up
@@ -37,7 +37,7 @@ def force_columns(up: Floats) -> Floats:
 
 
 def norm_columns(up: Floats) -> Floats:
-    """Differentiate |f| at unit vectors (n, 3) w.r.t. the nine constants of a triad: (n, 9)."""
+    """Differentiate |f| in attitudes `up`, (n, 3), by a triad's nine constants: (n, 9)."""
     return np.asarray(np.einsum('ni,nij->nj', up, force_columns(up)))
 
 
@@ -88,7 +88,7 @@ def farthest(up: Floats) -> tuple[Floats, float]:
 
 
 def distinct_directions(up: Floats) -> Floats:
-    """Drop NaN, and unit vectors within `SAME_DIRECTION_DEG` of an earlier one, from (n, 3)."""
+    """Drop NaN, and vectors within `SAME_DIRECTION_DEG` of an earlier one, from `up`, (n, 3)."""
     kept: list[Floats] = []
     limit = np.cos(np.radians(SAME_DIRECTION_DEG))
     for direction in up[np.isfinite(up).all(axis=1)]:
@@ -112,7 +112,7 @@ def rough_centre(means: Floats) -> Floats:
     """
     Return the reading at zero force: 0, or a sphere's centre if the norms of the readings differ.
 
-    `means`: mean readings, shape (n, 3). The result is 0, too, for fewer than four readings, for
+    `means`: mean readings, shape (n, 3). The result is also 0 for fewer than four readings, for
     readings in a plane or almost one attitude, and for an implausible sphere.
     """
     zero = np.zeros(3)

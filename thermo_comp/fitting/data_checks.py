@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from .evidence import ResidualRow
     from .selection import Fit
 
-#: Smallest numbers of positions that determine bias and scale factor of the axes (six constants);
-#: the misalignment, too (nine constants); and, by |f|, the sd of mounting offsets, too.
+#: Smallest numbers of positions that determine: bias and scale factor of the axes (6 constants);
+#: these and the misalignment (9 constants); these and, by |f|, the sd of mounting offsets.
 POSITIONS_NEEDED, POSITIONS_FOR_MISALIGNMENT, POSITIONS_FOR_MOUNTINGS = 6, 9, 12
 #: Span of the board temperature below which no temperature dependence is visible [K].
 LEAST_SPAN_K = 3.0
@@ -103,7 +103,7 @@ def judge_windows(
 
 
 def _judge_order(windows: ThermalWindows) -> Iterator[Finding]:
-    """Refuse bags if the board leads the case in ramps of all bags together, or of some bags."""
+    """Refuse bags if T_board leads T_case in the ramps of all bags together, or of some bags."""
     moving, bag = np.abs(_ramp_rates(windows)) > RAMP_K_MIN, windows.data.bag
     least, where = _correlation(windows, moving), ''
     numbers, first = np.unique(bag, return_index=True)
@@ -124,7 +124,7 @@ def _judge_order(windows: ThermalWindows) -> Iterator[Finding]:
 
 
 def _correlation(windows: ThermalWindows, rows: Bools) -> float:
-    """Correlate gradient and rate over windows; 0 if their samples fill less than 30 windows."""
+    """Correlate gradient and rate over windows; 0 for fewer samples than 30 full windows have."""
     if windows.data.weight[rows].sum() < 30.0 * windows.data.weight.max():
         return 0.0
     # The case leads the board in a ramp, so the gradient has the sign of the board's rate.
@@ -189,7 +189,7 @@ def _judge_ramps(windows: ThermalWindows) -> Iterator[Finding]:
             'unknown; record ramps between the soaks',
         )
         steps = np.diff(np.sort(windows.temperature))
-        # Temperatures that differ by more than this [K] belong to different soaks.
+        # Temperatures on both sides of a gap wider than this [K] belong to different soaks.
         least = max(1.0, 0.1 * steps.sum())
         is_gap = steps > least
         n = 1 + int(is_gap.sum())

@@ -163,7 +163,7 @@ class Reduced:
         return replace(self, common=common, matrix=self.matrix + _square(common.whitened))
 
     def follow(self, step: Floats) -> tuple[Floats, Floats]:
-        """Return the steps of the unknowns of positions and bags, given the unit's step."""
+        """Return steps of positions' and bags' unknowns, given the step of the unit's unknowns."""
         r, solved = len(self.bags.root[0]), self.positions.solved
         bags = self.bags.solved[..., -1] - self.bags.solved[..., :-1] @ step
         if self.common is not None:
@@ -245,7 +245,7 @@ def eliminate(normal: Normal, layout: Layout, precision: Floats, deviation: Floa
     for axis, at in enumerate(layout.columns):
         rows[:, at[:n_local, None], at] += normal.local[:, axis]
     block, cross = rows[:, :n_own, :n_own], rows[:, :n_own, n_own:]
-    diagonal = np.einsum('pii->pi', block)  # a view
+    diagonal = np.einsum('pii->pi', block)  # a view of `block`
     diagonal += precision[layout.own]
     cross[..., -1] -= (precision * deviation)[layout.own]
     # A diagonal element of 0, for an attitude without information in the data, is set to 1.

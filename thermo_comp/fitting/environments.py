@@ -6,9 +6,9 @@ than most bags or a prior, and the error that the calibration states for these b
 
 In still air the board temperature responds to the case temperature in another way than in a
 chamber with a fan. No thermometer is at the axes, so the bias is another function of the measured
-temperatures in another environment. A bag of still air would increase the error of a calibration
-in a chamber with a fan. The error of the correction in an excluded bag is published as a lack of
-fit.
+temperatures in another environment. A bag from still air in the fit would increase the error of
+the calibration in a chamber with a fan. The error of the correction in an excluded bag is
+published as a lack of fit.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ def _is_far_above(square: Floats | float, usual: float) -> Bools:
 
 def contradicting_bag(fit: Fit) -> list[int]:
     """
-    Return, in a list, the index of a bag that may be of another environment; [] if none may.
+    Return, in a list, the index of a bag that may be of another environment; [] without such.
 
     A bag is suspect if its left-out drift exceeds five times both the median over the bags and the
-    white noise of a window. The only bag whose drift the other bags do not determine is suspect if
-    the median left-out drift exceeds five times the noise.
+    white noise of a window. If the left-out drift of exactly one bag is unknown, this bag is
+    suspect if the median left-out drift of the other bags exceeds five times the noise.
     """
     square = _square_of_bags(fit)
     is_scored = np.isfinite(square)

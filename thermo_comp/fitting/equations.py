@@ -12,8 +12,8 @@ Equation [m/s^2] of the mean reading N of window w, position p, axis i; K0: nomi
 
 B and S are columns of the table in `unit.columns`, each divided by its RMS, with the weights beta
 and s. For an angular rate g is 0, which leaves bias b, columns B beta and offsets o_p. If |f|
-differs between positions, |f| replaces g, and the nonlinear terms ``kappa sum_j (k_j + k'_j t)
-n_j(a)`` are added (`forces`). All terms are linear combinations of the base series (`series`).
+differs between positions, |f| replaces g, and the terms ``kappa sum_j (k_j + k'_j t) n_j(a)`` of
+`nonlinear` are added, t: T_board - T_reference. All terms are linear combinations of base series.
 """
 
 from __future__ import annotations
@@ -154,8 +154,8 @@ class Equations(Series):
 
     def _combined(self, state: State, base: Base, n_starts: int) -> Floats:
         """
-        Return the combinations of base series in `Tangent`: the scale's 1 + S s; the derivatives
-        w.r.t. kappa, the force along the axis and the initial lag states; and the residual.
+        Return, as combinations of base series (see `Tangent`): 1 + S s of the scale; the readings'
+        derivatives by kappa, the force along the axis and the initial lag states; the residual.
         """
         force, _, without_bias, (terms, terms_by_t), (slope, slope_by_t) = self._effects(state)
         on_bias, on_scale = state.weights[:, :, base.columns]
