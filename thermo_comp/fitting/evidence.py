@@ -144,7 +144,7 @@ def position_reports(fit: Fit, residual: Floats, left_out: Floats) -> tuple[Posi
 
 def group_evidence(regression: Regression, posterior: PosteriorMode) -> tuple[GroupEvidence, ...]:
     """
-    Return contribution (RMS), effective parameters and log Bayes factor of groups of columns.
+    Return RMS effect, number of effective parameters and log Bayes factor of each column group.
 
     The Bayes factor compares the fit with a fit without a group or, if the prior is a
     calibration, with a fit in which the group keeps the weights of this calibration.

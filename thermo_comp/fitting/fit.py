@@ -134,12 +134,12 @@ def fit_bags(
 
 
 def _judged_result(result: FitResult) -> FitResult:
-    """Add the effects of the unknowns of bags, and the terms that the bags do not tell apart."""
+    """Add to a result the effects of the unknowns of bags, and the correlations of terms."""
     fit, findings = result.fit, list(result.findings)
     contributions, likeness = contributions_of(fit.regression, fit.posterior), likenesses(fit)
     findings += judge_contributions(contributions, fit.selected.score.noise)
     if all(finding.name != 'environment' for finding in findings):
-        # After the exclusion of a bag of another environment, terms are not judged.
+        # After the exclusion of a bag of another environment, `likeness` is not judged.
         n_directions = len(distinct_directions(fit.posterior.state.up))
         findings += judge_likeness(likeness, n_directions)
     return replace(

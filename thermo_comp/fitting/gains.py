@@ -58,7 +58,7 @@ class Inactive:
     Q: Floats
 
     def _in_prior_sd(self, column_sd: Floats, wanted: Bools) -> tuple[Floats, Floats, Ints]:
-        """Return S and Q of `wanted` columns' weights in prior sds, and each weight's column."""
+        """Return S and Q for `wanted` columns, weights in prior sds, and each weight's column."""
         sd = np.repeat(column_sd[self.part, self.column] * wanted[self.column], 3)
         at = np.flatnonzero(sd > 0.0)
         S = self.S[np.ix_(at, at)] * np.outer(sd[at], sd[at])
@@ -67,7 +67,7 @@ class Inactive:
     def gain(self, column_sd: Floats, wanted: Bools) -> float:
         """
         Return the gain in log evidence, at least 0, if the columns in the mask `wanted`, (m,), are
-        added: ``(Q (1 + S)^-1 Q - log det(1 + S)) / 2``, S, Q of weights in their prior sds. A
+        added: ``(Q (1 + S)^-1 Q - log det(1 + S)) / 2``, S and Q for weights in prior sds. A
         prior sd is `column_sd`, (2, m), times the factor of largest gain (`_SQUARED_FACTORS`).
         """
         S, Q, _ = self._in_prior_sd(column_sd, wanted)

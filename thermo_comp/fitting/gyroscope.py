@@ -3,7 +3,7 @@
 """
 Owns the fit of a gyroscope's bias to the angular rate at rest, with the accelerometer's columns.
 
-A gyroscope at rest measures the component of the Earth's rate in its attitude, plus a bias that
+Each axis of a gyroscope at rest measures a component of the Earth's rate, plus a bias that
 changes at each turn-on, so the regression has a constant offset of the rate as an unknown of each
 position. Changes of the rate within a position determine the effect of temperature; the mean rate
 over the positions determines the constant bias. The equations are those of the accelerometer with

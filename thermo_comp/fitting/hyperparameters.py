@@ -5,7 +5,7 @@ Owns the estimation of prior sds and noises, and the removal of columns of small
 
 Each column has one prior standard deviation of its weights in the bias of all axes and one in the
 scale. All bends (changes of slope at knees) have one sd of the change of slope in the bias and one
-in the scale, which set the smoothness of the curves. Newton's steps move each sd that is not fixed
+in the scale, which set the smoothness of the curves. Newton's steps move each sd, unless fixed,
 to the mode of the log evidence [1]_ plus the log density of a hyperprior, which is log-normal with
 centre sd0 and variance tau^2 of log sd. At this mode
 ``effective parameters + log(sd / sd0) / tau^2 = sum w^2 / sd^2``, w being the weights of the
@@ -17,7 +17,7 @@ References
 .. [2] A. Gelman, Prior distributions for variance parameters in hierarchical models, Bayesian
    Analysis 1 (2006): half-t priors for standard deviations.
 .. [3] J. A. Nelder, A reformulation of linear models, Journal of the Royal Statistical Society A
-   140 (1977): a model with a product has the product's factors, too.
+   140 (1977): a model with a product also has the factors of the product.
 
 """
 
@@ -41,7 +41,7 @@ STUDENT_NU = 4.0
 #: Smallest log Bayes factor of a column that is kept: below 1 it is "not worth more than a bare
 #: mention" (Kass and Raftery, Bayes factors, JASA 90 (1995), section 3.2).
 LEAST_GAIN = 1.0
-#: Gain in log evidence from which a model is clearly more likely than another: odds of 55 : 1.
+#: Gain in log evidence that makes a model clearly more likely than another: odds of 55 : 1.
 CLEAR_GAIN = 4.0
 #: Variance of the natural log of a prior sd in the hyperprior: 1 sd is a factor of ten.
 LOG_VARIANCE = float(np.log(10.0)) ** 2
@@ -142,7 +142,7 @@ def _misalignment_sd(posterior: PosteriorMode) -> float:
     share = 1.5 * max(1.0 - 1.0 / max(gamma, 1.0), 0.0)
     square = share * np.sum(misalignment**2) + prior.misalignment_scale**2
     # Limit of the misalignment sd: 0.03 rad, for separate sensors on a printed bracket. Larger
-    # misalignments would explain |f| on six faces, to second order.
+    # misalignments would, to second order, explain any error of |f| on six faces.
     return min(float(np.sqrt(square / (share * gamma + 1.0))), 0.03)
 
 
@@ -185,7 +185,7 @@ def _pose_sd(posterior: PosteriorMode) -> float:
 
 def _toward(effective: _Value, power: _Value, sd: _Value, slope: _Value, rise: _Value) -> Floats:
     """
-    Return Newton's step of log sd, within +-2, to ``power / sd^2 = effective + slope``.
+    Return Newton's step of log sd, within +-2, to solve ``power / sd^2 = effective + slope``.
 
     `slope`, `rise`: minus the first and second derivative of the log hyperprior by log sd
     """
@@ -239,8 +239,8 @@ def white_noise(regression: Regression, posterior: PosteriorMode) -> Floats:
     common = (layout.shared, layout.up, layout.stretch, layout.tilt, layout.start)
     spent = of_axis + sum(determined[places].sum() for places in common) / 3.0
     sigma = np.sqrt(posterior.square / np.maximum(n - spent, 0.05 * n))
-    # The samples of an axis may be constant: its noise is at least a hundredth of the noise of the
-    # noisiest axis.
+    # The samples of an axis may be constant: set its noise to at least a hundredth of the noise of
+    # the noisiest axis.
     least_sigma = np.full(3, max(posterior.prior.least_sigma, 0.01 * float(sigma.max())))
     if not regression.windows.has_drifts:
         # If no column changes within a position, slow noise may explain the whole residual: the
@@ -269,8 +269,8 @@ def with_slow_noise(
         return replace(fitted, prior=trial)
 
     def likeliest(n_times: int) -> PosteriorMode:
-        # Find the variance ratio and correlation time of largest log evidence, by factors of 3,
-        # then of 3^(1/2) and 3^(1/4).
+        # Find the variance ratio and correlation time of largest log evidence, in steps by a
+        # factor of 3, then of 3^(1/2) and 3^(1/4).
         best, step = with_noise(estimated._replace(n_times=n_times)), 3.0
         while step > 3.0**0.2:
             ratio, time_s, _ = best.prior.noise
@@ -352,7 +352,7 @@ def downweigh(regression: Regression, posterior: PosteriorMode) -> None:
 
 
 def undisturbed(residual: Floats, weight: Floats, position: Ints) -> Floats:
-    """Return factors of at most 1 for windows' weights, (n,), by their residuals, (n, 3)."""
+    """Return factors <= 1 for the weights of windows, (n,), from their `residual`, (n, 3)."""
     size = residual * np.sqrt(weight)[:, None]
     for part in np.split(size, np.flatnonzero(np.diff(position)) + 1):
         if len(part) > 6:

@@ -46,7 +46,7 @@ class Problem:
 
     start: initial bias, scale and misalignment, without effects of temperature
     up: attitudes of the positions, upward unit vectors, shape (n_positions, 3)
-    is_by_settled: whether the selection refuses a model with a larger `left_out.settled_error`
+    is_by_settled: whether the selection refuses an increase of `left_out.settled_error`
     has_pieces: whether each position is a piece, of about an hour, of a rest (`refit_checks`)
     """
 
@@ -118,7 +118,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     state = initial_state(regression, start, problem.up)
     prior = _initial_prior(windows, problem)
     if n_directions >= POSITIONS_NEEDED and not data.has_turn_ons:
-        # The fit has no turn-on offsets, so M would explain them: reduce the prior sd of M.
+        # M would explain turn-on offsets, which the fit lacks: reduce the prior sd of M.
         prior = _with_faces(prior, problem.up)
     steepness = _steepness(windows, problem, is_at_rest=is_at_rest)
     candidates = _candidates(windows, problem, steepness, is_bench=is_bench)
@@ -155,8 +155,8 @@ def _selected(
     progress: Callable[[float], None],
 ) -> Selected:
     """
-    Select the model. If `_with_faces` reduced the prior sd of the misalignment, also select one
-    with the larger sd, and choose between both by `better_start`.
+    Select the model. If `_with_faces` reduced the prior sd of the misalignment, also select a
+    model with the larger sd, and choose between both by `better_start`.
     """
     selected = select(regression, state, prior, candidates, progress)
     if not prior.unseen_misalignment_sd:
@@ -379,7 +379,7 @@ def sizes_of(windows: ThermalWindows, options: FitOptions) -> Floats:
 
 
 def initial_triad(windows: ThermalWindows, options: FitOptions) -> ConstantCalibration:
-    """Fit constant bias, scale and M; with few attitudes, one scale (1 if input is in m/s^2)."""
+    """Fit constant bias, scale, M; in few attitudes only a common scale (1 for input in m/s^2)."""
     means, gravity = position_means(windows.data), sizes_of(windows, options)
     norms = np.linalg.norm(means, axis=1)
     if not norms.all() or (len(means) > 1 and not means.any(axis=0).all()):
