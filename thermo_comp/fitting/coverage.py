@@ -155,7 +155,7 @@ def geometry(up: Floats, with_misalignment: bool) -> float:
 
 def best_rests(candidates: list[Floats]) -> int:
     """
-    Return the index of the best candidate: a set of n rests, given by mean readings, (n, 3).
+    Return the index of the best of candidate sets of n rests, given by mean readings, (n, 3).
 
     The largest sd of a calibration constant follows from the directions of a set's rests and the
     residuals of |f|. The first set whose largest sd is at most 2 % above that of every other set
@@ -171,7 +171,7 @@ def best_rests(candidates: list[Floats]) -> int:
 
 
 def _cost(means: Floats, with_misalignment: bool) -> float:
-    """Return the largest sd [g] of a constant fitted to rests, by the scatter of their |f|."""
+    """Return the largest sd [g] of a constant fitted to rests, from the scatter of |f|."""
     n_free = len(means) - (9 if with_misalignment else 6)
     if n_free < 0:
         return np.inf

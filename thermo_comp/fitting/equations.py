@@ -179,7 +179,7 @@ class Equations(Series):
         Return place and factor, see `Tangent`, of each active nonlinear coefficient.
 
         The factor 1 + S s of the scale multiplies the nonlinear terms at the reference
-        temperature, but not their changes per kelvin, which it would hardly alter.
+        temperature, but not their changes per kelvin, where its effect is negligible.
         """
         active = np.flatnonzero(layout.nonlinear[0] >= 0)
         if self.forces is None or not len(active):

@@ -195,7 +195,7 @@ def lack_of_fit(fit: Fit, claim: Claim) -> tuple[tuple[LackOfFit, ...], tuple[La
     """Return the lack of fit in the static and the dynamic regime, at 0 to 5 temperatures each."""
     windows, regression, selected = fit[:3]
     prior, state, position = fit.posterior.prior, fit.posterior.state, windows.data.position
-    # Use weights by numbers of samples: the fit's weights, reduced for outliers, exaggerate noise.
+    # Use weights from numbers of samples: weights reduced for outliers would overstate the noise.
     noise = prior.sigma**2 * (1.0 / windows.data.weight[:, None] + prior.noise.variance)
     claimed = drift_variance(regression, state, claim.layout, claim.covariance)
     excess = selected.score.drift**2 - noise - claimed

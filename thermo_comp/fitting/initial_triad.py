@@ -90,7 +90,7 @@ def constant_calibration(
 def _refine(
     means: Floats, gravity: float | Floats, bias: Floats, scale: Floats, misalignment_sd: float
 ) -> tuple[ConstantCalibration, float]:
-    """Fit the triad, beginning with given values; return also the RMS error of |f| [m/s^2]."""
+    """Fit the triad from initial bias and scale; return also the RMS error of |f| [m/s^2]."""
     one_g = float(np.median(gravity))
 
     def unpack(parameters: Floats) -> ConstantCalibration:
@@ -158,9 +158,9 @@ def white_noise_of(windows: Windows, scale: Floats) -> Floats:
 def thermometer_error_of(windows: Windows, scale: Floats, *, beyond_noise: bool = False) -> Floats:
     """
     Return the sd of a window's error on each axis due to errors of the board temperature [m/s^2],
-    shape (3,): sd of the temperature times slope of the samples over temperature in a position.
+    shape (3,): sd of these errors times slope of the samples over temperature in a position.
 
-    `beyond_noise`: subtract the variance of a reading's noise from that of the temperature; the
+    `beyond_noise`: subtract the variance of a reading's noise from that of these errors; the
     remaining error is due to coarse steps of the readings, or to long intervals between readings
     """
     if windows.board is None:
