@@ -28,7 +28,7 @@ def joined(bags: Sequence[ReducedBag]) -> list[ReducedBag]:
     for bag in sorted(bags, key=lambda bag: bag.start_ns):
         before = [recording for recording in recordings if _continues(recording[-1], bag)]
         if before:
-            # Several simulated recordings may end here: take that of the smallest step.
+            # If several (simulated) recordings end here, take that of the smallest `_step`.
             min(before, key=lambda recording: _step(recording[-1], bag)).append(bag)
         else:
             recordings.append([bag])

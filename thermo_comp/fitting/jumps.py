@@ -3,17 +3,17 @@
 """
 Owns the detection of jumps: steps in the reading of an accelerometer at rest.
 
-The reading of a sensor can step within one sample, if a die relaxes or a piece slips. The
-temperature does not step, so no function of temperature describes a jump, and a fit to data across
-a jump gives a wrong curve. A jump differs from a rotation of the unit in two ways: the samples
-before and after a jump scatter no more than at rest; and either the norm of the reading changes
-(in a rotation it is almost constant), or a gyroscope measures no rotation during the jump. A steep
-curve over temperature changes the reading more slowly than a jump.
+The reading of a sensor can step within one sample, if stress in its die relaxes or a joint slips.
+The temperature does not step, so no function of temperature describes a jump, and a fit to data
+across a jump gives a wrong curve. A jump differs from a rotation of the unit in two ways: the
+samples before and after a jump scatter no more than at rest; and either the norm of the reading
+changes (in a rotation it is almost constant), or a gyroscope measures no rotation during the jump.
+A steep curve over temperature changes the reading more slowly than a jump.
 
 If a sensor has a low-pass filter, neighbouring samples have a correlation r, and the slow noise of
 the samples hides a step. The noise of the differences ``a_i - r a_(i-1)`` is white (generalised
-least squares for first-order noise), so a step within one sample is significant in them. As a
-decaying shock is significant, too, the mean levels before and after a jump must also differ.
+least squares for first-order noise), so a step within one sample is significant in them. A
+decaying shock is also significant in them, so the mean levels before and after a jump must differ.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     Two rests are compared if the gap between them is at most 30 s or 250 samples, whichever is
     longer, and their directions differ by less than 10 degrees.
     """
-    # Rests are whole cells, usually of 30 samples or more, so a low sample rate makes long gaps.
+    # A rest consists of whole cells, usually of 30 samples, so gaps are long at a low sample rate.
     longest_ns = 1e9 * max(30.0, 250.0 * bag.cycle_s)
     margin_s = max(_MARGIN_S, 120.0 * bag.cycle_s)  # at least 120 samples
     means = [np.average(rest.mean, axis=0, weights=rest.count) for rest in bag.intervals]
@@ -134,7 +134,7 @@ def _examine(
     step_sd = np.hypot(sd * relative_sd * _sd_growth(residual, sd), by_rounding)
     if r:
         is_step = np.abs(step) > _STEP_SDS * step_sd
-        # The change of the mean level must exceed half of the step in one sample, and 4 of its sd.
+        # The change of the level must exceed half the step in one sample, and 4 sd of the change.
         is_step &= lasting * np.sign(step) > 0.5 * np.abs(step)
         is_step &= np.abs(lasting) > 4.0 * lasting_sd
     else:
@@ -151,7 +151,7 @@ def _examine(
     along_sd = float(np.sqrt((middle / norm) ** 2 @ step_sd**2))
     needed_rad = float(np.sqrt(max(size**2 - along**2, 0.0))) / norm
     # A step is not a rotation if the gyroscope measured less than a third of the step's angle, or
-    # if |a| changed: a rotation by d changes |a| by at most 2 d times the sensor's error (10 %).
+    # if |a| changed: a turn by d rad changes |a| by up to 2 d |a| times the sensor's error, 10 %.
     is_no_turn = _turn(time, gyro, at) < 0.33 * needed_rad or (
         abs(along) > 0.2 * size and abs(along) > _STEP_SDS * along_sd
     )
@@ -187,7 +187,7 @@ def _is_gradual(
 
 
 def _sd_growth(residual: Floats, sd: Floats) -> Floats:
-    """Return the sd of the mean of `residual`, divided by that of white noise of sd `sd`, (3,)."""
+    """Return sd of the mean of `residual` / sd of a mean of white noise of sd `sd`, >= 1, (3,)."""
     # A lag-1 correlation r of the means of 40 pieces multiplies the variance of the mean of all
     # pieces by (1 + r) / (1 - r).
     size = max(len(residual) // 40, 1)
@@ -269,7 +269,7 @@ def _step(
 ) -> tuple[Floats, float, Floats]:
     """
     Fit a step at the time `at`, or a linear change over `duration_s` about `at`, and a linear
-    drift; return the step, its sd divided by that of the noise, and the residuals (n, k).
+    drift; return the step, its sd / sd of the noise, and the residuals (n, k).
     """
     trend = _trend(time, r)
     part = np.clip((time - at) / duration_s + 0.5, 0.0, 1.0) if duration_s else time >= at
@@ -288,7 +288,7 @@ def _trend(time: Floats, r: float) -> Floats:
 
 
 def _turn(time: Floats, gyro: Floats, at: int) -> float:
-    """Return the rotation within 1 s of a step [rad], by rates less their median on each side."""
+    """Return the angle turned within 1 s of a step [rad], by rates less their median per side."""
     rates = [side - np.median(side, axis=0) for side in (gyro[:at], gyro[at:])]
     angles = np.concatenate(rates)[1:] * np.diff(time)[:, None]
     return float(np.linalg.norm(angles[np.abs(time[1:] - time[at]) <= 1.0].sum(axis=0)))

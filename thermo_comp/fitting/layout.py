@@ -85,7 +85,7 @@ class Layout:
 
     @cached_property
     def unit(self) -> Ints:
-        """Indices, by axis, of the unknowns of the unit; the last is the residual's, (3, k)."""
+        """Indices of the unit's unknowns in the equations of each axis; last: residual, (3, k)."""
         common = np.append(self.shared, self.n_unit)
         return np.hstack((self.axis, np.tile(common, (3, 1))))
 
@@ -199,7 +199,8 @@ class Normal(NamedTuple):
 @dataclass(frozen=True)
 class Tangent:
     """
-    The equations linearised about a state, as coefficients of the base series at this state.
+    The measurement equations linearised about a state, as factors of base series (`series.Base`)
+    at the initial lag states of this state.
 
     The derivative of the readings w.r.t. an unknown is a factor times a base series, or times one
     of the combinations `combined` of base series. For axis i, position p and unknown u the
@@ -270,7 +271,7 @@ class Tangent:
     def of(self, rows: Floats) -> Floats:
         """
         Return the derivatives of m linear functions of the readings, such as the mean, shape
-        (n_positions, 3, m, k + 1); `rows`: the functions of base series, (n_positions, m, n_base).
+        (n_positions, 3, m, k + 1); `rows`: their values for base series, (n_positions, m, n_base).
         """
         combined = rows[:, None] @ self.combined
         of_base = np.broadcast_to(rows[:, None], (*combined.shape[:3], rows.shape[2]))

@@ -69,7 +69,7 @@ class Folds:
 
     @property
     def rms(self) -> float:
-        """RMS error over all windows of the folds [m/s^2]; NaN without folds."""
+        """RMS error over all windows of the scored folds [m/s^2]; NaN if no fold is scored."""
         is_scored = np.isfinite(self.square)
         if not is_scored.any():
             return np.nan
@@ -92,7 +92,7 @@ class Folds:
         before, after = ((f.square * f.windows)[is_scored] + 1e-300 for f in (self, other))
         of_sums = float(np.log(before.sum() / after.sum()))
         if n == 1:
-            # One fold gives no standard error: return the largest log ratio that counts as equal.
+            # One fold has no standard error: return the largest negligible log ratio instead.
             return of_sums, _NEGLIGIBLE_LOG_RATIO
         each = np.log(before / after)
         others = (np.maximum(square.sum() - square, 1e-300) for square in (before, after))
@@ -115,12 +115,12 @@ class Score:
     """
     Left-out errors of a model.
 
-    positions, sections: drift of left-out positions, and of left-out sections of the test
+    positions, sections: drift of left-out positions, and of left-out sections of the program
     norms: ``|f| - g`` of left-out positions in which the other positions determine |f|
     force: force in each window by a fit without its position, (n, 3); NaN if |f| is not scored
     drift: drift of each window, (n, 3), by a fit without its position or, if that fit does not
         determine the drift, without its section
-    halves: drift of left-out halves of the test, at temperatures that occur in the other half
+    halves: drift of left-out halves of the program, at temperatures that occur in the other half
     noise: white noise of a window, RMS of the axes [m/s^2]
     by_thermometer: error of a window due to a coarse board thermometer, RMS of the axes [m/s^2]
     settled: expected error of the bias at settled temperatures [m/s^2] (`settled_error`), or 0
@@ -175,10 +175,10 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     The gain is the sum of the log ratios (`Folds.gain_of`) of the drift of positions and of
     sections. If the drifts of both models agree to 5 %, the gain is the log ratio of the errors of
     left-out |f|, if this ratio exceeds two standard errors. There is no gain if `after` has a
-    larger error of left-out |f|; of the bias at settled temperatures, as expected, unless noise
-    explains the drift; or, with `by_halves`, of left-out halves of the program, a sign of too many
-    columns. A drift that noise explains need not decrease for a gain, because the drift of
-    left-out soaks contains no effects of ramps.
+    larger error of left-out |f|; if it has a larger expected error of the bias at settled
+    temperatures, unless noise explains the drift; or if, with `by_halves`, it has a larger drift
+    of left-out halves of the program, a sign of too many columns. A drift that noise explains need
+    not decrease for a gain, because the drift of left-out soaks contains no effects of ramps.
     """
     *drifts, norms = _beyond_thermometer(before, after)
     drift = [ratio for ratio in drifts if ratio]
@@ -292,7 +292,7 @@ def settled_error(
 def _variance(layout: Layout, columns: Floats, force: Floats, root: Floats) -> float:
     """
     Return the variance of the readings less their mean over k windows, summed over windows and
-    axes; `columns`: (k, m); `force`: along the axes, (3,); `root`: root of the covariance
+    axes, by the covariance ``root @ root.T``; `columns`: (k, m); `force`: along the axes, (3,)
     """
     parts = layout.by_weights(columns - columns.mean(axis=0), force)
     return sum(float(np.sum((along @ root[at]) ** 2)) for along, at in parts)
@@ -349,8 +349,8 @@ def _determines_norm(point: Point, posterior: PosteriorMode, root: Floats, p: in
     """
     Whether the fit without position `p`, of covariance ``root @ root.T``, determines |f| in `p`:
     the variance of |f| is below 10 times (variance by the fit to all data + offset variance), or
-    below the variance of usual mounting offsets. In few poses only the former counts, because
-    there the prior of bias and scale makes the variance small.
+    below the variance of usual mounting offsets. In a fit with poses only the former limit counts,
+    because there the prior of bias and scale makes the variance small.
     """
     if not point.regression.gravity:
         return False

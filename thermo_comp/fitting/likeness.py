@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the correlation of two terms' columns in the bags, and the advice which bag separates them.
+Owns the correlation of the columns of two terms in the bags, and the advice of a further bag in
+which these columns are less correlated.
 
 In one environment the board follows the case in the same way in all bags. A lag of the board
 temperature is then proportional to a lag of the gradient T_case - T_board, and both describe the
@@ -96,7 +97,7 @@ def likenesses(fit: Fit) -> tuple[Likeness, ...]:
     try:
         pairs = [_likeness(point, groups, pair) for pair in _PAIRS if used & {*pair.groups}]
     except np.linalg.LinAlgError:
-        # The fit itself succeeded: rounding errors in a table of correlations do not refuse it.
+        # The fit succeeded: rounding errors in a table of correlations are no reason to refuse it.
         return ()
     return tuple(likeness for likeness in pairs if likeness is not None)
 
@@ -105,7 +106,7 @@ def _likeness(point: Point, groups: NDArray[np.str_], pair: _Pair) -> Likeness |
     """Return the largest correlation of the columns of a pair; None if a term has no column."""
     layout, n = point.layout, point.layout.n_unit
     root = point.precision[:n] ** -0.5
-    # The information about the unknowns, each divided by its prior sd, and the prior itself.
+    # Posterior precision of the unit's unknowns, each unknown divided by its prior sd.
     information = point.reduced.matrix[:n, :n] * np.outer(root, root) + np.eye(n)
     acts = point.regression.windows.share == 1.0  # whether each column acts on an axis, (3, m)
     curve = layout.weights[:, :, groups == CURVE]
@@ -129,10 +130,10 @@ def _likeness(point: Point, groups: NDArray[np.str_], pair: _Pair) -> Likeness |
 
 
 def judge_likeness(pairs: Sequence[Likeness], n_directions: int) -> Iterator[Finding]:
-    """Advise the bag that separates the two most correlated terms, if their inflation is large."""
+    """Advise a bag to separate the two most correlated terms, if their inflation is too large."""
     alike = [pair for pair in pairs if pair.inflation > _LARGEST_INFLATION]
     if n_directions < POSITIONS_NEEDED:
-        # The finding `positions` says that bias and scale are not separated.
+        # The finding `positions` reports already that bias and scale are not separated.
         alike = [pair for pair in alike if pair.parts[0] == pair.parts[1]]
     if not alike:
         return

@@ -31,8 +31,8 @@ from .thermal_ranges import union
 from .unknowns import State
 from .windows import ThermalWindows
 
-# The data determine a coefficient if its posterior sd is less than a tenth of its prior sd: if its
-# effective parameters exceed this number.
+# The data determine a coefficient if its posterior sd is less than a tenth of its prior sd, that
+# is, if its effective number of parameters, 1 - (posterior sd / prior sd)^2, exceeds this value.
 _DETERMINED_SHARE = 0.99
 
 _Active = frozenset[int]  # indices of the nonlinear coefficients in use
@@ -80,7 +80,7 @@ class Forces:
         return np.maximum(self.sd / self.sizes, 1e-12)
 
     def terms(self, force: Floats) -> tuple[Floats, Floats]:
-        """Return each nonlinear term of coefficient 1, and its derivative, (*force.shape, k)."""
+        """Return nonlinear terms of coefficient 1, and slopes over force, (*force.shape, k)."""
         each = {
             'square': (force**2, 2.0 * force),
             'odd_square': (np.abs(force) * force, 2.0 * np.abs(force)),
@@ -91,7 +91,7 @@ class Forces:
         return value, slope
 
     def linearise(self, x: Floats, nonlinear: Floats, rows: slice) -> Floats:
-        """Return the force of windows, shape (n, 3), without the nonlinear terms."""
+        """Return the force of windows, (n, 3), from `x`, the force plus the nonlinear terms."""
         k = len(self.kinds)
         at = nonlinear[:, :k] + self.t[rows, np.newaxis, np.newaxis] * nonlinear[:, k:]
         k2, kq, k3 = (
@@ -145,7 +145,7 @@ def is_beyond(windows: ThermalWindows) -> bool:
 
 
 def prior_sd(kinds: Sequence[Kind], options: FitOptions) -> Floats:
-    """Return the prior sds of k coefficients, then of their changes per kelvin, shape (2 k,)."""
+    """Return prior sds of k nonlinear coefficients, then of their changes per kelvin, (2 k,)."""
     sd = np.array([options.nonlinear_sd(kind) for kind in kinds])
     return np.concatenate((sd, 0.02 * sd))
 
@@ -203,7 +203,7 @@ class _TermFits:
 def choose(
     regression: Regression, selected: Selected, options: FitOptions
 ) -> tuple[Selected, tuple[NonlinearTerm, ...]]:
-    """Choose nonlinear terms, and their changes per kelvin; keep all terms of a prior."""
+    """Choose nonlinear terms, and their changes per kelvin; a prior's terms are all kept."""
     forces = regression.forces
     if forces is None or options.prior is not None:
         return selected, ()

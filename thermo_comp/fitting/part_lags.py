@@ -46,7 +46,7 @@ class _Shape(NamedTuple):
 
     n_nodes: largest number of nodes of the spline of the bias
     most_noise: largest ratio of the RMS residual to the noise at which noise explains the residual
-    has_stress: whether bias and scale have terms in m and m x, for stress between part and board
+    has_stress: whether bias and scale have terms in the lag m and in m x by stress in the unit
     has_gradient: whether the bias also has a term in the gradient T_case - T_board
     """
 
@@ -200,8 +200,8 @@ class _PartCurves:
         if self._square(best, axis) > enough:
             starts = [one_stage]
             if self._has_case:
-                # The residual has several minima, because a larger share v of the gradient, which
-                # makes T + v G earlier, and a larger time constant nearly cancel.
+                # The residual has several minima: a larger share v of the gradient advances
+                # T + v G in time, which a larger time constant nearly compensates.
                 along = [self.one_stage(axis, share) for share in (0.3, 0.6, 0.9)]
                 starts.append(min(along, key=lambda lag: self._square(lag, axis)))
             if not any(self._is_useful(near, axis, noise, 8.0, 1.5) for near in (best, *starts)):
@@ -227,8 +227,9 @@ class _PartCurves:
         Return `lag` plus a share of the gradient or, without a case thermometer, a positive lead
         time; or `lag` itself if the residual does not become significantly smaller.
 
-        The residual is linearised w.r.t. time constant and share of the gradient, or lead. The
-        residual's sum of squares must decrease by more than white noise allows at p = 1e-5.
+        The residual is linearised w.r.t. the time constant and, second, the share of the gradient
+        or the lead. The linearised residual must have a sum of squares smaller by more than white
+        noise allows at p = 1e-5.
         """
         tau = lag.tau_s
         if not tau:
@@ -340,8 +341,8 @@ class _PartCurves:
         ratio = float(np.sqrt((square / noise**2).max()))
         x, y, z = (Part(*map(round, lag, (1, 1, 4, 1))) for lag in lags)
         # Other models are tried if the left-out drift is above `most_drift`: 2 sd of the noise, or
-        # 10 sd if noise explains the residual of a shape without stress: such a shape may fit all
-        # data well, although it extrapolates badly to left-out data.
+        # 10 sd if noise explains the residual of a shape without stress, because curves that fit
+        # all data well may still extrapolate badly to left-out data.
         is_complete = ratio <= self._shape.most_noise and not self._shape.has_stress
         most_drift = (10.0 if is_complete else 2.0) * float(noise.mean())
         return Parts((x, y, z), factors, most_drift), ratio

@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the prior of a type of unit (`population`): a calibration with the mean parameters of several
-units, relative to the scale factors. Its covariance is their scatter plus the mean covariance.
+units, relative to the scale factors. Its covariance is the scatter of these parameters over the
+units plus the mean of the units' covariances.
 
 References
 ----------
@@ -46,7 +47,7 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     Raises FitError for fewer than three calibrations, two of the same unit, a calibration without
     covariance, or different input units, reference temperatures, sensors or forms of the curves.
     """
-    # Leave out nonlinear terms: few units have them, as they need |f| above 1 g.
+    # Leave out nonlinear terms: few units have such terms, which need |f| above 1 g.
     calibrations = [without_terms(each) for each in calibrations]
     _check_alike(calibrations)
     keys: dict[Column, list[Column]] = {}
@@ -168,10 +169,11 @@ def _in_one_stage(column: Column, tau_s: float) -> Column:
 
 def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
     """
-    Return columns with time constants of the bank, and factors; their sum approximates `column`.
+    Return columns with lags of the bank (`FINE_TAUS`), and factors of a sum that approximates
+    `column`.
 
     Parts of two units of a type have different time constants, so a lag is interpolated between
-    the lags of the bank, which is common to all units; a lag of 0 s has the value 0. A lag of two
+    the lags of the bank, which is common to all units; a lag of 0 s is always 0 K. A lag of two
     stages, a lag behind a temperature between board and sensor, and a lag with a lead are sums of
     first-order lags. A power of such a sum is approximated by the power of one lag of the board
     that has the same delay as the sum in a long ramp.

@@ -83,7 +83,7 @@ def offset_sd_of(calibration: Calibration) -> float:
 
 
 def with_calibration(calibration: Calibration, regression: Regression, state: State) -> State:
-    """Return a state with the bias and weights of a calibration whose K is `nominal_scale`."""
+    """Return a state with the bias and weights of a calibration with K = `nominal_scale`."""
     layout, values = parameter_layout(calibration), parameters_of(calibration)
     if len({(b - a, d - a) for a, b, _, d in (*layout.bias, *layout.scale)}) > 1:
         raise FitError(
@@ -116,7 +116,7 @@ def informative_priors(
             'calibration cannot be a prior'
         )
     # Pairs to try: `ageing`, the sd of the changes of bias [g] and scale factor (0: as the user
-    # states); `share`, the ratio of an added uncorrelated variance to each calibration variance.
+    # states); `share`, the uncorrelated variance added to each parameter / its own variance.
     tried = [(0.0, share) for share in (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)]
     # The fit begins with the last, widest prior: in a first fit with a narrow prior, the
     # estimated noise would absorb changes of the unit.

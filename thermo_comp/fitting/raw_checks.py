@@ -38,7 +38,7 @@ def judge_prior(serial: str, prior: Calibration | None) -> Iterator[Finding]:
 
 
 def full_scale_of(bags: Sequence[ReducedBag], options: FitOptions) -> float:
-    """Return the stated full scale [input units] or, by default, one above all samples."""
+    """Return the full scale [input units]: as stated, by default a value above all samples."""
     full_scale, largest = options.saturated_at, max(bag.max_abs for bag in bags)
     if full_scale == COUNTS_FULL_SCALE:
         return widened(full_scale, np.array([[largest]]))
@@ -291,7 +291,7 @@ def judge_missing(bags: Sequence[ReducedBag], windows: ThermalWindows) -> Iterat
 def _missing(bag: ReducedBag, track: Track) -> tuple[float, float, float]:
     """
     Return the numbers of all samples at rest, of those before the board temperature is accurate,
-    and of later ones without a known temperature while all thermometers are recorded.
+    and of later samples at rest without a known temperature while all thermometers are recorded.
     """
     read = [readings.stamp_ns for readings in bag.temperatures.values() if len(readings.stamp_ns)]
     begin_s = 1e-9 * (max(stamp_ns[0] for stamp_ns in read) - bag.start_ns)

@@ -304,7 +304,7 @@ def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
     use &= stamp_ns > np.maximum.accumulate(before[: len(stamp_ns)])
     stamp_ns, value = stamp_ns[use], value[use]
     span_s = np.ptp(stamp_ns) * 1e-9 if len(stamp_ns) else 0.0
-    # Average readings over 0.2 s: no thermometer is faster, and the tracker's Python loop is slow.
+    # No thermometer responds within 0.2 s, and the tracker's loop over the readings is slow.
     size = int(0.2 * (len(stamp_ns) - 1) / span_s) if span_s else 1
     n = len(stamp_ns) // size * size if size > 1 else 0
     if n:
@@ -318,8 +318,8 @@ def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
 @np.errstate(invalid='ignore')
 def is_spike(value: Floats) -> Bools:
     """Return which readings are over 10 K from the median of five readings about them, (n,)."""
-    # A thermometer with a loose contact reads -127 or 85 degC for a moment. Noise estimates leave
-    # out such readings, so that the tracker rejects them as outliers.
+    # A thermometer with a loose contact reads -127 or 85 degC for a moment. Noise is estimated
+    # without such readings, so that the tracker rejects them as outliers.
     far = np.zeros(len(value), dtype=bool)
     if len(value) > 4:
         middle = np.median(sliding_window_view(value, 5), axis=1)

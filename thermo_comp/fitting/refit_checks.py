@@ -117,7 +117,7 @@ def of_whole_rests(
     for bag in bags:
         for rest in bag.intervals:
             parts = [next(left) for _ in _pieces(rest, bag.window_s)]
-            # The weight of a piece is its duration, at least a window's length (a cell lasts 0 s).
+            # Weight of a piece: its duration (0 s if it has one cell), at least a window's length.
             share = np.array([max(part.duration_s, bag.window_s) for part in parts])
             up = share @ np.array([part.up for part in parts])
             x, y, z = (up / np.linalg.norm(up)).tolist()

@@ -5,7 +5,7 @@ Owns the regression: the posterior of all unknowns under a given prior, by Gauss
 
 All unknowns have Gaussian priors, except attitudes, whose prior is flat. Gauss-Newton finds the
 mode; the inverse of the Hessian is the covariance. The unknowns of positions and bags are
-eliminated first. To leave out a position, subtract its part from the unit's normal equations.
+eliminated first. A position is left out by subtracting its part of the unit's normal equations.
 
 References
 ----------
@@ -35,7 +35,7 @@ class PosteriorMode:
     """
     The Gaussian approximation of the posterior at its mode.
 
-    determined: effective parameters of each unknown (MacKay's gamma), 0 to 1, shape (n,)
+    determined: effective number of parameters (MacKay's gamma, 0 to 1) of each unknown, (n,)
     root: root of the covariance of the unit's unknowns, ``root @ root.T``, (n_unit, n_unit)
     variance: variances of all unknowns, shape (n,)
     square: sum of squares of the whitened residuals of each axis, shape (3,) [(m/s^2)^2]
@@ -68,7 +68,7 @@ class Point:
     """
     The equations linearised about a state, and the Gauss-Newton step from this state.
 
-    grams: sums of products of whitened base series by position, (n_positions, n_base, n_base)
+    grams: sums of products of whitened base series over each position, as in `Products`
     """
 
     regression: Regression
@@ -231,7 +231,7 @@ class Point:
         If the step increases the energy, fractions of the step of the nonlinear unknowns (those
         that multiply other unknowns) are tried, each with a new step of the linear unknowns.
         """
-        # Compute these before the next point: the regression keeps only the last linearisation.
+        # Energy and step need this point's linearisation, which that of the next point replaces.
         energy, (step, _) = self.energy, self.solution
         result = self.with_step(step)
         if result.energy <= energy:

@@ -88,7 +88,7 @@ def constant_in(data: Windows, steady: Bools, settled: Bools) -> Windows:
 
 def poses_of(windows: ThermalWindows, up: Floats) -> Ints | None:
     """
-    Return the index of each position's pose, (n_positions,), -1 if it has none; None if none has.
+    Return the index of each position's pose, -1 without pose, (n_positions,); None without poses.
 
     `up`: attitudes, shape (n_positions, 3). The positions of an attitude form a pose if the unit
     was returned to this attitude from a different one, or if all (two or more) positions have it.

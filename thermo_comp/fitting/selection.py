@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the choice of the model: groups of columns are added to the constants in steps.
+Owns the choice of the model: groups of columns are added in steps to a model of constants.
 
 The log evidence ranks the groups of columns to try; the score on left-out data decides which to
 add. The fit of each model begins from the fit of a smaller model.
@@ -161,10 +161,10 @@ class Growth:
             kelvins, state = regression.windows.kelvins, posterior.state
             square = float(np.mean(regression.residual(state, posterior.layout) ** 2))
             if state.pose.size:
-                # Add the mean squares of attitudes and offsets, which absorb errors of the model.
+                # Add mean squares of offsets and deviations from poses, which absorb model errors.
                 by_attitude = regression.gravity * state.from_pose
                 square += float(np.mean(state.offset**2) + np.mean(by_attitude**2))
-            # Typical sd of a new column: the weight with which it alone explains the residual.
+            # Typical sd of a new column: the weight with which this column explains the residual.
             slope = np.sqrt(square) / (float(kelvins[0]) or 1.0)
             units = np.array([[1.0], [1.0 / (regression.gravity or 1.0)]])
             new = np.minimum(slope * units * kelvins, largest_sd)
@@ -223,7 +223,7 @@ class Growth:
             knees = inactive.chosen(typical, is_bend, CLEAR_GAIN, 60)
             typical = np.where(is_bend & ~knees, 0.0, typical)
         # Try those groups together that describe one effect: the squared temperature of a part of
-        # lag m, (t - m)^2 = t^2 - 2 t m + m^2, needs the product t m and the square m^2.
+        # lag m behind t, (t - m)^2 = t^2 - 2 t m + m^2, needs the product t m and the square m^2.
         together = PRODUCTS, (*LAGS, 'product', 'gradient_x_temperature', 'square')
         sets = [tuple(group for group in groups if group in absent) for groups in together]
         sets = [*((group,) for group in absent), *(groups for groups in sets if len(groups) > 1)]
@@ -273,7 +273,7 @@ def select(
     constants = first = better_start(fits)
     growth.tried.append(constants)
     if CURVE in growth.free:
-        # Add the curve without a test: a curve may improve the score only with further columns.
+        # Add the curve without a test: it may improve the score only together with more columns.
         if regression.windows.has_drifts:
             curve = better_start([growth.extended(fit, (CURVE,)) for fit in fits])
             downweigh(regression, curve.posterior)

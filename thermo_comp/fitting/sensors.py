@@ -22,7 +22,7 @@ from ..thermal.settings import OBVIOUS_SHARE, RAMP_K_MIN, DetectorSettings, Ther
 from ..typing import Floats, Ints
 from .reduction import Readings, ReducedBag
 
-# Interval between temperature rates [s]; intervals on each side of a central difference.
+# Interval between temperature rates [s]; number of intervals per side of a central difference.
 _BIN_S, _BINS_PER_SIDE = 10.0, 6
 
 
@@ -167,7 +167,7 @@ def _histories(recorded: Sequence[Readings], noise: float, quantum: float) -> li
 
 
 def _slowest_ramp(histories: Sequence[RateHistory], usual: float) -> float:
-    """Return 0.7 times the rate of the slowest ramp over 10 min, in RAMP_K_MIN..usual [K/min]."""
+    """Return 0.7 times the slowest rate of ramps longer than 10 min, RAMP_K_MIN..usual [K/min]."""
     slowest = usual / 0.7
     for history in histories:
         is_ramp = np.abs(history.rate) > max(history.least_ramp, 0.1 / 60.0)
@@ -259,7 +259,7 @@ def averaged(
     bag: ReducedBag, detector: DetectorSettings, inputs: Sequence[str], step_s: float
 ) -> tuple[ReducedBag, DetectorSettings]:
     """
-    Average readings over steps of time if there are at least two per step, as from IMU drivers.
+    Average readings over steps of `step_s` if they are at least two per step, as from IMU drivers.
 
     Return the bag with mean readings, and the settings with the noise of a mean reading.
     `inputs`: the thermometers, first that of the board; the others have the settings of the case.

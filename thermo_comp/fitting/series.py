@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the base series of the windows (a constant, columns, derivatives, readings), the filter that
-whitens these series for slow noise, and the sums of products of whitened series.
+Owns the base series of the windows (a constant, columns, derivatives of columns, readings), the
+filter that whitens these series for slow noise, and the sums of products of whitened series.
 
 All terms of the measurement equation (`equations`) are linear combinations of the base series, so
 the sums of the products of whitened base series in each position are sufficient statistics.
@@ -59,7 +59,7 @@ class Whitener:
         while time_s <= span_s / 6.0:
             self.times_s.append(time_s)
             time_s *= 10.0**0.5
-        #: Upper bound of the correlation time in a search: half a decade above `times_s` [s].
+        #: Upper bound of the correlation time in a search [s]: half a decade above `times_s[-1]`.
         self._longest_s = time_s
         #: Number of processes of flicker noise: their correlation times are 3 windows times powers
         #: of ten, up to the first that is at least as long as a position.
@@ -98,7 +98,7 @@ class Whitener:
             covariance = covariance - gain[..., None] * shared[..., None, :]
 
     def filter(self, series: Floats, weight: Floats, noise: Noise) -> Floats:
-        """Whiten series, shape (n, m)."""
+        """Return series, shape (n, m), whitened for `noise`."""
         if noise.ratio <= 0.0:
             return np.asarray(series * (1.0 / np.sqrt(1.0 / weight))[:, None])
         result = np.empty_like(series)
@@ -147,7 +147,7 @@ class Whitener:
 
 
 def _vertex(values: Floats, at: int) -> float:
-    """Return the place of the minimum of a parabola through three values, less `at`, or 0."""
+    """Return the place of a parabola's minimum by three values, less `at`; 0 without minimum."""
     if not 0 < at < len(values) - 1:
         return 0.0
     before, here, after = values[at - 1 : at + 2].tolist()
@@ -159,7 +159,7 @@ def _vertex(values: Floats, at: int) -> float:
 class Base:
     """
     The base series of the active columns, in this order: 1; the columns; for each column with a
-    lag its derivative w.r.t. the initial state of the lag; t, if there are nonlinear terms; the
+    lag its derivative w.r.t. the initial state of the lag; `Series.t`, if it has columns; the
     functions `Windows.tilt`; the readings of the three axes less their mean in the position.
 
     columns: indices of the active columns; lagged: indices in `columns` of columns with a lag

@@ -50,7 +50,7 @@ def valid_range(values: Floats, smallest_margin: float, order: int = 0) -> Range
 
 def temperature_range(windows: ThermalWindows) -> Range:
     """Return the valid range of board temperatures [degC]."""
-    # A calibration from one temperature is valid within 0.5 K of this temperature; one without a
+    # A calibration from one temperature is valid within 0.5 K of it; a calibration without
     # thermometer within 50 K, as its covariance includes an unknown slope over temperature.
     return valid_range(windows.temperature, 0.5 if windows.was_measured else 50.0)
 
@@ -122,8 +122,8 @@ def with_unseen_axes(
     (lower, upper), (new_lower, new_upper) = _determined_ranges(fit, earlier), _seen(fit, None)
     slope = _unknown_slope(fit) * fit.regression.gravity
     ends = _ends(fit, earlier)
-    # The variance of an extrapolated scale factor grows with the square of the distance [K], but
-    # is interpolated linearly between stated temperatures, so it is stated at five temperatures.
+    # The variance of an extrapolated scale factor is quadratic in temperature, but is interpolated
+    # linearly between stated temperatures, so it is stated at five temperatures.
     between = [
         np.linspace(edge, end, 5)
         for edge, end in zip((lower.max(), upper.min()), ends, strict=True)

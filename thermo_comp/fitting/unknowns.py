@@ -185,7 +185,7 @@ class Noise(NamedTuple):
 
     @property
     def rate(self) -> float:
-        """Random walk of slow noise at short times, divided by white noise [1/sqrt(s)]."""
+        """Random walk of slow noise at short times / white-noise sd of a window [1/sqrt(s)]."""
         return math.sqrt(sum(2.0 * self.ratio / time_s for time_s in self.times_s))
 
 
@@ -264,7 +264,7 @@ class State:
     misalignment: elements of the inverse of M below the diagonal, shape (3,)
     up: upward unit vector of each position, its attitude, shape (n_positions, 3)
     offset: bias offset of each position [m/s^2], shape (n_positions, 3)
-    tilt: coefficients of the support's tilts along the tangents [rad], shape (n_positions, k, 2)
+    tilt: coefficients of the support's tilts along `tangents` [rad], shape (n_positions, k, 2)
     start: initial lag states of each bag, in units of their sd, shape (n_bags, r)
     turn_on: bias offset of each bag's turn-on [m/s^2], shape (n_bags, 3) or (n_bags, 0)
     nonlinear: nonlinear coefficients in the order of `Forces`, shape (3, 2 k)

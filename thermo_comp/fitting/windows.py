@@ -91,7 +91,7 @@ class Model:
     name: name of the model in the provenance
     parts: the lag of the part of each axis, or None in a model without one lag per axis
     sensors: thermometers other than the board's; the first is that of the case
-    range_c: board temperatures [degC]; windows outside are left out if their rest has one inside
+    range_c: board temperatures [degC]; a rest's windows outside are left out if it has some inside
     """
 
     name: str
@@ -174,7 +174,7 @@ class ThermalWindows:
     data: means of the samples, and columns, for the regression
     temperature, rate: board temperature [degC], its rate [K/s]; weight: of the dynamic set; (n,)
     gradient: T_case - T_board [K], shape (n,)
-    raw: values u of the response's columns, not limited or multiplied by powers of t, (n, k)
+    raw: values u of the response's columns, without limits and powers of temperature, (n, k)
     angular_rate: mean angular rate [rad/s], shape (n, 3), or (n, 0) if a bag has no angular rate
     typical_count: median number of samples of a window
     rests: bag and interval of each position
@@ -225,8 +225,8 @@ class _Rows(NamedTuple):
     """
     The windows of one rest, or of all rests: one row for each window.
 
-    thermal: board temperature [degC], its rate [K/s], weight of the dynamic set, gradient [K], and
-        the columns of the response without powers of t, as in `ThermalWindows`, shape (n, 4 + k)
+    thermal: board temperature [degC] and variance of its estimate [K^2], rate [K/s], weight of the
+        dynamic set, gradient [K], and the k columns `ThermalWindows.raw`, shape (n, 5 + k)
     columns: values of the columns, as in `Windows`
     start: derivatives of the k response columns w.r.t. the initial states of their lags, (n, k)
     angular_rate: mean angular rate [rad/s], shape (n, 3) or (n, 0)
@@ -344,7 +344,7 @@ def _windows(
     sums, groups, columns = model.part_sums, model.sets.groups, model.columns
     n_curves, lags = len(groups), StateLayout(spec).lags
     t, gradient = rows.thermal[:, 0] - model.reference_temperature, rows.thermal[:, 4]
-    # A support's tilt is linear in board and case temperature, and in the square of the latter.
+    # A support's tilt is linear in board and case temperature, and in the square of the case's.
     tilt = np.column_stack((t, gradient, (t + gradient) ** 2))
     tilt_rms = np.sqrt(np.mean(tilt**2, axis=0))
     is_tilting = tilt_rms > 0.0
@@ -453,7 +453,7 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
     reading = next(readings, None)
     for stamp_ns in range(begin_ns, max(bag.end_ns, begin_ns) + step_ns, step_ns):
         # As in the node, a state depends on all readings with a stamp up to that of the state. A
-        # mean has the mean stamp of its readings, so some of these may be later, by up to a step.
+        # mean has the mean stamp of its readings, some of which may be up to a step later.
         while reading is not None and reading[1] <= stamp_ns:
             tracker.read(*reading)
             reading = next(readings, None)
