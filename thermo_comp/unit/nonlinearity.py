@@ -221,7 +221,7 @@ class ForceCorrection:
         return np.asarray(linearised(x.T, k2, kq, k3).T)
 
     def regressors(self, force: Floats, board: Floats) -> Floats:
-        """Differentiate readings w.r.t. k coefficients, then their slopes in T, (n, 3, 2 k)."""
+        """Differentiate readings w.r.t. k coefficients, then their changes per K, (n, 3, 2 k)."""
         size = np.abs(force)
         each = {'square': force**2, 'odd_square': size * force, 'cube': force**3}
         values = [each[term.kind] / unit_of(term.kind) for term in self._nonlinearity.terms]
