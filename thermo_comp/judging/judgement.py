@@ -44,7 +44,7 @@ class AxisShift:
 
 @dataclass(frozen=True)
 class Expectation:
-    """RMS error of windows and of data left out of the fit, RMS claimed sd [m/s^2]; or NaN."""
+    """RMS error of windows and of left-out data, RMS claimed sd [m/s^2]; NaN if unknown."""
 
     found_rms: float
     expected_rms: float
