@@ -3,9 +3,9 @@
 """
 Owns the detection of departures of a temperature's rate from the baseline, the rate in a soak.
 
-Two Kalman filters of temperature and rate, one with a long and one with a short memory, have white
-noise as second derivative. A rate has departed if it exceeds the baseline, away from 0, by more
-than swing plus error of the baseline plus k times the sd of the rate's noise; k follows from the
+Two Kalman filters of temperature and rate, with a long and a short memory, model d2T/dt2 as white
+noise. A rate has departed if it exceeds the baseline, away from 0, by more than the sum of its
+swing, the error of the baseline and k times the sd of the rate's noise; k follows from the
 permitted number of false alarms per hour (Rice's formula [1]_, docs/regime.md). If noise cannot
 change the reading of a quantized sensor, the filters are not used: the mean rate follows from two
 successive crossings of edges between cells of one quantum.
