@@ -260,7 +260,7 @@ class Correction:
         static_weight, beyond_range = 1.0 - weight, self.table.beyond(raw)
         excess, _, relative, by_rate = self.curves.excess(states)
         if not self._has_lags:
-            # Columns of lags describe the effect of the rate: without them, add the excess of the rate.
+            # Lags describe the effect of the rate: without lags, add the excess of the rate.
             relative = relative + by_rate
         outside = static_weight * relative[0] + weight * relative[1]
         shares = np.array([static_weight + unknown * weight, weight + unknown * static_weight])

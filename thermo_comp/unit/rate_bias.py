@@ -60,7 +60,7 @@ class RateTerm(Column):
 @dataclass(frozen=True)
 class Gyroscope:
     """
-    Bias of the angular rate over temperature: ``rate = measured - bias``. The scale factor is 1.
+    Bias of the angular rate over temperature: ``w = measured - bias``. The scale factor is 1.
 
     Parameters of `posterior`, for each axis: coefficients of each regime, then column weights.
     """
