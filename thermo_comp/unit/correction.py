@@ -250,7 +250,7 @@ class Correction:
     ) -> tuple[Floats, Floats]:
         """
         Evaluate a, b, c of each axis' error variance ``a + b x + c x^2``, (3, 3, n), without
-        sample noise, and the factor (3, n) of this variance outside the calibrated ranges.
+        sample noise, and the growth factor (3, n) of this variance outside the calibrated ranges.
 
         `gap`, the dynamic less the static set, is added as an error while the sets are blended,
         outside the calibrated ranges, and while the regime is unknown. In an unknown regime the

@@ -82,7 +82,7 @@ class Curves:
         return hold(t - lower, -below, 0.0), hold(t - upper, 0.0, above)
 
     def unexplained(self, board: Floats) -> Floats:
-        """Evaluate the variance of residual and lack of fit by regime and axis, (2, 3, n)."""
+        """Evaluate residual plus lack-of-fit variance of each regime and axis, (2, 3, n)."""
         return self._residuals + self.lack_of_fit(board)
 
     def lack_of_fit(self, board: Floats) -> Floats:

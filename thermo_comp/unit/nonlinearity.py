@@ -108,7 +108,7 @@ class Nonlinearity:
                 raise broken('nonlinearity.terms', rule, got)
 
     def coefficients(self, t: Floats) -> Floats:
-        """Return K2, Kq [s^2/m], K3 [s^4/m^2] by axis at t [K] from T_ref, shape (3, 3, n)."""
+        """Return K2, Kq [s^2/m], K3 [s^4/m^2] of axes at t [K] from T_ref, shape (3, 3, n)."""
         result = np.zeros((3, 3, len(t)))
         for term in self.terms:
             at, slope = np.array([term.coefficient, term.per_kelvin])[:, :, np.newaxis]
