@@ -44,7 +44,7 @@ class AxisShift:
 
 @dataclass(frozen=True)
 class Expectation:
-    """RMS error of windows and of data left out of the fit, RMS claimed sd [m/s^2]; or NaN."""
+    """RMS error of windows and of left-out data, RMS claimed sd [m/s^2]; NaN if unknown."""
 
     found_rms: float
     expected_rms: float
@@ -56,11 +56,11 @@ class Judgement:
     """
     The judgement of a calibration on recordings: the verdict, and a sentence with its numbers.
 
-    `left_out_rms` is the fit's RMS on positions left out, NaN if the bags are not those of the
-    fit; `tolerance` is the user's limit on the RMS [m/s^2]. `shifts`: shift of bias and scale of
-    each axis, empty with fewer than six distinct positions; `moved`: text of each significant
-    shift; `axis_rms`: RMS drift by regime and axis; `rate`: judgement of the gyroscope;
-    `expectations`: |f| - g and drift of an axis (`norm`, `drift`) within the calibrated ranges.
+    `left_out_rms`: RMS of |f| - g on positions left out of the fit, NaN if the bags are not those
+    of the fit; `tolerance`: the user's limit on RMS values [m/s^2]. `shifts`: shift of bias and
+    scale of each axis, empty with fewer than six distinct positions; `moved`: text of each
+    significant shift; `axis_rms`: RMS drift of each regime and axis; `rate`: judgement of the
+    gyroscope; `expectations`: |f| - g and drift of an axis (`norm`, `drift`) in calibrated ranges.
     """
 
     kind: Verdict
@@ -303,7 +303,7 @@ def change_texts(shifts: tuple[AxisShift, ...]) -> tuple[str, ...]:
 
 
 def rms_by_axis(windows: JudgedWindows) -> Floats:
-    """Return by regime and axis the RMS of the force less its mean in the position, (2, 3)."""
+    """Return for each regime and axis the RMS of force less mean in the position, (2, 3)."""
     about = within_positions(windows.force, windows.position)
     return np.array(
         [

@@ -31,7 +31,7 @@ from ..unit.nonlinearity import AT_REST
 #: Default duration of a window of a judgement [s].
 WINDOW_S = 60.0
 # A window counts as inside the calibrated ranges up to this sum of its distances from the ranges
-# of temperature, rate and worst column [half ranges], because thermometers have noise.
+# of temperature, rate and the farthest column [half ranges], because thermometers have noise.
 _RANGE_TOLERANCE = 0.02
 # A partial sum is used if it has at least this share of the median number of samples.
 _LEAST_FILLED = 0.9
@@ -268,7 +268,7 @@ def _joined(sums: _Table) -> _Table:
 
 
 def _correct(calibration: Calibration, bag: ReducedBag, sums: _Table) -> None:
-    """Run partial sums through the compensator, with the readings before each partial sum."""
+    """Correct partial sums with the compensator and the readings up to each sum's middle."""
     # The checks for stuck samples and gravity do not apply to means of samples.
     config = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
     compensator = Compensator(calibration, config)

@@ -58,7 +58,7 @@ class CompensatedBlock:
 def process_block(
     compensator: Compensator, block: Block, angular_rate: Floats | None = None
 ) -> CompensatedBlock:
-    """Correct a block's samples and angular rates, (n, 3), with the bits of `process`."""
+    """Correct a block's samples and angular rates, (n, 3), bit for bit as `process` does."""
     thermal = compensator.thermal
     stamps = np.asarray(block.accel_stamp_ns, dtype=np.int64)
     samples = np.asarray(block.accel, dtype=np.float64)
@@ -127,7 +127,7 @@ def _push(
         _, _, name, stamp_ns, celsius = arrivals.pop()
         if len(thermal.queue) >= PENDING_LIMIT:
             # A full queue is applied up to `DISORDER_NS` before the new reading, as the node does
-            # while no samples come, but after the first sample not beyond `due_ns`.
+            # while no samples come; after the first sample, readings after `due_ns` keep waiting.
             limit_ns = NEVER_NS if compensator.now_ns is None else due_ns
             thermal.flush(min(limit_ns, stamp_ns - DISORDER_NS))
         thermal.push(name, stamp_ns, celsius)

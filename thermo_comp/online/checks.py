@@ -274,7 +274,7 @@ class GravityCheck:
         self._begin_ns = self._last_ns = 0
         self._last_mean: list[float] | None = None
         #: Mean force and stamp [ns] of the last still window in which |f| agreed with gravity or
-        #: in which the platform accelerated; whether a window has not been still since.
+        #: in which the platform accelerated; whether any later window was not still.
         self._agreed: tuple[list[float], int] | None = None
         self._has_moved = False
         self._weight = 0.0  # sum of the weights of the windows averaged in `result`

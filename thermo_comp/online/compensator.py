@@ -51,7 +51,7 @@ CONTINUED: Final = (
     f'{TANGENT_SPANS:g} of the range, then constant'
 )
 
-#: Variances of a rate that is not finite: sensor_msgs/Imu marks a missing rate by a first -1.
+#: Variances of a rate that is not finite: -1 as first variance means no rate (sensor_msgs/Imu).
 NO_RATE: Final = (-1.0, 0.0, 0.0)
 
 #: Specific force x, y, z [m/s^2] and the covariance xx, xy, xz, yy, yz, zz [m^2/s^4].
@@ -238,7 +238,7 @@ class Compensator:
         if not is_new:
             return row
         if self.gravity.is_refuted and not is_too_fast:
-            # Dropped samples are checked, too: output resumes when |f| agrees with gravity.
+            # The |f| of dropped samples is checked: output resumes when it agrees with gravity.
             self.is_refusing = True
             if row is not None:
                 counters.n_out -= 1
@@ -255,7 +255,7 @@ class Compensator:
         is_far = self.last_ns != EVER_NS and max(self.last_ns, self.reading_ns) < near_ns
         if is_far and (leapt_ns is None or stamp_ns <= leapt_ns):
             self.leapt_ns = stamp_ns
-            self.event_ns = EVER_NS  # the next sample is checked by `is_leap`, too
+            self.event_ns = EVER_NS  # so `is_leap` also tests the next sample
             return True
         return False
 

@@ -3,9 +3,9 @@
 """
 Owns the detection of departures of a temperature's rate from the baseline, the rate in a soak.
 
-Two Kalman filters of temperature and rate, one with a long and one with a short memory, have white
-noise as second derivative. A rate has departed if it exceeds the baseline, away from 0, by more
-than swing plus error of the baseline plus k times the sd of the rate's noise; k follows from the
+Two Kalman filters of temperature and rate, with a long and a short memory, model d2T/dt2 as white
+noise. A rate has departed if it exceeds the baseline, away from 0, by more than the sum of its
+swing, the error of the baseline and k times the sd of the rate's noise; k follows from the
 permitted number of false alarms per hour (Rice's formula [1]_, docs/regime.md). If noise cannot
 change the reading of a quantized sensor, the filters are not used: the mean rate follows from two
 successive crossings of edges between cells of one quantum.
@@ -32,7 +32,7 @@ SETTLING_MEMORIES: Final = 5.0  # age / memory of a filter from which its noise 
 LONGEST_HALF_SWING_S: Final = 600.0  # longest half period of a temperature ripple [s]
 LARGEST_BASELINE_SHARE: Final = 0.25  # largest baseline rate of a soak / smallest ramp's rate
 SWING_MARGIN: Final = 1.25  # assumed swing / observed swing of the rate about its trend
-SWING_SIGMAS: Final = 3.0  # noise subtracted from an observed swing of the rate, in sd
+SWING_SIGMAS: Final = 3.0  # number of noise sds subtracted from an observed swing of the rate
 SWING_MEMORY_LAGS: Final = 10.0  # time constant of the decay of the swing / lag of the sensor
 
 

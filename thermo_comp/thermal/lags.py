@@ -3,12 +3,12 @@
 """
 Owns the definitions of lags and play operators, and the covariance of their initial states.
 
-A lag L of an input u obeys ``dL/dt = (u - L) / tau``. The stored state is ``m = u - L``, the input
-less the lag. For two stages in series, of time constants ``tau_1 > tau_2``, and a lead theta, m is
-a weighted sum of the m of two first-order lags,
-``m = ((tau_1 - theta) m_1 - (tau_2 - theta) m_2) / (tau_1 - tau_2)``. A part between the board and
-a sensor s lags the temperature ``T + v G``, with the gradient ``G = T_s - T`` and its share v, so
-``m = T - L(T + v G)`` is ``T - L(T)`` less ``v L(G)``. docs/theory.md explains the model (Parts).
+The lagged value L of an input u obeys ``dL/dt = (u - L) / tau``; the stored state is
+``m = u - L``. For two stages in series, of time constants ``tau_1 > tau_2``, and a lead theta, m
+is a weighted sum of the states m_1 and m_2 of two first-order lags,
+``m = ((tau_1 - theta) m_1 - (tau_2 - theta) m_2) / (tau_1 - tau_2)``. With T = T_board, a part
+between the board and a sensor s lags ``T + v G``, where ``G = T_s - T`` is the gradient and v its
+share, so ``m = T - L(T + v G)`` is ``T - L(T)`` less ``v L(G)`` (docs/theory.md, Parts).
 """
 
 import math
@@ -23,8 +23,8 @@ from ..typing import Floats
 
 #: Name of the board temperature as the input of a lag or play.
 BOARD_INPUT: Final = 'board'
-#: Relative jitter on the diagonal of the start covariance: lags of similar time constants are
-#: almost collinear, and their covariance would not be invertible.
+#: Relative jitter on the diagonal of the covariance of initial states of first-order lags: lags of
+#: similar time constants are almost collinear, and their covariance would not be invertible.
 START_JITTER: Final = 3e-4
 #: Prior sd [K] of the initial state of a lag with the time constant `START_TAU_S` [s].
 BOARD_START_SD: Final = 3.0  # for a lag of the board temperature
@@ -74,7 +74,7 @@ class Lag(_Lag, Quantity):
 
     @property
     def by_board(self) -> float:
-        """Derivative of the quantity w.r.t. T_board, at constant first-order lags L."""
+        """Derivative of the quantity w.r.t. T_board, at constant lagged values L (module top)."""
         if self.input != BOARD_INPUT:
             return 0.0
         return 1.0 if self.second_tau_s else self.shares[0]

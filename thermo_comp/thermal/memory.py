@@ -43,11 +43,11 @@ class LagBank:
         self.stamp_ns: int | None = None
         self.start_ns: int | None = None
         self.input = 0.0
-        #: Input less each lag [K], and its variance for a known initial state [K^2].
+        #: Input less lagged input of each lag [K]; variance for a known initial state [K^2].
         self.lagging = self.extra = [0.0] * len(self.taus)
 
     def step(self, stamp_ns: int, value: float, sd: float = 0.0) -> None:
-        """Use the next input value, with an error of the sd `sd` [K]; it is linear in between."""
+        """Use the next input value (error sd: `sd` [K]); the input is linear between values."""
         if self.stamp_ns is None:
             self.stamp_ns = self.start_ns = stamp_ns
             self.input = value
@@ -143,7 +143,7 @@ class ThermalMemory:
             bank.forget()
         self._held: list[float] = []  # output of each play; empty before the first temperature
         #: Rate of a ramp in which the unit may have been switched on [K/s], estimated from the
-        #: board's rate shortly afterwards; lower bound of this rate by its sd.
+        #: board's rate shortly afterwards; `sure_rate`: lower bound, largest rate less 2 sd.
         self.start_rate = self.sure_rate = 0.0
 
     def forget_input(self, name: str) -> None:

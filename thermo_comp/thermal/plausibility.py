@@ -26,7 +26,7 @@ SETTLED_READINGS: Final = 5
 #: A sensor's first reading is wrong if the second reading differs from it by an impossible step,
 #: and the third from the second by less than this share of the step, in K and in K/s.
 CONTINUED_SHARE: Final = 0.25
-#: A sensor stands still after `STILL_S` [s] and this number of equal readings, or after the larger
+#: A sensor stands still after `STILL_S` [s] with this number of equal readings or, if larger, the
 #: number of equal readings that noise gives with the probability `STILL_PROBABILITY`.
 STILL_READINGS: Final = 20
 STILL_S: Final = 5.0
@@ -44,7 +44,7 @@ LARGEST_ERROR: Final = 60.0  # largest assumed error of a sensor with constant r
 LEAD_K: Final = 0.5  # limit in K
 LEAD_SHARE: Final = 0.15  # limit relative to the larger change
 LEAD_READINGS: Final = 5
-LEAD_RATE_SHARE: Final = 0.3  # least ratio of the slower to the faster rate at such a reading
+LEAD_RATE_SHARE: Final = 0.3  # least ratio of the slower to the faster rate at these readings
 #: Ratio of the slower to the faster rate above which a leading board gets a larger variance.
 DOUBTFUL_RATE_SHARE: Final = 0.03
 #: A sensor copies the board if this number of its readings in a row change and equal the board's.
@@ -86,7 +86,7 @@ class SensorCheck:
 
     def __init__(self, sensor: Thermometer, other: Thermometer, lag_s: float) -> None:
         self.sensor, self._other, self.lag_s = sensor, other, lag_s
-        #: Sum of the impossible jumps after which readings were used [K]; a jump back cancels one.
+        #: Signed sum of the impossible jumps after which readings were used [K].
         self.shift = 0.0
         settings = sensor.settings
         self._quantum = settings.quantum_c
@@ -116,7 +116,7 @@ class SensorCheck:
 
     @property
     def finding(self) -> tuple[Fault, float]:
-        """The present fault, and the size of the jump [K] if the fault is one."""
+        """The present fault, and the size of the jump [K] if the fault is a jump."""
         is_shifted = self.fault is Fault.NONE and abs(self.shift) > LARGEST_STEP
         return (Fault.SHIFTED, self.shift) if is_shifted else (self.fault, self.step)
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the causal decision [1]_ between static and dynamic regime, by the stamps of readings alone.
+Owns the causal decision [1]_ between static and dynamic regime, from stamped readings alone.
 
 The dynamic state *begins* when the rate of the leading sensor has left the baseline of the soak
 (`change_detector`), or when the rate of any sensor is clearly that of a ramp. The dynamic state

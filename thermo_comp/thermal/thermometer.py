@@ -6,10 +6,10 @@ Owns the recursive estimate of T, dT/dt, d2T/dt2 and their variances from stampe
 Two Kalman filters of temperature, rate and acceleration (d2T/dt2) interact [1]_: *quiet*, in which
 the acceleration is almost constant (a soak, the middle of a ramp), and *bending*, in which the
 acceleration changes as at the onset and end of a ramp behind a thermal lag [2]_. The estimate is
-the mixture of the quiet and the bending filter, with the variance of a mixture. If a sensor's
-quantum exceeds the noise, all temperatures in a cell (an interval of one quantum) give the same
-reading. A changed reading is then a precise measurement of the edge between two cells, and an
-unchanged reading only bounds the temperature by the cell [3]_.
+the mean of both filters weighted by their probabilities, and its variance includes the filters'
+difference. If a sensor's quantum exceeds the noise, all temperatures in a cell (an interval of one
+quantum) give the same reading. A changed reading is then a precise measurement of the edge between
+two cells, and an unchanged reading only bounds the temperature by the cell [3]_.
 
 References
 ----------
@@ -33,7 +33,7 @@ RESTART_READINGS: Final = 4  # consecutive outliers of equal sign after which th
 SOAK_S: Final = 900.0
 # Sd of the noise that drives the temperature's second derivative: quiet filter / bending filter.
 QUIET_SHARE: Final = 5e-3
-CELL_SHARE: Final = 0.2  # this ratio for a sensor whose readings never change by noise alone
+CELL_SHARE: Final = 0.2  # replaces `QUIET_SHARE` if noise alone never changes the reading
 _ROOT_HALF: Final = 0.7071067811865476  # 1 / sqrt(2)
 _DENSITY_AT_0: Final = 0.3989422804014327  # 1 / sqrt(2 pi)
 #: Range of readings accepted as temperatures [degC]; the lower end is absolute zero.
@@ -70,7 +70,7 @@ class Thermometer:
         self._noise = noise * noise
         self._flat = noise * noise + quantum * quantum / 12.0
         self._noise_scale = 1.0  # noise factor: actual / declared noise variance
-        self._n_turns = 8.0  # number of innovations in `_noise_scale`, 8 of which are its prior
+        self._n_turns = 8.0  # number of innovations in `_noise_scale`; its prior counts as 8
         self._has_cells = settings.has_cells
         self._quantum = quantum
         self._lag = settings.lag_s

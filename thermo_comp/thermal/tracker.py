@@ -134,7 +134,7 @@ class ThermalTracker:
             memory.board_step(stamp_ns, board.temperature, error)
             age_s = (stamp_ns - (memory.board.start_ns or 0)) * 1e-9
             if age_s <= max(self._board_lag_s, board.settings.lag_s):
-                # A ramp that began before the start shows in the board's rate within this time.
+                # A ramp begun before the first reading shows in the board's rate in this time.
                 rate = abs(board.rate)
                 memory.sure_rate = max(memory.sure_rate, rate - 2.0 * sqrt(board.var_rate))
                 memory.start_rate = max(memory.sure_rate, rate)
@@ -272,7 +272,7 @@ class ThermalTracker:
         return loose * loose + (gradient * gradient if lead.is_reversed else lead.extra_variance)
 
     def loose_k(self, gradient: float) -> float:
-        """Return the part of the leading gradient [K] not explained by ramp and self-heating."""
+        """Return the leading sensor's gradient [K] beyond that of ramp and self-heating."""
         of_ramp = self._board_lag_s * self.board.rate
         lower, upper = self._rest_gradient_range
         excess = max(gradient - of_ramp - upper, lower - gradient + of_ramp)

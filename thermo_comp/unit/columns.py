@@ -6,7 +6,7 @@ Owns the columns of the thermal response: the regressors of bias and scale.
 A column is ``phi = u t^power r``. The value u is computed by the column's kind (`unit.terms`), t
 is the board temperature less the reference, and r is 1, 1 - w or w, with w the weight of the
 dynamic set. u is limited to the column's range, and t to the calibrated temperatures, because no
-recording determines the weights of columns beyond them.
+recording determines the effect of a column outside this range and these temperatures.
 
 The function `bank` makes the candidate columns of a fit. The group *part* has columns of the kinds
 board, square and cube, whose sum with a curve over the board temperature is a curve over the
@@ -193,8 +193,8 @@ def bank(
     columns += _family('product', ['board'], powers=(1, 2), lags=coarse)
     columns += _family('gradient_x_temperature', ['gradient'], sensors, powers=(1,))
     columns += _family('gradient_x_temperature', ['gradient_lag'], sensors, (1,), coarse_gradient)
-    # A bias that follows the temperature of a part, t - m with the lag m, is a polynomial of
-    # t - m: (t - m)^2 = t^2 - 2 t m + m^2, (t - m)^3 = t^3 - 3 t^2 m + 3 t m^2 - m^3.
+    # The temperature of a part of lag m is t - m. A bias that is a polynomial of it has the terms
+    # (t - m)^2 = t^2 - 2 t m + m^2 and (t - m)^3 = t^3 - 3 t^2 m + 3 t m^2 - m^3.
     columns += _family('square', ['square'], powers=(0, 1), lags=coarse)
     columns += _family('square', ['cube'], lags=coarse)
     even = _family('gradient_even', ['gradient_even'], sensors, (0, 1, 2), widths=EVEN_WIDTHS)
@@ -231,7 +231,7 @@ def _family(
 
 
 def memory_of(columns: Iterable[Column], sensors: Sequence[str] = ('case',)) -> MemorySpec:
-    """Return the lags, plays and rates in columns; ValueError for a sensor not in `sensors`."""
+    """Return lags, plays and rates that columns use; ValueError: sensor not in `sensors`."""
     sources: set[Quantity] = set()
     for column in columns:
         sources.add(column.source)
@@ -269,8 +269,8 @@ class ColumnTable:
         self._t_range = coldest - reference_temperature, hottest - reference_temperature
         ranges = np.array([column.range for column in columns])
         self._range = ranges.reshape(-1, 2).T[:, :, np.newaxis]
-        # Outside its range a column is constant. Curves over the board temperature continue for
-        # `TANGENT_SPANS` of their range, and so do curves over a part's temperature (bends).
+        # The value u of a column is constant outside its range. Only a bend, a curve over a part's
+        # temperature, continues for `TANGENT_SPANS` of its range, as a curve over T_board does.
         is_curve = np.array([c.term.is_temperature for c in columns], bool)[:, np.newaxis]
         lower, upper = self._range
         extension = np.where(is_curve, TANGENT_SPANS * (upper - lower), 0.0)
@@ -313,7 +313,7 @@ class ColumnTable:
         return raw - hold(raw, *self._range)
 
     def excess(self, raw: Floats) -> Floats:
-        """Return how far each u (for a power: its root) is outside its range [half ranges]."""
+        """Return each u's distance d from its range [half ranges]; order p: (1 + d)^(1/p) - 1."""
         lower, upper = self._range
         excess = np.asarray(np.abs(self.beyond(raw)) / ((upper - lower) / 2.0))
         for order in {*self._orders.tolist()} - {1}:

@@ -61,7 +61,7 @@ class Excess(NamedTuple):
     temperature: float  # board temperature beyond the range of the present regime, signed [K]
     rate: float  # rate of the board temperature beyond this regime's range, signed [K/s]
     gradient: float  # excess of the gradient farthest outside its range, signed [K]
-    relative: float  # sum of the excesses of temperature, rate and worst column [half ranges]
+    relative: float  # excess of temperature + of rate + largest of a column [half ranges]
 
 
 class Correction:
@@ -95,7 +95,7 @@ class Correction:
         slopes, (_, of_bends) = self.curves.slopes(settled[BOARD]), self.table.slopes(settled)
         if of_bends is not None:
             slopes += self._weigh(of_bends, np.zeros(slopes.shape[1:]))
-        # Sd of each set's slopes over temperature: rows for the bias, then rows for the scale.
+        # Sd over the calibrated range of the slopes of both sets: of the bias, then of the scale.
         of_bias = np.arange(6)[:, np.newaxis] < 3
         sds = slopes.std(axis=2, keepdims=True)
         self._slope_sds = np.concatenate((sds * of_bias, sds * ~of_bias))
@@ -250,7 +250,7 @@ class Correction:
     ) -> tuple[Floats, Floats]:
         """
         Evaluate a, b, c of each axis' error variance ``a + b x + c x^2``, (3, 3, n), without
-        sample noise, and the factor (3, n) of this variance outside the calibrated ranges.
+        sample noise, and the growth factor (3, n) of this variance outside the calibrated ranges.
 
         `gap`, the dynamic less the static set, is added as an error while the sets are blended,
         outside the calibrated ranges, and while the regime is unknown. In an unknown regime the
@@ -260,7 +260,7 @@ class Correction:
         static_weight, beyond_range = 1.0 - weight, self.table.beyond(raw)
         excess, _, relative, by_rate = self.curves.excess(states)
         if not self._has_lags:
-            # Lags describe the effect of the rate: without lags, the range of the rate counts.
+            # Lags describe the effect of the rate: without lags, add the excess of the rate.
             relative = relative + by_rate
         outside = static_weight * relative[0] + weight * relative[1]
         shares = np.array([static_weight + unknown * weight, weight + unknown * static_weight])
@@ -302,7 +302,7 @@ class Correction:
             both = (np.full_like(weight, w) for w in (0.0, 1.0))
             of_static, of_dynamic = (self.table.factors(board, w)[0] for w in both)
             gap = self._weigh(held * (of_dynamic - of_static), gap)
-        # The effect that each column loses by the limits of its range is an error, too.
+        # The part of a column's effect that the limits of its range cut off is an error.
         cut_off = self._weigh(beyond_range * factors[0], np.zeros_like(gap))
         variances_of_both = np.array([of_gap, np.ones_like(of_gap)])
         return v + self._spread(variances_of_both, np.array([gap, cut_off])), growth

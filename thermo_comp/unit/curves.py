@@ -51,7 +51,7 @@ class Curves:
         self._lacks = {regime: np.array(rows).T for regime, rows in enumerate(lacks) if rows}
 
     def excess(self, states: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Return T_board [K] and rate [K/s] beyond each set's range; both / half range, (2, n)."""
+        """Return T_board [K], rate [K/s] beyond each set's range; both in half ranges, (2, n)."""
         t, rate = states[BOARD] - self._reference, states[RATE]
         over, too_fast = t - hold(t, *self._t_range), rate - hold(rate, *self._rate_range)
         span, rate_span = (edges[1] - edges[0] for edges in (self._t_range, self._rate_range))
@@ -82,7 +82,7 @@ class Curves:
         return hold(t - lower, -below, 0.0), hold(t - upper, 0.0, above)
 
     def unexplained(self, board: Floats) -> Floats:
-        """Evaluate the variance of residual and lack of fit by regime and axis, (2, 3, n)."""
+        """Evaluate residual plus lack-of-fit variance of each regime and axis, (2, 3, n)."""
         return self._residuals + self.lack_of_fit(board)
 
     def lack_of_fit(self, board: Floats) -> Floats:

@@ -123,7 +123,7 @@ def _check_scale(key: str, extremes: tuple[float, float], effect: float) -> None
 
 
 def _extremes(function: TemperatureFunction, edges: Sequence[float]) -> tuple[float, float]:
-    """Return a function's smallest and largest value between `edges` and on the tangents there."""
+    """Return a function's smallest and largest value between `edges` and on tangents beyond."""
     lower, upper = edges
     t = np.linspace(lower, upper, _GRID)
     beyond_k = TANGENT_SPANS * (upper - lower)

@@ -45,7 +45,7 @@ def means_by(labels: Ints, values: Floats, weight: Floats | None = None) -> Floa
 
 
 def statistics_by_regime(residual: Floats, is_dynamic: Bools) -> dict[str, ResidualStatistics]:
-    """Summarise residuals over the static sections, the dynamic sections, and all sections."""
+    """Summarise the residuals in the static regime, in the dynamic regime, and in both."""
     return {
         'static': residual_statistics(residual[~is_dynamic]),
         'dynamic': residual_statistics(residual[is_dynamic]),

@@ -108,7 +108,7 @@ class Nonlinearity:
                 raise broken('nonlinearity.terms', rule, got)
 
     def coefficients(self, t: Floats) -> Floats:
-        """Return K2, Kq [s^2/m], K3 [s^4/m^2] by axis at t [K] from T_ref, shape (3, 3, n)."""
+        """Return K2, Kq [s^2/m], K3 [s^4/m^2] of axes at t [K] from T_ref, shape (3, 3, n)."""
         result = np.zeros((3, 3, len(t)))
         for term in self.terms:
             at, slope = np.array([term.coefficient, term.per_kelvin])[:, :, np.newaxis]
@@ -221,7 +221,7 @@ class ForceCorrection:
         return np.asarray(linearised(x.T, k2, kq, k3).T)
 
     def regressors(self, force: Floats, board: Floats) -> Floats:
-        """Differentiate readings w.r.t. k coefficients, then their slopes in T, (n, 3, 2 k)."""
+        """Differentiate readings w.r.t. k coefficients, then their changes per K, (n, 3, 2 k)."""
         size = np.abs(force)
         each = {'square': force**2, 'odd_square': size * force, 'cube': force**3}
         values = [each[term.kind] / unit_of(term.kind) for term in self._nonlinearity.terms]

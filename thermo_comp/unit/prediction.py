@@ -52,7 +52,7 @@ class SlowUncertainty:
         if posterior is not None:
             matrix, diagonal = posterior.matrix, posterior.variances
         #: For each axis: factor and diagonal of the covariance of the parameters of the bias, of
-        #: the scale, and of the nonlinear terms. Below: factor and diagonal for the misalignment.
+        #: the scale, of the nonlinear terms. `_misalignment`: factor, diagonal of M's covariance.
         self._blocks = [
             [(matrix[part], diagonal[part]) for part in (bias.rows, scale.rows, force)]
             for bias, scale, force in zip(layout.bias, layout.scale, layout.force, strict=True)
@@ -87,7 +87,7 @@ class SlowUncertainty:
         by_pair = self._correction.by_pairs(table.slopes(states)[0] * factors)
         by_lag = by_pair[self._correction.layout.lag_pairs] * start_shares[:, np.newaxis]
         # The unit may have been switched on in a ramp: the sd of a lag at the start is the lag in
-        # a ramp of this rate, limited to the calibrated span of temperatures.
+        # a ramp of rate `rates`, limited to the calibrated span of temperatures.
         behind = hold(self._behind_s[:, :, np.newaxis] * rates, -self._span, self._span)
         in_ramp = in_order(by_lag * behind[:, :, np.newaxis], 1)
         by_root = in_order(self._root[:, :, np.newaxis, np.newaxis] * by_lag[:, np.newaxis], 0)

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class Form(NamedTuple):
-    """A function of x and its derivative; the result of an x has the same bits in any array."""
+    """A function of x and its derivative; an x gives the same bits alone and in any array."""
 
     value: Callable[[Floats], Floats]
     slope: Callable[[Floats], Floats]
@@ -129,17 +129,17 @@ _ALL: Final = (
     # `gradient`: heat flow from a thermometer to the board; `rate`: a fit never uses this kind.
     Term('gradient', 'g_s', _gradient),
     Term('rate', 'dT_board/dt [K/s]', lambda _: state.Rate()),
-    # `board`: of a part that lags the board; `gradient_lag`: of a part between thermometers.
+    # `board`: for a part that lags the board; `gradient_lag`: for a part between thermometers.
     Term('board', 'T_board - lagged T_board', _part, positive=('tau_s',)),
     Term('gradient_lag', 'lagged g_s', _lagged_gradient, positive=('tau_s',)),
-    # `square` with a lag is for a curve over a part's temperature; q_s is a heat flow.
+    # `square` with lag: for a curve over a part's temperature; without: squared heat flow.
     Term(
         *('square', '(T_board - lagged T_board)^2, or q_s^2 without lag', _part_or_gradient),
         *(_SQUARE, 2, 'rest_k'),
     ),
     # Cubic curve over the temperature of a part.
     Term('cube', '(T_board - lagged T_board)^3', _part, _CUBE, 3, 'rest_k', positive=('tau_s',)),
-    # Even in q_s. `size`: load of a heat pump; `gradient_even`: a load that saturates.
+    # Even functions of q_s. `size`: heat pump load; `gradient_even`: a load that saturates.
     Term('size', 'abs(q_s)', _gradient, _SIZE, centre_key='rest_k'),
     Term(
         *('gradient_even', 'tanh((q_s / width)^2)', _gradient, _EVEN),
