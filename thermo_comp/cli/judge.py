@@ -128,7 +128,7 @@ def _print_axes(out: Output, judged: 'Judgement') -> None:
 
 
 def _print_expectations(out: Output, judged: 'Judgement') -> None:
-    """Print found and expected errors (on data left out of the fit), if the file has both."""
+    """If the file has errors on data left out of the fit, print these beside the found errors."""
     names = {'norm': '|f| - g', 'drift': 'drift of an axis'}
     parts = {names[key]: part for key, part in judged.expectations.items()}
     if any(isfinite(part.expected_rms) for part in parts.values()):
