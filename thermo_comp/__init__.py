@@ -16,8 +16,8 @@ Units
     unit suffix only where there is no docstring to read (file keys, ROS parameters, command-line
     flags, columns) or where the unit is not SI (`rate_k_min`).
 Counts
-    Raw accelerometer outputs are signed counts per conversion cycle: an increment, quantized,
-    saturating at the converter's full scale. Where a unit already reports m/s^2, "counts" means
+    Raw accelerometer outputs are signed counts per conversion cycle: quantized increments that
+    saturate at the converter's full scale. Where a unit already reports m/s^2, "counts" means
     m/s^2 and the scale factor is close to 1.
 Signs
     ``corrected = (measured - bias) / scale``; a residual is ``corrected - true``. The
@@ -35,8 +35,8 @@ Frames
     unit diagonal).
 Time
     Stamps are integers, ``stamp_ns`` [ns]. A time difference in seconds is always computed from
-    an integer difference, so that no result depends on the origin of time. A sample that is
-    corrected alone gives the same bits as in an array.
+    an integer difference, so that no result depends on the origin of time. A sample
+    corrected alone gives the same result, bit for bit, as in an array.
 
 References
 ----------

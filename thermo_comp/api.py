@@ -103,7 +103,7 @@ def correct(
     **sensors: Temperature,
 ) -> Corrected:
     """
-    Correct arrays of samples; the node and ``replay`` give the same bits at equal stamps.
+    Correct arrays of samples; bit for bit as node and ``replay`` do at equal stamps.
 
     Parameters
     ----------
@@ -188,7 +188,7 @@ def read(path: str | Path, topics: Topics | None = None) -> Columns:
     first_ns = min((int(stamp.min()) for stamp in stamps if len(stamp)), default=0)
     start_ns = first_ns // _MINUTE_NS * _MINUTE_NS
     metadata = recording.info.metadata
-    # `fit` refuses a |f| that is not a number: only a bag contains the rotation rate.
+    # `Columns` lacks the bag's rotation rate: `fit` refuses this text, which is no number |f|.
     force = f'{ROTATION} {metadata[ROTATION]}' if ROTATION in metadata else ''
     return Columns(
         time_s=_seconds(block.accel_stamp_ns, start_ns),
@@ -268,7 +268,7 @@ def fit(
 def _block(
     time_s: npt.ArrayLike, counts: npt.ArrayLike, given: Mapping[str, Temperature], start_ns: int
 ) -> Block:
-    """Make a block of arrays; a reading applies from the first sample at its time or later."""
+    """Make a block from arrays; a reading applies from the first sample of equal or later time."""
     stamps = _stamps('time_s', time_s)
     samples = _numbers('counts', counts)
     if samples.shape != (len(stamps), 3):

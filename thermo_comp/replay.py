@@ -205,7 +205,7 @@ def _messages_of(
                 for topic, pack in FLAGS.items():
                     packed = [pack(*flag, serial) for flag in new]
                     writer.write_raw(topic.name, topic.type, times, packed)
-            # The log time of a copied input message is its stamp, as that of an output message.
+            # Copied input messages, like output messages, get their stamps as log times.
             for role, messages in block.raw.items():
                 name = thermometer(role) if role in reader.fields else reader.topics[role]
                 kind = TEMPERATURE if role in reader.fields else reader.info.topics[name][0]
@@ -246,7 +246,7 @@ def _rows_of(table: AbstractContextManager[WriteRows]) -> Iterator[WriteBlock]:
 
 
 def _imu_of(block: Block, corrected: CompensatedBlock) -> ImuColumns | None:
-    """Return the Imu fields but the force; a rate with the covariance[0] -1 is not corrected."""
+    """Return all Imu fields but the force; an angular rate with covariance[0] -1 stays raw."""
     if block.imu is None:
         return None
     imu = block.imu.take(corrected.index)

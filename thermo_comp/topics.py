@@ -99,7 +99,7 @@ STAMPED = NodeTopic(
 )
 STATUS = NodeTopic('/diagnostics', DIAGNOSTICS, '1 Hz; hardware_id = serial of the unit', 10)
 
-SAMPLES = {'counts': COUNTS, 'imu': IMU_IN}  # sample topics by the parameter `input`
+SAMPLES = {'counts': COUNTS, 'imu': IMU_IN}  # sample topics by the value of the parameter `input`
 INPUTS = {**SAMPLES, 'board': BOARD, 'case': CASE}  # all input topics by their keys in `Topics`
 FLAGS: dict[NodeTopic, PackFlag] = {REGIME: _bool_flag, STAMPED: _stamped_flag}
 OUTPUTS = (IMU_OUT, *FLAGS)  # the topics that `replay` writes

@@ -31,7 +31,8 @@ _LOOKED_BACK = 200
 # Sd of a position's mean force due to hysteresis, mounting and drift, even in a long rest [g].
 _FLOOR_SD = 2e-5
 # A position is 'restless' if its noise is above `_RESTLESS` times the median of all positions.
-# A still interval after the known rests is a rest if its noise is below `_NOISIEST` times theirs.
+# A still interval after the known rests is a rest if its noise is below `_NOISIEST` times that of
+# these rests.
 _RESTLESS, _NOISIEST = 3.0, 10.0
 # Smallest backward step of the stamps that shows a restart of the driver [ns].
 _STEP_BACK_NS = 10**9
@@ -63,8 +64,8 @@ class Account:
     The last of the `positions` is unfinished. `worst_sd_g` is the sd of the corrected force in
     the attitude with the largest sd, `constants_sd` the sds of bias [g], scale and misalignment
     [rad]. `now` is the direction of the newest sample, NaN without samples. `next_up` is the
-    direction recommended for the next position; `next_deg` is its angle to `now` [deg]. The angle
-    of `farthest_up` to the nearest position, `farthest_deg`, is the largest of all directions.
+    direction recommended for the next position; `next_deg` is its angle to `now` [deg]. The
+    direction `farthest_up` has the largest angle to the nearest position, `farthest_deg` [deg].
     """
 
     positions: tuple[Position, ...]

@@ -137,8 +137,8 @@ def _print_conversion(out: Output, report: 'ConversionReport', output: Path) -> 
 
 def print_guess(out: Output, log: 'ForeignLog', printed: dict[str, str]) -> None:
     """
-    Print the guessed column map and the unused columns of a table. `printed`: table of each text
-    printed so far; a repeated map is replaced by the name of its first table.
+    Print the guessed column map and the unused columns of a table. `printed`: for each text
+    printed so far, its table; a repeated map is replaced by the name of the first such table.
     """
     from ..convert.column_map import column_map_text
     from ..convert.headings import map_lines

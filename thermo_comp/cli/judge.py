@@ -128,7 +128,7 @@ def _print_axes(out: Output, judged: 'Judgement') -> None:
 
 
 def _print_expectations(out: Output, judged: 'Judgement') -> None:
-    """Print the errors next to those on data left out of the fit, if the file states these."""
+    """If the file has errors on data left out of the fit, print these beside the found errors."""
     names = {'norm': '|f| - g', 'drift': 'drift of an axis'}
     parts = {names[key]: part for key, part in judged.expectations.items()}
     if any(isfinite(part.expected_rms) for part in parts.values()):
@@ -372,7 +372,7 @@ def _ageing(ageing: 'Ageing | None') -> dict[str, Any]:
 def _evaluate_rests(
     rests: list[Path], calibration: Path, judging: dict[str, Any], out: Output
 ) -> None:
-    """Print |f| - g over a rest log; exit with 1 if the unit is outside the limit."""
+    """Print |f| - g over a rest log; exit with 1 if the unit's error is above the limit."""
     from ..field.series import read_rests, series_of
     from ..field.watch import LIMIT, watch
     from ..unit.calibration_file import load_calibration

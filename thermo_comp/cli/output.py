@@ -56,7 +56,7 @@ class Output:
             if chosen:
                 by_note.setdefault(chosen, []).append(bag)
             if missing:
-                # Missing parts make the exit code 1, so they are printed with --quiet, too.
+                # Missing parts make the exit code 1, so they are printed even with --quiet.
                 _print(f'thermo_comp: {bag}: {missing}', sys.stderr)
                 self._has_missing_parts = True
         for chosen, names in by_note.items():
@@ -113,7 +113,7 @@ class Output:
 
     @contextmanager
     def progress(self, what: str, total: float | None = 1.0) -> Iterator[Callable[[float], None]]:
-        """Show a progress bar on a terminal; yield a function that takes the part done so far."""
+        """Show a progress bar on a terminal; yield a function that takes the amount done."""
         if self.quiet or not sys.stderr.isatty():
             yield lambda _done: None
             return

@@ -192,7 +192,7 @@ def _write(
     start_ns: int | None = None
     for run in runs:
         if start_ns is None:
-            # With two thermometers the samples begin at the later one's first reading.
+            # With two thermometers the samples begin once both thermometers have a reading.
             board_ns, case_ns = run.board_stamp_ns, run.case_stamp_ns
             start_ns = max(board_ns[0], case_ns[0]) if len(board_ns) and len(case_ns) else 0
         keep = run.accel_stamp_ns >= start_ns

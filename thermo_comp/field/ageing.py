@@ -41,12 +41,12 @@ _JUMPS = (50.0 * MICRO_G, 500.0 * MICRO_G, 5000.0 * MICRO_G)
 #: shock changes a scale times g less than a bias.
 _JUMP_SHARES = np.repeat([1.0, 0.1], 3)
 _LEAST_GAIN = 5.0  # smallest log Bayes factor of a change that is added (odds 150:1)
-_LEAST_LEAD = 3.0  # smallest log Bayes factor of a jump of gravity against other changes (20:1)
-_BENDS = (1.0 * MICRO_G, 10.0 * MICRO_G)  # prior sds tried for a change of slopes [m/s^2 per K]
-#: Random walk of the slopes of the bias curves [m/s^2 per K per root day]: after one year, its sd
-#: is the smallest of `_BENDS`.
+_LEAST_LEAD = 3.0  # smallest log Bayes factor of a gravity jump over other changes (odds 20:1)
+_BENDS = (1.0 * MICRO_G, 10.0 * MICRO_G)  # prior sds of a change of the bias slopes [m/s^2 per K]
+#: Sd of the random walk of the slopes of the bias curves [m/s^2 per K per root day]: after one
+#: year, the sd is the smallest of `_BENDS`.
 _SLOPE_WALK = _BENDS[0] / np.sqrt(365.25)
-_ROWS = 6  # largest number of rows (equations) per start of the node, in the solution
+_ROWS = 6  # largest number of rows (equations) per start of the node, in `solve`
 _SEARCH_ROWS = 3  # largest number of rows per start in the search for the variances
 _MOST_ROWS = 600  # largest number of rows in the search; computing time grows with their cube
 
@@ -89,7 +89,7 @@ class Change:
     may_be_gravity: bool = False
 
     def columns(self, rows: Rows) -> Floats:
-        """Return derivatives of `rows.y`: by levels (n, 6), gravity (n, 1) or slopes (n, 3)."""
+        """Return derivatives of `rows.y` by levels (n, 6), gravity (n, 1) or slopes (n, 3)."""
         if self.time is None:
             return rows.by_slope
         of_jump = rows.by_jump[:, 6:] if self.kind == 'gravity' else rows.by_jump[:, :6]
@@ -102,8 +102,9 @@ class Rows:
     Up to `_ROWS` equations per start of the node, in the order of starts: orthogonal combinations
     of the rests of a start, with all information of the rests about bias and scale.
 
-    y, `by_...`, lack: combinations of ``|f| - g`` [m/s^2] and of the fields of `RestSeries`
-    noise, scatter: variance of a row by noise; by scatter, relative to the variance for one rest
+    y, `by_...`, lack: combinations of ``|f| - g`` [m/s^2], its derivatives, `RestSeries.lack`
+    noise: variance of a row due to noise
+    scatter: variance of a row due to the scatter of rests / scatter variance of one rest
     rank: number of the row among the rows of its start, from 0
     above_reference: mean board temperature of a start's rests less the reference temperature [K]
     """
@@ -217,8 +218,9 @@ class Model:
             slope = [v**2 * float((inverse * P).sum() - alpha @ P @ alpha) for v, P in pairs]
             return float(value), np.array(slope) + shift / _LOG_SD
 
-        # The gradient of the evidence is almost 0 where a variance is small, so the search begins
-        # at two points: most of the steps between starts are due to turn-ons, or to random walks.
+        # The gradient of the evidence is almost 0 where a variance is small, so two searches
+        # begin with variances that assign the steps of |f| - g between starts of the node mainly
+        # to turn-on offsets, or mainly to random walks.
         steps = np.abs(np.diff(self.rows.y[self.rows.rank == 0]))
         step = max(float(np.median(steps)), centre.rest)
         bounds = middle - 5.0 * _LOG_SD, middle + 5.0 * _LOG_SD
@@ -241,7 +243,7 @@ class Model:
         return factor[0], np.asarray(cho_solve(factor, np.eye(len(self.rows.y))))
 
     def log_covariance(self, ageing: Ageing) -> Floats:
-        """Return the covariance of the log sds of `Ageing`, by Fisher information and prior."""
+        """Return the covariance of the log sds of `Ageing`, from Fisher information and prior."""
         inverse = self.inverse(ageing)
         pairs = zip(vars(ageing).values(), self.parts, strict=True)
         parts = [2.0 * sd**2 * inverse @ part for sd, part in pairs]
@@ -250,7 +252,7 @@ class Model:
 
 
 def usual(calibration: Calibration) -> Ageing:
-    """Return the prior medians of `Ageing` by the fit's residual sd or, without it, the noise."""
+    """Return the prior medians of `Ageing`, from the fit's residual sd or, if this is 0, noise."""
     residual = max(axis.residual_sd_m_s2 for axis in calibration.static.axes())
     turn_on = max(residual or max(calibration.noise_density_m_s2_sqrt_hz), _LEAST_TURN_ON)
     walk = _WALK_SHARE * turn_on

@@ -159,8 +159,8 @@ def counted_rests(content: bytes) -> int:
 
 def thinned(content: bytes) -> bytes:
     """
-    Keep the lines of node starts, and of the first, third, fifth ... rest after each; drop all
-    other lines. Checksums are not verified.
+    Keep the lines of node starts and, after each start, of the first, third, fifth ... rest; drop
+    all other lines. Checksums are not verified.
     """
     kept: list[bytes] = []
     n = 0

@@ -4,10 +4,11 @@
 Owns rests as measurements of the error of a calibration: ``|f| - g`` and its derivatives.
 
 A rest at an unknown attitude measures one number, |f|. Let x be the forces along the axes, f = M
-x, u = f / |f| and v = M^T u. A bias of axis i that is too large by d_bias [input units], and a
-scale too large by d_scale [of K_i], change |f| by ``-v_i (d_bias + K_i x_i d_scale) / scale_i``;
-scale_i: scale factor of axis i at the rest. To first order ``|f| - g`` is noise plus H times the
-errors of all parameters (true less calibrated); H: derivatives of |f| by these errors.
+x, u = f / |f| and v = M^T u. If the bias of axis i is too large by d_bias [input units], and
+the scale by the part d_scale of K_i, |f| changes by ``-v_i (d_bias + K_i x_i d_scale) / scale_i``;
+K_i, scale_i: scale factors at the reference temperature, and at the rest. To first order
+``|f| - g`` is noise plus H times the errors of all parameters (true less calibrated); H:
+derivatives of |f| by these errors.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ class RestSeries:
     gravity, residual: stated g; ``|f| - g``
     by_level: derivatives of |f| by the bias, and by the scale times g, of each axis, (n, 6)
     noise: variance of |f| due to noise of samples, errors of thermometers and of the regime
-    by_start: derivatives of |f| by unknown lag states at the start, scaled to unit variance
+    by_start: derivatives of |f| by the unknown lag states at the start, in units of their sds
     lack: sd of the lack of fit of each axis times `direction`
     claim: claimed sd of `residual`
     n_windows: number of windows averaged to a rest
@@ -289,7 +290,7 @@ def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
 
     The windows of a group belong to one start of the node and differ from the group's first window
     by less than 1e-3 in each component of the force's unit vector, and by less than 1 K on the
-    board. The mean of unit vectors at angles of up to a has a norm of 1 - a^2 / 2 or more.
+    board. The mean of unit vectors within an angle a of one vector has a norm >= 1 - a^2 / 2.
     """
     direction = force / np.sqrt((force**2).sum(axis=1, keepdims=True))
     group = np.zeros(len(start), dtype=np.int64)

@@ -44,7 +44,8 @@ class AxisChange:
 
     bias: change of the bias at the mean thermal state of the rests
     scale: relative change of the scale
-    curve: change of the bias at the 90 % quantile of temperature less that at the 10 % quantile
+    curve: change of the bias at the 90 % quantile of the rests' temperatures less the change of
+        the bias at the 10 % quantile
     reading: change of the specific force by bias and scale, at the mean force of the rests
     claimed_sd: sd of the specific force that the old calibration claims
     present_sd: sd of the specific force with the old calibration, aged until the last rest
@@ -184,7 +185,7 @@ def _with_update(
 
 def _derivatives(calibration: Calibration) -> tuple[Floats, Floats]:
     """
-    Return derivatives of the n parameters: by the bias and the scale times g of each axis, (n, 6),
+    Return derivatives of the n file parameters: by bias, and scale times g, of each axis, (n, 6),
     and by the slope over temperature of the bias of each axis [m/s^2 per K], (n, 3).
     """
     layout, reference_c = parameter_layout(calibration), calibration.reference_temperature_c
@@ -243,7 +244,7 @@ def _axis_changes(
 
 
 def _judged(series: RestSeries, model: Model, solution: Solution, determined: Bools) -> Judged:
-    """Score updates by earlier rests on the rests of each day or, below 5 days, of each start."""
+    """Score updates from earlier rests on the rests of a day or, below 5 days, of a node start."""
     over, labels = 'days', series.day
     if len(np.unique(labels)) < 5:
         over, labels = 'starts', series.start

@@ -155,7 +155,8 @@ def watch(series: RestSeries, calibration: Calibration, tolerance: float | None 
         outside_since = next((row.name for row in window if not row.is_within), window[-1].name)
         forecast = ()
     elif (recent > 1.0).any():
-        # A later row exists: a later week, or each of the last two days, is within the limit.
+        # `days` has a row after `until`: a later week, or each of the last two days, is within
+        # the limit.
         until = int(np.flatnonzero(recent > 1.0)[-1])
         inside_since = days[int(np.flatnonzero(is_row_out[: until + 1])[-1]) + 1].name
     periods = _rows(series, firsts, ordered[::together].tolist(), tolerance)
@@ -248,7 +249,7 @@ def passage(
     size, vectors = np.linalg.eigh(covariance + np.outer(mean, mean) + walk @ walk.T)
     onto = vectors[:, size > 1e-6 * size[-1]].T
     mean, covariance = onto @ mean, onto @ covariance @ onto.T
-    # By a square factor the random walk takes one normal variable per direction and step.
+    # With a square factor of its covariance the walk takes one normal variable per direction.
     walk = np.transpose(np.linalg.qr((onto @ walk).T, mode='r'))
     values, vectors = np.linalg.eigh(covariance)
     initial = vectors * np.sqrt(np.maximum(values, 0.0))

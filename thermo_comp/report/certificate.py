@@ -35,7 +35,7 @@ _MOST_TEMPERATURES = 8
 
 
 class Program(NamedTuple):
-    """A soak, or a ramp from a soak at one end of a regime's temperature range to the other."""
+    """A soak, or a ramp from a soak at one end of a regime's temperatures to the other end."""
 
     name: str  # soak, heating or cooling
     regime: RegimeSet
@@ -112,7 +112,7 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
         attitude = _rms(np.linalg.norm(by_element.T * calibration.misalignment_sd, axis=1))
         claimed = _rms(windows.claimed_sd)
         lack = _rms(windows.lack_sd)
-        # The claimed variance is the sum of these variances and of that of the other parameters.
+        # The claimed variance is the sum of `itemised` and the variance due to other parameters.
         itemised = noise**2 + attitude**2 + lack**2 + evidence.gravity_sd**2
         model = float(np.sqrt(max(claimed**2 - itemised, 0.0)))
     excess = float(np.sqrt(max(judgement.headline_rms**2 - claimed**2, 0.0)))

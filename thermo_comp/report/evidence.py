@@ -71,7 +71,7 @@ class Stretch(NamedTuple):
 
 @dataclass(frozen=True)
 class ShownBag:
-    """A bag, its regimes, and estimated derivatives, which are NaN until they have settled."""
+    """A bag, its regimes, and temperature derivatives, NaN until their estimates have settled."""
 
     index: int
     bag: ReducedBag
@@ -196,7 +196,7 @@ class Evidence:
 
     @cached_property
     def positions(self) -> tuple[Position, ...]:
-        """The still positions; attitudes by corrected or, without calibration, raw forces."""
+        """The still positions; attitudes from corrected or, without calibration, raw forces."""
         windows = self.windows
         if windows is None or not self.forces:
             return ()

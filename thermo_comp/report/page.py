@@ -91,7 +91,7 @@ def render_report(evidence: Evidence, info: CertificateInfo | None = None) -> st
 
 
 def position_error(bias: float, time: float) -> float:
-    """Return the position error [m] of a constant horizontal error [m/s^2] after a time [s]."""
+    """Return the position error [m] due to a constant horizontal bias [m/s^2] after a time [s]."""
     return 0.5 * bias * time * time
 
 

@@ -138,7 +138,7 @@ def read_temperature(data: bytes) -> tuple[int, float] | None:
 
 
 def _values_at(data: bytes, size: int) -> int:
-    """Return the offset of the last `size` bytes, the numbers; 0 if it is not plain CDR."""
+    """Return the offset of the last `size` bytes, the numbers; 0 if `data` is not plain CDR."""
     if not 16 < len(data) <= _LONGEST_MESSAGE or data[:4] != _ENCAPSULATION:
         return 0
     length = int.from_bytes(data[12:16], 'little')

@@ -31,11 +31,11 @@ from .reader import LoadedCalibration
 from .relay import Relay
 from .waitloop import WaitLoop
 
-# Time without samples after which readings are used [s]; Fast DDS may deliver samples 3 s late.
+# After this time without samples [s] readings are used alone; Fast DDS may deliver 3 s late.
 IDLE_S = 5.0
-#: Stamps of readings that are ahead of those of samples by more than this show another clock [s].
+#: Readings with stamps ahead of the samples' stamps by more than this time [s] have another clock.
 AHEAD_S = 5.0
-#: The samples have stopped if none has arrived for this number of conversion cycles and time [s].
+#: Samples have stopped if none arrives for the longer of these conversion cycles and time [s].
 SILENT_CYCLES, SILENT_S = 5.0, 0.5
 #: Time for which the level must stay lower until the lower level is logged [s], so that a fault
 #: that comes and goes does not fill the log.
@@ -150,7 +150,7 @@ class Reporter:
                 log.error(message.message)
 
     def _force_excess(self) -> float:
-        """Return the excess of the last |f| over 1.01 g and the largest |f| of the fit [m/s^2]."""
+        """Return how far the last |f| exceeds the fit's largest |f|, 1.01 g if unknown [m/s^2]."""
         last = self._relay.running.converter.last_result
         if last is None:
             return 0.0

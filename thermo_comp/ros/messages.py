@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns rclpy's message classes and QoS profiles by name, and numbers read from any message.
+Owns rclpy's message classes and QoS profiles by name, and the reading of numbers from messages.
 
 A temperature may be a number in a message of any type. The class of a message is imported at run
 time, because this package does not depend on the packages of drivers' messages.

@@ -5,7 +5,7 @@ Owns the player: publishes a bag on the node's input topics, with `/clock`, at a
 time or as fast as the subscribers acknowledge messages.
 
 Topics have the relative names of the node's inputs. Messages keep the bag's order and their bytes;
-ROS 1 messages are rewritten in CDR, temperature readings of other types as
+ROS 1 messages are rewritten in CDR, temperatures in messages of any type as
 sensor_msgs/Temperature. After `WINDOW` messages of a topic the player waits until every reliable
 subscriber has acknowledged them. Fast DDS requests acknowledgements every 3 s, but with every
 message while a history is full; therefore the histories are small, and transient-local durability
@@ -116,7 +116,7 @@ class Player:
     def run(
         self, progress: Callable[[float], None], throttle: Callable[[int], object] = lambda _: None
     ) -> PlayReport:
-        """Send the bag; call `throttle` with the number of samples sent after each window."""
+        """Send the bag; after each window call `throttle` with the number of samples sent."""
         reader, n_sent = self._reader, dict.fromkeys(self._publishers, 0)
         total = sum(reader.info.topics[name][1] for name in reader.topics.values())
         topics = {publisher.topic_name: role for role, publisher in self._publishers.items()}
@@ -177,7 +177,7 @@ class Player:
 
 
 def _in_order(block: Block) -> list[tuple[float, int, Role, bytes]]:
-    """List a block's messages in the bag's order, each as place, log time, role and bytes."""
+    """List a block's messages in the bag's order: place among samples, log time, role, bytes."""
     rows: list[tuple[float, int, Role, bytes]] = []
     places: dict[Role, Any] = {role: part.after - 0.5 for role, part in block.temperatures.items()}
     places['accel'] = np.arange(len(block))

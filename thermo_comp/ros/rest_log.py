@@ -25,7 +25,7 @@ from ..online.compensator import Compensator
 from ..typing import Floats, Stamps
 from .reader import LoadedCalibration
 
-#: Number of messages that the rest log sums at a time; fewer if a report is due earlier.
+#: Number of waiting messages at which the rest log sums them; it also sums every second.
 BLOCK = 1024
 #: Largest size of the file of a day, and of the folder [bytes]; a month takes at most 10 MB.
 DAY_BYTES, FOLDER_BYTES = 320_000, 64_000_000
@@ -65,7 +65,7 @@ class RestLog:
         self._thread.start()
 
     def put(self, stamp_ns: int, start: bytes, rest: bytes) -> None:
-        """Queue a rest's line, and the line of the node's `start`, written first where needed."""
+        """Queue a rest's line; where needed, the line of the node's `start` is written first."""
         day = np.datetime64(stamp_ns, 'ns').astype('datetime64[D]')
         try:
             self._lines.put_nowait((str(day), start, rest))
@@ -204,7 +204,7 @@ class RestKeeper:
 
 
 def samples_of(messages: Sequence[bytes], *, is_imu: bool) -> tuple[Stamps, Floats]:
-    """Read stamps [ns] and samples of little-endian messages with the length of the last one."""
+    """Read stamps [ns] and samples of the little-endian messages that are as long as the last."""
     size = len(messages[-1]) if messages else 0
     # A message shorter than one with an empty frame_id is malformed.
     if size < _SHORTEST[is_imu]:

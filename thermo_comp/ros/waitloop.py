@@ -251,7 +251,7 @@ class WaitLoop:
                     continue
                 now = now_ns()
                 if now >= self._call_ns:
-                    # Periodic calls that were missed are not repeated.
+                    # Periodic calls that were missed are not made later.
                     late_ns = (now - self._call_ns) % self._period_ns
                     self._call_ns = now - late_ns + self._period_ns
                     self._guarded(self._callback)
