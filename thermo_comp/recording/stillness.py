@@ -136,9 +136,12 @@ class CellAccumulator:
             self._n_looked_at += int((part[1:] != part[:-1]).any(axis=1).sum()) + 1
         self._is_integer = self._is_integer and bool((samples == np.rint(samples)).all())
         glitches = is_glitch(samples, self._quantum)
-        self._n_glitches += int(glitches.sum())
-        rate = None if rate is None else rate[use][~glitches]
-        self._accumulate(stamp_ns[~glitches], samples[~glitches], rate)
+        rate = None if rate is None else rate[use]
+        if glitches.any():
+            self._n_glitches += int(glitches.sum())
+            stamp_ns, samples = stamp_ns[~glitches], samples[~glitches]
+            rate = None if rate is None else rate[~glitches]
+        self._accumulate(stamp_ns, samples, rate)
 
     def forget(self, stamp_ns: int) -> None:
         """Drop the cells before a stamp [ns]."""
