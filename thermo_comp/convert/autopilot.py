@@ -200,7 +200,7 @@ def _vectors(columns: _Columns, names: Sequence[str]) -> Floats:
 
 
 def _matched(stamp_ns: Ints, columns: _Columns | None) -> Floats | None:
-    """Interpolate rates to n stamps; None if any is not finite or there are fewer than n / 2."""
+    """Interpolate angular rates to n stamps; None if fewer than n / 2 or not all are finite."""
     if columns is None:
         return None
     gyro_ns, gyro = _stamps(columns), _vectors(columns, _AXES)
@@ -310,7 +310,7 @@ def _instance(present: Mapping[int, T], wanted: int | None, what: str) -> T:
 
 
 def _valid_readings(readings: Readings) -> Readings:
-    """Drop invalid readings; drop all readings of a sensor without a thermometer: all are 0."""
+    """Drop invalid readings, and all readings if all are 0: the sensor has no thermometer."""
     use = np.isfinite(readings.celsius) & (readings.stamp_ns != NO_STAMP)
     use &= bool(readings.celsius[use].any())
     return readings.take(use)

@@ -6,7 +6,7 @@ Owns the reading of bags of ROS 1 and 2 whose topics or units differ from those 
 Drivers choose their topic names, and some do not publish m/s^2. A topic that the caller does not
 name is found by its message type. The board's temperature topic is the one that shares the most
 leading namespaces with the Imu topic. The case's temperature topic shares more namespaces with a
-barometer's topic than with the Imu topic, or is the only other temperature topic.
+barometer's topic than with the Imu topic, or is the only temperature topic besides the board's.
 """
 
 from pathlib import Path, PurePosixPath

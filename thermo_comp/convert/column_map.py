@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns column maps of tables: the content and unit of each column, and the message of its values.
+Owns column maps of tables: content and unit of each column, and the message type to write.
 
 A map is a small YAML file; config/columns/ has examples. Without a map the columns are recognised
 by their headings (see `headings`). A table without headings must have the columns ``[t] ax ay az
@@ -32,7 +32,7 @@ from .table import STAMP_EXPONENTS, Format, Stamp, Table, TimeUnit, read_parquet
 #: Slope and offset that convert a temperature of each unit to degC.
 _CELSIUS = {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}
 _STEPS_S = (5e-5, 0.5)  # range of plausible intervals between samples [s]
-_SLOW_S = 2.0  # longest plausible interval [s] if intervals in ms make a turn too fast for a hand
+_SLOW_S = 2.0  # longest plausible interval [s] if the unit turns within a block of samples
 _BLOCK, _QUIET = 12, 0.02  # number of samples of a block; largest sd of a still block [g]
 _TURN = 0.5  # smallest turn within a block that a hand cannot make if intervals are in ms [rad]
 _FASTEST_RAD_S = 20.0  # largest angular rate of a unit that is turned by hand [rad/s]
@@ -56,7 +56,7 @@ class Accel:
     unit: Unit
     output: Literal['counts', 'imu']  # message to write; Imu is in m/s^2
     counts_per_g: Positive | None = None
-    clip: tuple[float, float] | None = None  # lowest and highest reading: the sensor is saturated
+    clip: tuple[float, float] | None = None  # lowest and highest reading, at saturation
     offset: float = 0.0  # reading at zero force, which is subtracted, such as 32768
 
     def __post_init__(self) -> None:

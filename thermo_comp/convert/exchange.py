@@ -42,8 +42,8 @@ def export_calibration(
     up: tuple[float, float, float] | None = None,
 ) -> Content:
     """
-    Write the constants and the static curves in the format of one of `TOOLS`; the result has the
-    file's `text`, and `notes` on the parts of the calibration that the file cannot hold.
+    Write a calibration's constants and static curves in the format of one of `TOOLS`; the result
+    has the file's `text`, and `notes` on the parts of the calibration that the file cannot hold.
     `number` is the number of the parameter set or IMU, if the file numbers them; PX4 matches the
     sensor by `device_id`. With `up`, the unit vector of the specific force at rest, the scale
     error times gravity in this attitude is added to the offset of an autopilot.

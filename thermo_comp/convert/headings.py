@@ -129,7 +129,7 @@ def _thermometers(
         name = 'case' if result and (heading in outside or heading in named) else 'board'
         if name not in result:
             result[name] = heading, units[heading]
-        elif heading in named:  # a place is used only if its thermometer has no other column
+        elif heading in named:  # a heading like `imu` names no further thermometer
             result[f't{len(result)}'] = heading, units[heading]
     return result
 
@@ -174,7 +174,7 @@ def _stated(heading: str, units: dict[str, str]) -> str:
 
 
 def _triads(names: dict[str, str]) -> Iterator[tuple[str, tuple[str, str, str]]]:
-    """Find triads of headings that differ only in x, y, z; yield common part and headings."""
+    """Yield, of three headings that differ only in x, y, z, the common part and the headings."""
     for name in reversed(names):
         for at in (match.start() for match in re.finditer('x', name)):
             three = [f'{name[:at]}{axis}{name[at + 1 :]}' for axis in 'xyz']

@@ -33,12 +33,12 @@ from ..unit.gravity import STANDARD_GRAVITY
 
 Unit = Literal['m/s^2', 'g', 'mg', 'counts']
 
-PER_G: dict[Unit, float] = {'g': 1.0, 'm/s^2': STANDARD_GRAVITY, 'mg': 1000.0}  # |a| at rest
-_TOLERANCE = 0.2  # relative tolerance of |a|: above the errors of cheap sensors in a chamber
+PER_G: dict[Unit, float] = {'g': 1.0, 'm/s^2': STANDARD_GRAVITY, 'mg': 1000.0}  # |sample| at rest
+_TOLERANCE = 0.2  # relative tolerance of |sample| at rest: above the errors of cheap sensors
 _SENSITIVITIES = (2048, 4096, 8192, 16384)  # 16-bit sensors of +-16 g to +-2 g [counts/g]
 
 _CELL_S, _MIN_SAMPLES = 0.5, 12  # length of a cell of samples [s], least number of samples in it
-_MOVING_RATIO = 4.0  # largest sd of a still cell / lower quartile of all sds; by noise below 2
+_MOVING_RATIO = 4.0  # largest sd of a still cell / lower quartile of sds; below 2 from noise alone
 _MERGE_NS = 10 * 10**9  # shortest rest between two separate movements [ns]
 
 NO_STAMP = np.iinfo(np.int64).min  # stands for the stamp of a row without a stamp
@@ -86,7 +86,7 @@ class ForeignLog:
 class Stillness:
     """Rests and movements of a log; `magnitude`, `noise`: in the log's unit, NaN if unknown."""
 
-    magnitude: float  # median |a| of the quiet cells
+    magnitude: float  # median norm of the mean samples of the quiet cells
     noise: float  # median sd per axis of the quiet cells
     still_s: float  # total time of the quiet cells
     moving_ns: tuple[tuple[int, int], ...]  # stamps of begin and end of each movement
@@ -110,7 +110,7 @@ class ConversionReport:
     rate_hz: float
     duration_s: float
     findings: dict[str, Finding]
-    inferred_unit: str  # the unit that follows from the readings at rest, and the reason
+    inferred_unit: str  # unit that follows from the samples at rest, and the reason
     stillness: Stillness
 
 
@@ -305,7 +305,7 @@ def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:
 
 
 def infer_unit(magnitude: float) -> tuple[Unit | Literal['unknown'], str]:
-    """Return the unit of samples (or ``unknown``) that follows from |a| at rest, and why."""
+    """Return the unit (or ``unknown``) that follows from the norm of samples at rest, and why."""
     if not np.isfinite(magnitude):
         return 'unknown', 'the sensor never rests, so |a| at rest cannot identify g or m/s^2'
     reading = f'|a| at rest is {magnitude:.4g}'
@@ -321,7 +321,7 @@ def infer_unit(magnitude: float) -> tuple[Unit | Literal['unknown'], str]:
 
 
 def contradiction(stated: str, magnitude: float, counts_per_g: float | None) -> str | None:
-    """Return why a stated unit is false, given |a| at rest; None if it can be true."""
+    """Return why samples with the norm `magnitude` at rest exclude a stated unit; None if not."""
     if not np.isfinite(magnitude):
         return None
     inferred, reason = infer_unit(magnitude)

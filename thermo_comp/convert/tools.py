@@ -41,7 +41,7 @@ _THERMAL_NOTE = (
 )
 _NAME = re.compile(r'\b(TC_[AG]\d_\w+|TC_[AG]_ENABLE|INS_TCAL\d_\w+|INS_(?:ACC|GYR)\d_CALTEMP)\b')
 _NUMBER = re.compile(r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?')
-#: Reference temperature and range [degC] for imu_tk, imu_calib and Kalibr, whose files have none.
+#: Reference temperature and range [degC] for files of imu_tk, imu_calib, Kalibr, which lack both.
 _REFERENCE_C, _RANGE_C = 20.0, (-60.0, 120.0)
 _TRIAD_NOTE = 'imported: constants of one temperature, used at all temperatures; no uncertainty'
 _HEADING = re.compile(r'\s*(#|Misalignment Matrix|Scale Matrix|Bias Vector)')

@@ -25,7 +25,7 @@ _MAD_EFFICIENCY = 0.37
 # The data determine a unit's value if its sd by the fit is at most this multiple of the spread
 # over the units; a value of larger sd is about the prior mean of the fit.
 _LARGEST_SD = 5.0
-# Residuals [ug] and noises [ug/sqrt(Hz)] are raised to this limit before taking logarithms.
+# Residuals [ug] and noises [ug/sqrt(Hz)] below this limit are raised to it before logarithms.
 _LEAST = 1e-12
 #: Columns of the table in which units are compared.
 QUANTITIES = tuple(column for column in COLUMNS if column.label)
@@ -90,7 +90,7 @@ class Retest:
 
 @dataclass(frozen=True)
 class Summary:
-    """Statistics of a fleet: units by verdict; outliers and drifts, the largest |z| first."""
+    """Number of units by verdict; outliers and drifts, the largest deviation in sd first."""
 
     verdicts: dict[str, int]
     spreads: tuple[Spread, ...]
@@ -152,7 +152,7 @@ def spread_of(quantity: TableColumn, rows: Sequence[Row]) -> Spread | None:
 def _determined(quantity: TableColumn, values: Floats, own_sd: Floats) -> Bools:
     """
     Choose the units whose data determine a quantity: units are added in the order of their sd by
-    the fit, until the sd of a unit exceeds five times the spread of the units up to this one.
+    the fit, until a unit's sd exceeds five times the spread of this and all units added before.
     """
     order = np.argsort(own_sd, kind='stable')
     n = len(values)

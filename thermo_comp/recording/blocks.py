@@ -33,8 +33,8 @@ _JUMP_NS = 10**9  # a backward step of the stamps by more than this is a jump of
 LONGEST_PAUSE_NS = 3600 * 10**9  # longer jumps of the stamps are shortened to this length [ns]
 _MOST_JUMPS = 100  # a recording with more jumps of the stamps by over an hour is refused
 _FEWEST_STAMPS = 10  # smallest number of stamps for a warning about their clock
-_APART_S = 10.0  # largest median distance of readings from samples of the same clock [s]
-_REPEAT_NS = 10 * 10**9  # `Readings.thinned` keeps an equal reading after this time [ns]
+_APART_S = 10.0  # largest median time between readings and adjacent samples of one clock [s]
+_REPEAT_NS = 10 * 10**9  # `Readings.thinned` keeps a repeated reading after this time [ns]
 _LONG_NS = 10 * 86400 * 10**9  # shortest duration of a long recording [ns]
 _SPARSEST_NS = 10 * 10**9  # largest mean interval of messages in a long recording [ns]
 
@@ -73,7 +73,7 @@ class RecordingInfo:
     start_ns: int  # first log time, 0 without messages
     end_ns: int  # last log time, 0 without messages
     truncated: str | None = None  # description of missing parts
-    metadata: Mapping[str, str] = field(default_factory=dict)  # pairs stored in the bag
+    metadata: Mapping[str, str] = field(default_factory=dict)  # keys and values stored in the bag
     input: Literal['counts', 'imu'] | None = None  # input whose topic has the samples
     chosen: str | None = None  # notes on topics selected by their type, and on stamps
 
@@ -87,7 +87,7 @@ class ImuColumns(NamedTuple):
     """Fields of sensor_msgs/Imu; a writer repeats an array of one row for all messages."""
 
     orientation: Floats  # quaternion x, y, z, w, shape (n, 4)
-    orientation_covariance: Floats  # like the other covariances of shape (n, 9)
+    orientation_covariance: Floats  # shape (n, 9), as of the other covariances
     angular_velocity: Floats  # [rad/s], shape (n, 3)
     angular_velocity_covariance: Floats
     linear_acceleration_covariance: Floats
@@ -139,7 +139,7 @@ class Block:
     accel_stamp_ns: Ints
     accel: Floats  # counts per conversion cycle, or m/s^2 of sensor_msgs/Imu, shape (n, 3)
     frame_id: str
-    imu: ImuColumns | None  # the other fields of sensor_msgs/Imu
+    imu: ImuColumns | None  # fields of sensor_msgs/Imu besides the acceleration
     temperatures: Mapping[str, Readings]  # by thermometer
     log_ns: Mapping[Role, Ints]
     raw: Mapping[Role, Messages] = field(default_factory=dict)  # serialized, if requested
@@ -226,8 +226,8 @@ def joined(blocks: Sequence[Block]) -> Block:
 def with_stamps(block: Block, last_ns: int) -> tuple[Block, int]:
     """
     Give each reading without a stamp the newest stamp of the samples before it, because its log
-    time depends on the speed of a playback; drop such readings before the first sample. `last_ns`:
-    newest stamp before the block. Return the block and the newest stamp at the block's end.
+    time depends on the speed of a playback; drop readings without a stamp before the first sample.
+    `last_ns`: newest sample stamp before the block. Return the block and the newest at its end.
     """
     samples = np.concatenate(([last_ns], block.accel_stamp_ns))
     jumps = np.flatnonzero(np.diff(samples) < -_JUMP_NS) + 1
@@ -255,7 +255,7 @@ def unstamped(stamp_ns: int) -> str:
 
 
 def clocks_apart(block: Block) -> str:
-    """Return a warning if all stamps are equal, or if readings have another clock; else ''."""
+    """Return a warning for equal stamps or for readings on another clock than samples; else ''."""
     stamps = block.accel_stamp_ns
     if len(stamps) >= _FEWEST_STAMPS and (stamps == stamps[0]).all():
         return unstamped(int(stamps[0]))

@@ -35,7 +35,7 @@ _CHUNK_HEAD = struct.Struct('<BQQQQII')
 _INDEX_HEAD = struct.Struct('<BQHI')
 _INDEX_ROW_BYTES = 16  # log time and offset of one message, 8 bytes each
 MESSAGE_HEAD_BYTES = 31  # number of bytes before the serialized message in a record
-_MESSAGE_FIELDS_BYTES = MESSAGE_HEAD_BYTES - PREFIX.size  # number of these bytes after `PREFIX`
+_MESSAGE_FIELDS_BYTES = MESSAGE_HEAD_BYTES - PREFIX.size  # bytes from `PREFIX` to the message
 MESSAGE = int(Opcode.MESSAGE)
 
 #: Reasons why `scan_records` stopped before the end of the data.

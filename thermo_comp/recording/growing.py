@@ -90,8 +90,8 @@ def leftovers(folder: Path) -> dict[Path, int]:
 
 def finish(path: Path, number: int) -> Path | None:
     """
-    Copy an unfinished bag to the bag `number`, or if it exists, to the largest number plus 1;
-    delete the unfinished bag. Return None if it has no messages; RecordingError if unreadable.
+    Copy an unfinished bag to the bag `number` or, if that bag exists, to the largest number + 1;
+    delete the unfinished bag. Return None if no message was copied; RecordingError if unreadable.
     """
     with open_recording(path, require=()) as reader:
         numbers = {int(bag.stem) for bag in numbered_bags(path.parent)}

@@ -51,7 +51,7 @@ _INDEX_ROW = np.dtype([('log', '<u8'), ('offset', '<u8')])
 
 @lru_cache(maxsize=64)
 def known_definition(kind: str) -> tuple[str, str, str]:
-    """Return encoding, full text and hash (RIHS01) of a type of Jazzy, else RecordingError."""
+    """Return a message type's encoding, text and RIHS01 hash; RecordingError if Jazzy lacks it."""
     store = typestore()
     if kind not in store.fielddefs:
         raise RecordingError(f'the definition of message type {kind} is not known')

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 _SDS = 25.0  # smallest distance of a glitch from the mean of its neighbours, in sd of the noise
 # Smallest distance of a glitch from the mean of its neighbours, divided by the samples' norm. A
-# change by one count, as by the remainder that a converter carries over, is no glitch.
+# change by one count, from the remainder that a converter adds to its next cycle, is no glitch.
 _LEAST = 0.02
 _FEWEST = 30  # smallest number of samples that determines the noise, to search for glitches
 _TENTH, _NEVER = -1.2816, 6.7  # standard normal quantiles of the probabilities 0.1 and 1 - 1e-11

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the survey of a recording before a fit: duration, rates, temperatures, rests and gaps, and
-messages on samples that an accelerometer at rest does not send.
+warnings about samples that an accelerometer at rest does not send.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -28,9 +28,9 @@ _RAMP_WINDOW_S = 120.0  # time over which the rate of a ramp is averaged [s]
 _CELL_S, _MIN_REST_S = 0.5, 3.0  # lengths of a cell and of the shortest still interval [s]
 _GAP_INTERVALS = 5.0  # shortest gap between samples / median interval in the first block
 _GLITCH_SHARE = 0.01  # largest share of samples of exactly 0 that is taken for glitches
-_FAULT_SHARE = 0.5  # largest share of messages marked as without acceleration
-_WITH_GRAVITY = (0.8, 1.25)  # range of |a| / gravity at rest if a contains gravity
-_WITHOUT_GRAVITY = 0.3  # largest |a| / gravity at rest if gravity is subtracted
+_FAULT_SHARE = 0.5  # a larger share of messages marked as without acceleration is a fault
+_WITH_GRAVITY = (0.8, 1.25)  # range of |sample| / gravity at rest if samples contain gravity
+_WITHOUT_GRAVITY = 0.3  # largest |sample| / gravity at rest if gravity is subtracted
 _NO_SAMPLES = (
     'no accelerometer samples: record accel/counts or imu/uncompensated, or name another topic '
     'with --topic counts=TOPIC or --topic imu=TOPIC'
@@ -59,9 +59,9 @@ class Survey:
     duration_s: float
     rate_hz: float  # inverse of the median interval between samples of the first block
     n_still: int  # number of still intervals of 3 s or more
-    still_s: float  # sum of the lengths of these intervals
+    still_s: float  # sum of the lengths of the still intervals [s]
     thermometers: Mapping[str, ThermometerSurvey]
-    findings: list[str]  # problems of the recording, and what a fit lacks
+    findings: list[str]  # problems of the recording, and data that a fit lacks
 
 
 def thermal_findings(
@@ -103,7 +103,7 @@ def thermal_findings(
 
 
 def unused_thermometers(reader: RecordingReader) -> list[str]:
-    """List unused topics that may hold a temperature, as of a barometer or another IMU."""
+    """List unused topics that may hold a temperature, such as that of a barometer."""
     candidates = []
     paths = {role: field.path for role, field in reader.fields.items()}
     used = {(name, paths.get(role)) for role, name in reader.topics.items()}
@@ -127,7 +127,7 @@ def survey_recording(
         topic = reader.topics.get('accel')
         total = reader.info.topics[topic][1] if topic else 0
         accumulator, causes = CellAccumulator(_CELL_S, None), CauseCounter()
-        readings: dict[str, list[Readings]] = {}  # all in memory: far fewer than the samples
+        readings: dict[str, list[Readings]] = {}  # kept in memory: far fewer than the samples
         clock = _Clock()
         for block in reader.blocks():
             for name, temperature in block.temperatures.items():
@@ -171,7 +171,7 @@ class _Clock:
     last_ns: int = 0
     newest_ns: int = 0  # newest stamp since the last restart of the clock
     step_ns: float = 0.0  # median interval of the first stamps that rise
-    n_backwards: int = 0  # number of stamps not later than the newest stamp before
+    n_backwards: int = 0  # number of stamps not later than an earlier stamp since a restart
     n_restarts: int = 0  # number of steps back by more than `LONGEST_PAUSE_NS`
     n_gaps: int = 0
     longest_gap_s: float = 0.0
@@ -185,7 +185,7 @@ class _Clock:
         self.n, self.last_ns = self.n + len(stamp_ns), int(stamp_ns[-1])
         self.earliest_ns = min(self.earliest_ns, int(stamp_ns.min()))
         self.latest_ns = max(self.latest_ns, int(stamp_ns.max()))
-        # After a backward step by an hour or less, samples up to the newest stamp are left out.
+        # After a step back by an hour or less, samples not later than earlier ones are left out.
         restarts = np.flatnonzero(steps < -LONGEST_PAUSE_NS)
         self.n_restarts += len(restarts)
         for number, part in enumerate(np.split(later, restarts)):
@@ -281,7 +281,7 @@ class CauseCounter:
         return self._unit_of(cells, still_sd) if self._is_imu else ''
 
     def _unit_of(self, cells: Cells, still_sd: float) -> str:
-        """Name the fault if |a| at rest is near 1 (g), 1000 (mg) or 0 (no gravity); '' if not."""
+        """Name the fault if |sample| at rest is near 1 (g), 1000 (mg), 0 (no gravity); else ''."""
         scatter = cells.variance.max(axis=1, initial=0.0)
         quiet = (cells.count > 1) & (scatter <= np.quantile(scatter, 0.5) if len(scatter) else 0)
         if not quiet.any():

@@ -81,8 +81,8 @@ class RecordingReader(ExitStack):
                 raise RecordingError(f'cannot be opened: {error.strerror}', path) from error
             raise
         self._part = topics.part
-        self.since_s = 0.0  # time from the first sample of the bag to that of the part read [s]
-        self.apart = ''  # warning about stamps that are all equal, or of a second clock
+        self.since_s = 0.0  # time from the bag's first sample to the first sample read [s]
+        self.apart = ''  # warning of `clocks_apart`: equal stamps, or two clocks
 
     def _fields(self, selected: Selected) -> Iterator[tuple[Role, Field]]:
         for role, path in selected.fields.items():
@@ -159,7 +159,7 @@ class RecordingReader(ExitStack):
         self.info = info
 
     def raw(self, topics: Collection[str]) -> Iterator[tuple[Topic, Messages]]:
-        """Read serialized messages of topics (the bag's names) in batches, each split by topic."""
+        """Read serialized messages of topics, named as in the bag, in batches of one topic."""
         for _, channels, messages in self._read(topics, {'cdr'}):
             for number, topic in channels.items():
                 if len(batch := messages.of_channels([number])):

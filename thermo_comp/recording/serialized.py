@@ -95,7 +95,7 @@ class Messages:
         return self.take(np.argsort(self.log_ns, kind='stable'))
 
     def packed(self, room: int = 0) -> Messages:
-        """Copy the messages, so that `data` can be freed; leave `room` bytes before each."""
+        """Copy the messages so that `data` can be freed; leave `room` bytes before each copy."""
         ends = np.cumsum(self.size + room)
         data = np.empty(int(ends[-1]) if len(ends) else 0, np.uint8)
         for each in np.unique(self.size[self.size > 0]).tolist():

@@ -5,8 +5,8 @@ Owns still intervals: sums samples in short cells (count, mean, variance) and fi
 
 Two tests are relative to the noise of the bag's quiet cells: the variance inside a cell
 (vibration, handling) and the step of the mean between adjacent cells (a turn, a knock). A step
-starts a new interval, because a tilt by a microradian changes a sample by a micro-g. A change of
-temperature tilts a unit at rest, too: if the mean changes steadily by at most 50 micro-g/s over
+starts a new interval, because a tilt by a microradian changes a sample by a micro-g. A unit at
+rest may tilt as its temperature changes: if the mean changes steadily by at most 50 micro-g/s over
 several cells, this is a drift and not a step. Two tests have absolute limits, because even a
 flight has quiet cells: at rest the sd of samples is at most `still_sd`, and the angular rate is
 within 1 deg/s of its median.
@@ -27,14 +27,14 @@ VARIANCE_RATIO = 4.0
 #: Largest sd of samples at rest [g]: above the noise of any sensor, below that of most flights.
 STILL_SD = 0.05
 _STILL_RATE_SD = np.radians(2.0)  # largest sd of the angular rate in a cell at rest [rad/s]
-_STILL_RATE = np.radians(1.0)  # largest distance of a cell's mean rate from the bias [rad/s]
+_STILL_RATE = np.radians(1.0)  # largest mean angular rate of a cell less its bias [rad/s]
 _LEVEL_S = 120.0  # the bias of the angular rate is interpolated between medians over this time [s]
 _ROTATION_S = 10.0  # `without_rotation` subtracts the median angular rate over this time [s]
 _STEP_SDS = 8.0  # smallest step between adjacent cells that ends a rest, in robust sd of steps
-_DRIFT_STEPS, _DRIFT = 9, 5e-5  # number of steps whose median is the drift; its limit [g/s]
+_DRIFT_STEPS, _DRIFT = 9, 5e-5  # number of steps whose median is the drift; largest drift [g/s]
 _QUANTUM_SAMPLES = 20000  # number of samples that are searched for a quantum
-_STEPS_NEEDED = 10  # smallest number of changes that show a quantum by being its whole multiples
-STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # whole cells fill one of these numbers of windows
+_STEPS_NEEDED = 10  # smallest number of changes that prove a quantum if each is a multiple of it
+STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # one of these numbers of windows has a whole number of cells
 _LONGEST_CELL_NS = 86400e9  # largest length of a cell, reached only with wrong stamps [ns]
 MIN_SAMPLES = 30  # usual smallest number of samples in a cell
 _LARGEST = 1e100  # largest valid sample: squares of larger samples may overflow
@@ -76,7 +76,7 @@ class Cells:
 class CellAccumulator:
     """
     Reduces streamed samples to cells of `cell_s`, or of `least` samples if these last longer.
-    Whole cells fill a window of `window_s` or, if a cell is longer than a window, 2 to 60 windows.
+    A whole number of cells fills `window_s` or, if a cell is longer, 2 to 60 times `window_s`.
     Samples of `full_scale` or more are saturated and dropped.
     """
 
@@ -238,7 +238,7 @@ def widened(full_scale: float, samples: Floats) -> float:
 
 
 def _part_of(window_s: float, least_ns: float) -> float:
-    """Raise a cell length [ns] to one that divides 1 to 60 windows; a longer cell is kept."""
+    """Raise a cell length [ns] so that whole cells fill 1 to 60 windows; keep a longer length."""
     for stretch in STRETCHES:
         n_cells = int(stretch * window_s * 1e9 / least_ns * (1.0 + 1e-6))
         if n_cells:

@@ -285,7 +285,7 @@ def _text_of_unnamed(present: Present, board: str, taken: Collection[str]) -> st
 def _further(
     present: Present, topics: Topics, topics_of: Mapping[Role, str], *, is_read: bool
 ) -> dict[str, str]:
-    """Find `topics.further`, and further thermometers in the namespace of board or case."""
+    """Find the thermometers in `topics.further`, and those in the namespace of board or case."""
     further = {}
     for sensor, wanted in topics.further.items():
         name = _match(present, wanted, thermometer(sensor))

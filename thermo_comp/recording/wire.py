@@ -145,7 +145,7 @@ def encode_stamped(
     """
     Serialize (CDR, little-endian) a header and float64 numbers as rows of bytes, shape (n, size).
     A piece has the indices of its numbers in a message, and their values, of shape (n, width), or
-    (width,) if equal in all messages; other numbers are 0.
+    (width,) if equal in all messages; numbers that are in no piece are 0.
     """
     text = frame_id.encode() + b'\0'
     head = pack('<BBHiII', 0, 1, 0, 0, 0, len(text)) + text

@@ -4,7 +4,7 @@
 Owns the writing of columns to a rosbag2 directory or a bare MCAP file, or block by block to a
 table in CSV or Parquet (with the optional dependency ``parquet``).
 
-A bag or table gets its name when it is complete; if writing fails, an older file is kept.
+A bag or table gets its name when complete; if writing fails, an older file of this name is kept.
 """
 
 import csv

@@ -200,7 +200,7 @@ def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
     'chamber-9' (9 positions of 3 h), 'tumble' (18 positions of 20 min at room temperature),
     'tumble-3' or 'tumble-1' ('tumble', then 3 positions or 1 of 3 h in the chamber), 'held-out' (3
     positions with ramps and attitudes of no other plan), 'centrifuge', 'rate-table' (12 mountings,
-    each at rest and at four rates in three soaks). `seed` determines attitudes and temperatures.
+    at rest and at four rotation rates in three soaks). `seed` sets attitudes and temperatures.
     """
     if name not in PLAN_NAMES:
         raise ValueError(f'`name` must be one of {", ".join(PLAN_NAMES)}, got {name!r}')
@@ -228,7 +228,7 @@ def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
 def steps(
     begins_s: tuple[float, ...], rates: tuple[float, ...], dwell_s: float, ramp_s: float
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return times [s] and rates of runs that begin at `begins_s` and step through all `rates`."""
+    """Return times [s] and rotation rates of runs from each of `begins_s` through all `rates`."""
     time, rate = [0.0], [0.0]
     for begin in begins_s:
         now = begin

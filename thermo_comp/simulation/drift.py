@@ -71,7 +71,7 @@ class PartEffect(Effect):
     """
     Temperature coefficient of a part, or stress or thermo-EMF between two parts. The two signals
     are the temperature d of `part` less that in the reference state [K], and d^2; if a part `cold`
-    is given, each less the signal of `cold`.
+    is given, each less the same signal of `cold`.
     """
 
     part: str

@@ -96,7 +96,7 @@ class ThermalNetwork:
         return A, b, p
 
     def convection(self, state: Floats, air: float) -> Floats:
-        """Return the part of ``dx/dt`` by which heat paths are nonlinear, shape (k,)."""
+        """Return the part of ``dx/dt`` that `system` lacks: nonlinear heat flows, shape (k,)."""
         index, at = self._places, np.append(state, air)
         flow = np.zeros(len(at))
         for link in self.links:
@@ -178,7 +178,7 @@ class ThermalResponse:
         state = network.settled(air[0], drive[0])
         before = network.convection(state, air[0])
         for k, lasts in enumerate(length):
-            # Extrapolate the mean convection of this interval from the last two (Adams-Bashforth).
+            # Extrapolate an interval's mean convection from the last two values (Adams-Bashforth).
             now = network.convection(state, air[k])
             self._alpha[k] -= inverse @ (1.5 * now - 0.5 * before)
             self._amplitude[k] = unmix @ (state - self._alpha[k])

@@ -32,7 +32,7 @@ class Specimen:
         return float(self._rng.uniform(low, high))
 
     def axes(self, value: float, spread: float) -> Triple:
-        """Draw a number for each axis, uniform from (1 - `spread`) to (1 + `spread`) `value`."""
+        """Draw a number for each axis, uniform within `value` times (1 +- `spread`)."""
         return triple(value * (1.0 + spread * self._rng.uniform(-1.0, 1.0, 3)))
 
     def signed(self, low: float, high: float) -> Triple:

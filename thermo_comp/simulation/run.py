@@ -70,9 +70,9 @@ class Truth:
 @dataclass(frozen=True, eq=False)
 class SimulatedRun:
     """
-    The data that a recorder would store, and the truth. The data are stamps (ends) and counts of
-    the conversion cycles, readings of the thermometers [degC] and, of a unit with a gyroscope, the
-    angular rate in each cycle [rad/s].
+    The data that a recorder would store, and the truth. The data are the counts of each conversion
+    cycle, stamped at its end, readings of the thermometers [degC] and, of a unit with a gyroscope,
+    the angular rate in each cycle [rad/s].
     """
 
     accel_stamp_ns: Ints
@@ -232,7 +232,7 @@ def _thermal_truth(unit: UnitModel, cyclogram: Cyclogram, seed: int) -> Truth:
 
 
 def _switched(load: SwitchedLoad, knots: Floats, seed: int) -> tuple[Floats, Bools]:
-    """Merge knots and a load's switching times [s]; return also the intervals with the load on."""
+    """Add a load's switching times to `knots` [s]; return also in which intervals it is on."""
     n = 2 + int(knots[-1] // load.spell[0])
     flips = np.cumsum(generator(seed, Stream.LOAD).uniform(*load.spell, size=n))
     fine = np.unique(np.concatenate([knots, flips[flips <= knots[-1]]]))

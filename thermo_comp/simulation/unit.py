@@ -125,8 +125,8 @@ class ThermometerModel:
 @dataclass(frozen=True)
 class GyroModel:
     """
-    The gyroscope of a unit, with a scale of 1. All values are in mdeg/s (`drift` where that of an
-    accelerometer is in ug; `noise_density`: per root Hz); `turn_on`: sd of the bias between runs.
+    The gyroscope of a unit, with a scale of 1. All values are in mdeg/s (in `drift` instead of ug;
+    in `noise_density` per root Hz); `turn_on`: sd of the bias between runs.
     """
 
     drift: tuple[Effect, ...]
@@ -151,7 +151,7 @@ class GyroModel:
 class Bend:
     """
     Nonlinear terms ``K2 f^2 + K3 f^3`` of the axes: K2 [ug/g^2] and K3 [ug/g^3] at the reference
-    temperature, and the relative change of K2 and K3 per kelvin of the board.
+    temperature, and the relative change of K2 and K3 per kelvin of board temperature.
     """
 
     square: Triple = ZERO
@@ -167,7 +167,7 @@ class Bend:
 
 @dataclass(frozen=True)
 class SwitchedLoad:
-    """Electronics that heat a part with `power` [W]; `spell`: range of times off and on [s]."""
+    """Electronics that heat a part by `power` [W], on and off for random times in `spell` [s]."""
 
     part: str
     power: float
