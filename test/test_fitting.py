@@ -126,7 +126,7 @@ def test_a_fit_has_all_positions_sources_sections_and_groups_and_leaves_only_noi
     judged = {(group.part, group.group) for group in calibration.evidence}
     # In the unit OWN_LAGS each axis depends on the temperature of a part that lags the board.
     assert {('bias', 'part'), ('scale', 'part')} <= judged
-    # A response term without weights exists only for the covariance, without entry in `evidence`.
+    # A response term whose weights are all 0 has only a covariance, and no entry in `evidence`.
     weighty = [term for term in calibration.response if any((*term.bias, *term.scale))]
     assert {term.group for term in weighty} <= {group for _, group in judged}
     row = response.residuals[-1]

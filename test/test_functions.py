@@ -111,7 +111,7 @@ def test_the_predicted_sd_agrees_with_hand_numbers_or_is_that_of_the_residual():
         dynamic=regime_set(*[axis_set((0.0, 0.3))] * 3),
         response=(term('board', (0.3, 0.0, 0.0), tau_s=600.0),),
     )
-    # Parameters of x: level and slope of the bias per set (0-3), lag (4), scale per set (5, 6).
+    # Parameters of x: level, slope of the bias in each set (0-3), weight of the lag (4), scales.
     variances = np.zeros(parameter_layout(unit).n_parameters)
     variances[:7] = 4e-4, 1e-6, 9e-4, 0.0, 1e-6, 1e-12, 4e-12
     unit = replace(unit, posterior=posterior_of(np.diag(variances)))

@@ -306,7 +306,7 @@ def test_one_bag_of_ramps_beside_soaks_determines_the_lags():
 
 @pytest.mark.slow
 def test_a_bias_decay_after_power_on_is_not_fitted_by_a_lag():
-    # WHY: lags fitted a bias decay after power-on: from other starts the force error was 1.7 mg.
+    # WHY: a bias decay was fitted by lags: from other initial temperatures the error was 1.7 mg.
     rng = rng_of('power-on', 4)
     unit = cases.consumer_grade(rng)
 

@@ -166,7 +166,7 @@ def sd_at(unit, board, behind=0.0, force=0.0):
 
 
 def test_a_line_of_many_states_takes_one_noise_excess_for_all():
-    # `update` evaluates the states of all rests of a log at once, without an excess of noise.
+    # `update` evaluates the states of all rests of a log at once, with a `noise_excess` of 0.
     correction = Correction(rich_calibration())
     states = ramp_states(rich_calibration(), np.linspace(10.0, 30.0, 2049)).T
     line = correction.line(states, states, np.zeros((N_ROWS, 2049)), 0.0)
@@ -197,7 +197,7 @@ def test_outside_the_range_the_claimed_sd_is_that_of_curve_and_parts():
     # The range is 5 to 35 degC. A part at 34 degC adds no variance; a part at 41 degC does.
     assert sd_at(unit, 33.0, behind=-1.0) == pytest.approx(1e-6, rel=1e-6)
     assert sd_at(unit, 33.0, behind=-8.0) == pytest.approx(bends * 6.0 / 300.0, rel=0.05)
-    # WHY: a bump of the bias over a part's temperature caused 230 ug, with a claimed sd of 14 ug.
+    # WHY: for a bump of the bias over part temperature the error was 230 ug, claimed sd 14 ug.
     unit = calibration(response=(term('bend', (0.5, 0.0, 0.0), tau_s=600.0),))
     # The slope is 0 below 20 degC, 0.5 counts/K above: its sd over the range is 0.25 counts/K.
     assert sd_at(unit, 7.0, behind=5.0) == pytest.approx(0.25 * 3.0 / 300.0, rel=0.1)
