@@ -140,7 +140,7 @@ def test_bags_without_usable_numbers_are_refused_with_a_message(rng, spoil, text
         # WHY: for readings that are missing for 200 s the message suggested a second clock.
         (dropping_out, 'unmeasured', r'^2\d % .* has no temperatures .* stick, or drop out\? '
          r'bag\d: temperature/board has no new value for 20[0-2] s$'),
-        # WHY: for whole degrees, constant in a soak, the message suggested a second clock.
+        # WHY: for readings in whole degrees the message suggested a second clock.
         (in_whole_degrees, 'steps', r'^2\d % .* temperature/board \(steps of 1 K\) changes for'),
         (frozen, 'stuck', '^at rest all samples are equal'),
     ],

@@ -189,7 +189,7 @@ def test_tilts_of_two_supports_are_not_taken_for_a_scale_slope_of_a_level_axis(r
     at = np.array([0.0, 10.0])
     # 15000 samples (noise 0.1 mg) determine the mean bias slope of the two rests to 1 ug/K.
     assert np.diff(z.bias_function.value(at))[0] == pytest.approx(MG, abs=0.01 * MG)
-    # At 0.03 g drift errors of 1 ug/K in two rests are a scale slope of sqrt(2) * 33 = 47 ppm/K.
+    # At 0.03 g along z two drift errors of 1 ug/K are a scale slope of sqrt(2) * 33 = 47 ppm/K.
     assert abs(np.diff(z.scale_function.value(at))[0]) < 10.0 * 47e-6
 
 

@@ -101,7 +101,7 @@ def test_only_columns_with_an_effect_are_chosen_and_each_trial_has_a_left_out_er
 
 @pytest.mark.parametrize('where', ['one bag', 'one section', 'all'])
 def test_a_group_that_explains_one_bag_or_section_is_not_chosen(where):
-    # The evidence always favours the group 'idle', left-out errors only if it acts in all rows.
+    # The evidence always favours group 'idle', left-out errors only with its effect in all rows.
     truth = Truth()
     windows, up = table_of(truth, 10, np.random.default_rng(5), n_windows=30)
     rows = {

@@ -248,7 +248,7 @@ def test_a_killed_node_damages_at_most_one_line_of_its_rest_log(tmp_path, unit, 
     sent = 0
 
     def until(condition, what):
-        """Send bursts of 50 samples until a condition holds; DDS discovery loses the first."""
+        """Send bursts of 50 samples until a condition holds; DDS loses those before discovery."""
         nonlocal sent
         pause = threading.Event()
         for _ in range(len(samples) // RATE_HZ):

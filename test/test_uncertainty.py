@@ -67,7 +67,7 @@ def test_the_claimed_sd_of_lags_covers_a_start_in_a_ramp():
 
 
 def test_without_case_readings_the_gradient_is_that_at_rest():
-    # WHY: the board is 1 K warmer than the case; without case readings 0 K was assumed.
+    # WHY: without case readings a gradient of 0 K was assumed, although the board is 1 K warmer.
     of_gradient = (term('gradient', (30.0, 0.0, 0.0)),)
     soak = np.full(2000, 20.0)
     _, corrected, _ = at_1_hz(calibration(response=of_gradient), soak, soak[:1500] - 1.0)
@@ -147,7 +147,7 @@ def test_a_state_beyond_the_edge_of_a_column_is_limited_and_increases_the_sd():
     edge, beyond = (correction.line(s, s, np.zeros(N_ROWS), 0.0) for s in (inside, outside))
     assert beyond[:12].tolist() == edge[:12].tolist()
     assert math.sqrt(beyond[12] - edge[12]) == pytest.approx(30.0 / 300.0 * 2.0)
-    of_y = [27, 29, 32]  # coefficients of 1, y and y^2 in the variance of y
+    of_y = [27, 29, 32]  # coefficients of 1, f and f^2 in the variance of axis y
     assert beyond[of_y].tolist() == edge[of_y].tolist()
     excess = correction.excess(outside, is_dynamic=False)
     assert (excess.relative, excess[:3]) == (pytest.approx(2.0), (0.0, 0.0, 2.0))
@@ -176,7 +176,7 @@ def test_a_line_of_many_states_takes_one_noise_excess_for_all():
 
 
 def test_outside_the_range_the_claimed_sd_is_that_of_curve_and_parts():
-    # Outside of the range the claimed sd is that of the curve's slope, as if no lag cancelled it.
+    # Outside the range no lag cancels the curve's slope: the claimed sd is that of the slope.
     parts = regime_set(axis_set((0.0, 0.5), residual_sd_m_s2=1e-6))
     lag = term('board', (-0.5, 0.0, 0.0), tau_s=600.0)
     unit = calibration(static=parts, dynamic=parts, response=(lag,))

@@ -27,7 +27,7 @@ KINK = np.array([0.0, 1e-5, -1e-5])
 
 
 def fit_of(temperature, up, position, slope=1e-5, gravity=10.0):
-    """Make the data that `thermal_ranges` reads of a fit; `slope`: of the scale factors [1/K]."""
+    """Make the data of a fit that `thermal_ranges` reads; `slope`: of the scale factors [1/K]."""
     kelvins, temperature = np.array([1.0]), np.asarray(temperature, dtype=float)
     data = Parts(position=np.asarray(position), groups=('curve',), kelvins=kelvins)
     weights = np.zeros((2, 3, 1))
