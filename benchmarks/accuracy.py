@@ -138,7 +138,7 @@ def fit_and_correct(
         columns = np.column_stack((corrected.specific_force, corrected.covariance[:, [0, 4, 8]]))
         size = np.diff(first, append=len(slots))
         mean = np.add.reduceat(columns, first, axis=0)[size == size.max()] / size.max()
-        # A mean over 60 s reduces white noise and rounding; the other errors stay as they are.
+        # A mean over 60 s reduces only white noise and rounding, not errors that last for minutes.
         white = np.array(compensator.thermal.correction.noise)
         forces.append(mean[:, :3])
         sds.append(np.sqrt(np.maximum(mean[:, 3:] - white, 0.0) + density**2 / WINDOW_S))

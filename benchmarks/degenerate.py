@@ -85,7 +85,7 @@ def _peak_megabytes(pid: int) -> float:
 
 
 def run(name: str, command: str, path: Path, out: Path) -> Run:
-    """Run a command to its end, or until the time limit; judge the run by the rules."""
+    """Run a command to its end, or until the time limit; judge its time, memory and output."""
     program = Path(sys.executable).with_name('thermo_comp')
     log = out / 'said.txt'
     began = time.monotonic()

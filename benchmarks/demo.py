@@ -37,8 +37,8 @@ from thermo_comp.unit.gravity import STANDARD_GRAVITY
 # determine this sd, so the fit gets the sd as an option.
 MOUNTING_SD = 1e-6 * STANDARD_GRAVITY
 
-# Groups of columns by the name of the fit in the printed table: one curve for both regimes; one
-# per regime; None (the fit selects the groups) for the calibration of the node.
+# Groups of columns of each fit in the printed table: one curve for both regimes; one curve per
+# regime; None (the fit selects the groups) for the calibration of the node.
 MODELS = {'one set': ('curve',), 'two sets': ('curve', 'set'), 'node': None}
 
 

@@ -33,7 +33,7 @@ LABORATORY, TOLERANCE, N_FUTURES = calibration(), 200.0 * UG, 200
 
 
 def exits(probe: RestSeries, process: Process, bound: float, rng: np.random.Generator) -> Floats:
-    """Return for 200 random walks the time [days] at which the RMS of |f| - g exceeds `bound`."""
+    """Draw 200 random walks of bias and scale; return times [days] when RMS |f| - g > `bound`."""
     size = np.repeat([process.bias, process.scale * G], 3) / np.sqrt(3.0)
     error, levels = np.full(N_FUTURES, np.inf), np.zeros((N_FUTURES, 6))
     # The norm of `root` @ (1, changes `levels` of bias and scale) is the RMS of |f| - g.

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Prints the figures of docs/beyond_1g.md: errors of K2 and K3 that are fitted to centrifuge runs.
+Prints the figures of docs/beyond_1g.md: errors of nonlinear terms K2, K3 from centrifuge runs.
 
 Run ``python benchmarks/nonlinearity.py``, or with fewer units: ``--units 4``. The runs come from
 a generator in this file, not from `thermo_comp.simulation`. A test has 12 mountings, each in three

@@ -145,7 +145,7 @@ def run_matrix(
 
 
 def rate_table(matrix: Matrix) -> Rows:
-    """Count ramps, missed ramps, and ramps whose flag returns to static early, by rate."""
+    """Count for each reading rate the ramps, missed ramps, and ramps flagged static too early."""
     rows = [['readings', 'ramps', 'missed', 'missed, >= 0.2 K/min', 'static before the end']]
     for rate in dict.fromkeys(scene.rate_hz for scene, _ in matrix):
         mine = [(scene, result) for scene, result in matrix if scene.rate_hz == rate]

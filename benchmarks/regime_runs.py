@@ -89,7 +89,7 @@ def run_ramps(job: Job) -> tuple[Scene, Outcome]:
     """Run the detector over ramps of a scene."""
     scene, n, seed, is_rippled = job
     rng = rng_of(seed, 5, scene)
-    # A ramp lasts two lags plus the time of a change by four quanta, limited to 40 min .. 2 h.
+    # A ramp lasts 2 case lags plus the time of a change by 4 quanta, limited to 40 min .. 2 h.
     edges_s = 60.0 * 4.0 * scene.quantum / scene.ramp_k_min + 2.0 * scene.lag_s
     duration = min(max(edges_s, 2400.0), 7200.0)
     t = np.arange(-2700.0, duration, 1.0 / scene.rate_hz)

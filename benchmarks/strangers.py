@@ -239,7 +239,7 @@ def without_constants(calibration: thermo_comp.Calibration) -> thermo_comp.Calib
 def scored(
     study: Study, model: thermo_comp.Calibration, tests: dict[str, list[Minutes]]
 ) -> dict[str, Score]:
-    """Return the scores (errors and ratios) of a calibration by set of held-out bags."""
+    """Return the scores (errors and ratios) of a calibration for each set of held-out bags."""
     if study.bound is not None:
         return {'': bias_score(model, study)}
     if study.is_drift:

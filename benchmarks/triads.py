@@ -139,7 +139,7 @@ def _slips(draw: Specimen) -> list[Effect]:
     return effects
 
 
-# Kinds of triads with a sensor head per axis; kinds whose heads exchange heat with the case, too.
+# Kinds with a head per axis; kinds whose heads exchange heat with both the board and the case.
 _OWN_HEADS = ('own-lags', 'between', 'switched-load')
 _BETWEEN = ('between', 'switched-load')
 _EXTRA: dict[str, Callable[[Specimen], list[Effect]]] = {

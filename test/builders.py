@@ -143,7 +143,7 @@ def rich_gyroscope():
 
 
 def stream(compensator, events):
-    """Process events singly, angular rates 1e-3 * sample; return rows and numbers of samples."""
+    """Process single events, with angular rates 1e-3 * sample; return rows and sample numbers."""
     rows, index = [], []
     position = 0
     for kind, stamp, value in events:
@@ -204,7 +204,7 @@ def assert_equal_bits(unit, config, events, chunk):
 
 
 def warm(compensator, celsius=20.0, case=None, *, until_s=1, start_s=0, flicker=0.0):
-    """Push both readings each second; `flicker` [K]: noise, so that they do not count as stuck."""
+    """Push a board and a case reading each second; +-`flicker` [K] shows that neither is stuck."""
     for second in range(start_s, until_s):
         noise = flicker * (-1) ** second
         compensator.push('board', second * SECOND_NS, celsius + noise)

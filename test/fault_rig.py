@@ -89,7 +89,7 @@ def force_at(seconds):
 
 @dataclass(frozen=True)
 class Truth:
-    """Times [s], temperatures of case and board [degC], `memory`: board - lagged board [K]."""
+    """Times [s], case and board temperatures [degC]; `memory`: board less lagged board [K]."""
 
     time: np.ndarray
     case: np.ndarray

@@ -32,7 +32,7 @@ class Row:
     recovered: float = 0.0
     #: Time [s] from which stamps are ahead of the true times, and by how many seconds.
     shift: tuple[float, float] = (math.inf, 0.0)
-    #: Messages before the fault is applied; None: the bag of `fault_rig`.
+    #: Messages into which the fault is inserted; None: the bag of `fault_rig`.
     source: list[rig.Event] | None = field(default=None, repr=False)
 
 

@@ -21,7 +21,7 @@ ZERO = np.zeros(3)
 
 
 def rests(calibration, attitudes, error, days=20, seed=1, turn_on=20.0 * MICRO_G, rate=0.0):
-    """Log 3 starts a day, 4 windows each; `error(day)`: bias error [m/s^2]; `rate`: ramp [K/s]."""
+    """Log 3 turn-ons a day of 4 windows; `error(day)`: bias error [m/s^2]; `rate`: ramp [K/s]."""
     rng = np.random.default_rng(seed)
     correction = Correction(calibration)
     M, logged = np.array(calibration.misalignment), []

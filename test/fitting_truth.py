@@ -21,7 +21,7 @@ NOMINAL = np.array([1000.0, 1010.0, 990.0])  # counts per m/s^2
 #: Groups of the columns: curve (t, t^2), board (two lags), idle (two columns without effect).
 GROUPS = ('curve', 'curve', 'board', 'board', 'idle', 'idle')
 TAUS = np.array([400.0, 2500.0])  # time constants of the two board lags [s]
-START = np.array([[0.25, 0.1], [0.1, 1.0]])  # covariance of the two lags at the start [K^2]
+START = np.array([[0.25, 0.1], [0.1, 1.0]])  # covariance of both initial lag states [K^2]
 MICRO = 1e-6 * GRAVITY  # 1 ug [m/s^2]
 
 

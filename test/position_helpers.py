@@ -30,7 +30,7 @@ class Imu:
 
 @dataclass
 class Rest:
-    """A sensor at rest at `level`; the board cools from `warm` by `fall`."""
+    """A sensor at rest with specific force `level`; its board cools from `warm` by `fall`."""
 
     rng: np.random.Generator
     duration_s: float = 600.0

@@ -140,7 +140,7 @@ def test_bags_without_usable_numbers_are_refused_with_a_message(rng, spoil, text
         # WHY: for readings that are missing for 200 s the message suggested a second clock.
         (dropping_out, 'unmeasured', r'^2\d % .* has no temperatures .* stick, or drop out\? '
          r'bag\d: temperature/board has no new value for 20[0-2] s$'),
-        # WHY: readings in whole degrees, constant in the first soak, suggested a second clock.
+        # WHY: for readings in whole degrees the message suggested a second clock.
         (in_whole_degrees, 'steps', r'^2\d % .* temperature/board \(steps of 1 K\) changes for'),
         (frozen, 'stuck', '^at rest all samples are equal'),
     ],
@@ -157,7 +157,7 @@ def test_one_bag_in_kelvins_or_with_a_constant_axis_is_refused_by_name(rng):
     in_kelvins(rests[4])
     with pytest.raises(FitError, match=r'^bag4: temperature/board reads 2\d+\S* degC .* kelvins'):
         fit(sources_of(rests), FORCE)
-    # WHY: y was constant in one position, and the fit reduced the drift of y in all positions.
+    # WHY: y was constant in one position; the fitted drift of y was too small in all positions.
     rests = rests_of(rng)
     rests[4].accel[:, 1] = rests[4].level[1]
     with pytest.raises(FitError, match=r'^bag4: y reads exactly \S+ for 0\.\d+ h: the axis is'):

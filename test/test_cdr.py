@@ -98,7 +98,7 @@ def test_the_byte_swap_keeps_the_bits_of_a_signalling_nan():
 
 
 def test_messages_with_frame_ids_of_different_lengths_are_converted():
-    # WHY: the place of the numbers in a message depends on the length of its frame_id.
+    # The place of the numbers in a message depends on the length of its frame_id.
     converter = SampleConverter(Vector3Stamped)
     names = ['a', 'imu_link', '', 'a', 'x' * 40, 'imu_link']
     written = convert(converter, *(cdr('<', (1, k), f, [k, 0, 0]) for k, f in enumerate(names)))

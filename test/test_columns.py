@@ -93,7 +93,7 @@ def test_the_value_of_each_kind_of_column_agrees_with_hand_numbers():
     ]
     spec = memory_of(columns, ('case', 'tip'))
     layout = StateLayout(spec)
-    # T_board, its variance, rate; dynamic weight; unknown; 4 x (gradient or lag, variance); play.
+    # T_board, its variance, rate; weight; is regime unknown; 4 (gradient or lag, variance); play.
     state = [23.0, 0.0, 0.01, 0.25, 0.0, 1.2, 0.0, -0.7, 0.0, 0.5, 0.0, -0.3, 0.0, 0.1]
     state = np.array([state]).T
     assert layout.width == len(state)
@@ -121,13 +121,13 @@ def test_bends_have_slopes_and_go_on_along_their_tangent_beyond_the_range():
     assert not np.any(table.slopes(state))
     flow = ColumnTable([Column('gradient', 'gradient', **WIDE)], MemorySpec(), 20.0)
     assert flow.slopes(np.zeros((7, 1)))[1] is None
-    # WHY: bends that ended at different temperatures turned the curve by 200 ug/K beyond them.
+    # WHY: bends ended at different temperatures, beyond which the slope was 200 ug/K wrong.
     columns = [Column('bend', 'bend', knee_k=k, range=(-12.0 - k, 8.0 - k)) for k in (2.0, 6.0)]
     table = ColumnTable(columns, MemorySpec(), 20.0)
     states = np.zeros((StateLayout(MemorySpec()).width, 3))
     states[BOARD] = 20.0 + np.array([8.0, 12.0, 15.0])
     raw = table.raw(states)
-    # The tangent is a quarter of the width of 20 K long; the error grows from the range's end.
+    # The tangent ends 5 K, 1/4 of the range's width, beyond the range; `beyond` is 0 in the range.
     assert table.held(raw).tolist() == [[6.0, 10.0, 11.0], [2.0, 6.0, 7.0]]
     assert table.beyond(raw).tolist() == [[0.0, 4.0, 7.0]] * 2
 

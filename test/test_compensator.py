@@ -363,7 +363,7 @@ def test_a_swap_of_calibrations_takes_effect_between_two_samples_and_loses_no_sa
     compensator.swap(calibration(axes=equal_axes(150.0)))
     after = compensator.process(5 * SECOND_NS + 1, 300.0, 0.0, 1.0)
     assert (before[0], after[0]) == (1.0, 2.0)
-    # This calibration has other detector settings, so a new detector begins, not yet settled.
+    # `rich_calibration` has other detector settings: its detector is new and has not settled.
     compensator.swap(rich_calibration())
     assert compensator.process(5 * SECOND_NS + 2, 300.0, 0.0, 1.0) is not None
     assert not compensator.status().is_settled

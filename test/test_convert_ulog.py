@@ -221,7 +221,7 @@ def test_samples_compensated_by_px4_are_left_out(tmp_path, rng, begin):
     force = write_combined(path, rng, {'TC_A_ENABLE': 1 - begin}, TC_A_ENABLE=begin)
     read = read_autopilot(path)
     assert 'TC_A_ENABLE was 1 for 50 % of the samples' in read.chosen
-    # A changed parameter has the stamp of the message before it: do not compare this sample.
+    # A changed parameter has the stamp of the message before it: skip the sample at the change.
     n = min(len(read.accel), N // 2) - 1
     part = slice(-n, None) if begin else slice(n)
     np.testing.assert_array_equal(read.accel[part], force[part])

@@ -96,7 +96,7 @@ def test_columns_of_the_x_axis_do_not_change_the_output_of_y_and_z(rng):
 
 
 def states_of(unit, rng, n=5):
-    """Return stamp, thermal state and remaining shares of lags at n times of a run."""
+    """Return stamp, thermal state and remaining shares of initial lag states at n times."""
     tracker = ThermalTracker(unit.detector, Correction(unit).memory)
     collected = []
     for k, (kind, stamp, value) in enumerate(run_of(rng, seconds=1200, rate=1)):

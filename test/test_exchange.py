@@ -280,7 +280,7 @@ def test_formulas_of_imu_tk_imu_calib_and_kalibr_give_the_correction_of_the_cali
     assert np.all(np.tril(T, -1) == 0.0)
     assert np.count_nonzero(K - np.diag(np.diag(K))) == 0
     theirs = (RAW - numbers[18:]) @ (T @ K).T
-    # The notes round angles to 1e-6 rad, an error of 1e-6 times 90 m/s^2.
+    # The export notes state roll, pitch, yaw rounded to 1e-6 rad: an error of 1e-6 * 90 m/s^2.
     np.testing.assert_allclose(theirs, ours(tumbled, RAW) @ turn(file.notes).T, atol=1e-4)
     norms, expected = (np.linalg.norm(force, axis=1) for force in (theirs, ours(tumbled, RAW)))
     np.testing.assert_allclose(norms, expected, rtol=1e-12)

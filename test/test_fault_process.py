@@ -37,7 +37,7 @@ def node(path):
 
 
 def sigmas(heard):
-    """Return the largest error of the received forces divided by its claimed sd."""
+    """Return the largest ratio (error of a received force) / (claimed sd of this force)."""
     seconds = (heard.stamp_ns - START_NS) * 1e-9
     return ratios_to_sd(heard.force, heard.covariance, seconds).max()
 

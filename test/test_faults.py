@@ -28,7 +28,7 @@ OVER_DDS = (
     *('board late by 5 s', 'counts out of order'),
     *('time jumps back', 'temperatures of another clock'),
 )
-#: Slow tests: faults of the case thermometer that the board also has; further time jumps.
+#: Slow tests: case faults that are also tested on the board thermometer; further time jumps.
 SLOW = {
     *('case twice', 'case in whole degrees', 'case is NaN', 'case is infinite'),
     *('case jumps by 40 K and stays', 'case out of order', 'case late by 5 s'),

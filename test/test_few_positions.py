@@ -189,7 +189,7 @@ def test_tilts_of_two_supports_are_not_taken_for_a_scale_slope_of_a_level_axis(r
     at = np.array([0.0, 10.0])
     # 15000 samples (noise 0.1 mg) determine the mean bias slope of the two rests to 1 ug/K.
     assert np.diff(z.bias_function.value(at))[0] == pytest.approx(MG, abs=0.01 * MG)
-    # At 0.03 g drift errors of 1 ug/K in two rests are a scale slope of sqrt(2) * 33 = 47 ppm/K.
+    # At 0.03 g along z two drift errors of 1 ug/K are a scale slope of sqrt(2) * 33 = 47 ppm/K.
     assert abs(np.diff(z.scale_function.value(at))[0]) < 10.0 * 47e-6
 
 
@@ -416,14 +416,14 @@ def test_left_out_norms_of_faces_laid_by_hand_show_a_misalignment_of_20_mrad():
 
 
 def test_a_clearly_larger_evidence_shows_the_misalignment_of_faces_laid_with_tilts_of_1_deg():
-    # WHY: left-out |f| did not decide, and an element of M was wrong by 8 mrad.
+    # WHY: left-out |f| did not decide between prior sds of M; an element of M was 8 mrad wrong.
     rng = np.random.default_rng(508)
     up = np.tile(FACES, (2, 1)) + np.radians(1.0) * rng.standard_normal((12, 3))
     up /= np.linalg.norm(up, axis=1)[:, np.newaxis]
     true = np.eye(3)
     true[[1, 2, 2], [0, 0, 1]] = 0.01 * rng.standard_normal(3)
     calibration = fit([turned(rng, up @ np.linalg.inv(true).T)], OPTIONS).calibration
-    # The eight rests that show an element have a noise of 45 ug: its sd is 1 mrad.
+    # Eight rests with a noise of 45 ug in |f| determine an element of M to 1 mrad (1 sd).
     np.testing.assert_allclose(calibration.misalignment, true, atol=4e-3)
 
 

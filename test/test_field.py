@@ -35,7 +35,7 @@ def test_derivatives_of_a_rest_by_all_parameters_agree_with_finite_differences()
     layout = parameter_layout(unit)
     levels = {level for block in layout.scale for level in (block.static, block.dynamic)}
     levels |= {block.static for block in layout.bias}
-    # Every second parameter: as blocks have odd lengths, each kind is tested in bias or in scale.
+    # Test half of the parameters. Blocks have odd lengths: each kind is tested in bias or scale.
     for k in range(0, layout.n_parameters, 2):
         step = 1e-7
         moved = values.copy()

@@ -104,7 +104,7 @@ def columns_of(slopes, shift=0.0):
 @pytest.mark.slow
 @pytest.mark.parametrize('shift', [300.0, -20000.0])
 def test_a_changed_unit_is_updated_although_its_drift_contradicts_the_prior(shift, monkeypatch):
-    # WHY: the drift contradicted the prior: an update kept constants with errors of 35 claimed sd.
+    # WHY: if the drift contradicted the prior, an update kept constants wrong by 35 claimed sd.
     monkeypatch.setitem(globals(), 'KNEE_C', 5.0)
     options = {'gravity': G, 'input': 'm/s^2', 'groups': ('curve',)}
     old = tc.fit(columns_of([SLOPE] * len(UPS)), mounting_sd=1e-7, **options)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fits to simulated units agree with the true parameters, also for effects even in a gradient."""
+"""Fits to simulated units give the true parameters, also for even functions of a gradient."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -126,7 +126,7 @@ def test_a_fit_has_all_positions_sources_sections_and_groups_and_leaves_only_noi
     judged = {(group.part, group.group) for group in calibration.evidence}
     # In the unit OWN_LAGS each axis depends on the temperature of a part that lags the board.
     assert {('bias', 'part'), ('scale', 'part')} <= judged
-    # A response term without weights exists only for the covariance, without entry in `evidence`.
+    # A response term whose weights are all 0 has only a covariance, and no entry in `evidence`.
     weighty = [term for term in calibration.response if any((*term.bias, *term.scale))]
     assert {term.group for term in weighty} <= {group for _, group in judged}
     row = response.residuals[-1]
@@ -149,7 +149,7 @@ def test_the_error_of_the_compensator_is_that_stated_by_the_fit(response):
     assert rms < 2.0 * response.residuals[-1].left_out.rms
     density = np.array(response.calibration.noise_density_m_s2_sqrt_hz)
     variance = after.covariance[: n * per_window, [0, 4, 8]].reshape(n, per_window, 3).mean(axis=1)
-    # A mean over 60 s reduces white noise and rounding; it does not reduce errors of the model.
+    # A mean over 60 s reduces white noise and rounding, but not errors of the model.
     variance += density**2 / 60.0 - np.array(compensator.thermal.correction.noise)
     error = (force - record.truth.specific_force) / np.sqrt(variance)
     assert 0.5 < np.sqrt(np.mean(error**2)) < 1.6
@@ -241,7 +241,7 @@ def test_counts_of_24_bits_that_a_driver_averages_are_fitted(n_averaged, rng):
 
 @pytest.mark.slow
 def test_misalignments_of_a_mems_unit_are_determined_by_nine_positions():
-    # WHY: mounting offsets of 5 mg fit |f| in nine positions as well as misalignments do.
+    # WHY: |f| in nine positions was fitted by mounting offsets of 5 mg, not by misalignments.
     unit = unit_preset('mems', 0).with_thermometers(rate_hz=0.25)
     records = arrays(unit, plan('chamber-9'), 0, rate_hz=1.0)
     options = FitOptions(gravity=STANDARD_GRAVITY, groups=('curve', 'set', 'gradient', 'board'))

@@ -119,7 +119,7 @@ def test_variance_ratio_and_correlation_time_are_estimated(rng, noise):
     # Only correlation times up to a sixth of a position (at most 2000 s long) are tried.
     whitener, weight, series = drawn(rng, 12, 20, Noise(100.0, 1e5))
     assert 0.0 < whitener.estimate(series, weight).time_s <= 20.0 * 100.0 / 5.0
-    # In 1 % of all series of white noise a fit finds Gauss-Markov noise, but not in the few drawn.
+    # In 1 % of all series of white noise a fit finds Gauss-Markov noise, but in none of these.
     for _ in range(4):
         whitener, weight, series = drawn(rng, 5, 100, Noise())
         assert whitener.estimate(series, weight) == Noise()

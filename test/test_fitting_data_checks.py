@@ -62,7 +62,7 @@ def test_a_complete_thermal_test_gives_only_good_findings(good):
     ('name', 'changed', 'message'),
     [
         ('span', lambda w: {'temperature': 0.1 * w.temperature}, r'\(25 degC advised\): run the'),
-        # WHY: the thermometer given as board was that of the room.
+        # WHY: the readings given as those of the board were of a thermometer in the room.
         ('span', lambda w: {'temperature': 0.01 * w.temperature}, 'is the thermometer on'),
         ('temperature', lambda w: {'temperature': 0.0 * w.temperature + 20.0},
          'no thermometer: the calibration holds at the temperature of the test'),

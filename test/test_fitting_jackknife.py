@@ -52,8 +52,8 @@ def test_the_claimed_sd_covers_effects_that_the_model_lacks(effect_sd):
 
 
 def test_three_attitudes_determine_their_norms_as_well_as_mountings_repeat(rng):
-    # WHY: three attitudes do not separate bias and scale, which differed by percents between the
-    # fits of the mixture: the claimed sd of |f| was up to ten times that of the mountings' means.
+    # WHY: three attitudes do not separate bias and scale; both differed by percents between fits
+    # with different mounting sds: the claimed sd of |f| was up to 10 times that of mounting means.
     kappa, bias = np.array([1.03, 0.97, 1.02]), np.array([0.3, -0.2, 0.5])
     truth = fitting_truth.Truth(kappa, bias, offset_sd=2.0 * fitting_truth.MICRO)
     up = np.repeat(np.eye(3) + 0.02 * rng.standard_normal((3, 3)), 4, axis=0)

@@ -101,7 +101,7 @@ def test_only_columns_with_an_effect_are_chosen_and_each_trial_has_a_left_out_er
 
 @pytest.mark.parametrize('where', ['one bag', 'one section', 'all'])
 def test_a_group_that_explains_one_bag_or_section_is_not_chosen(where):
-    # The evidence always favours 'idle', the left-out error only if all bags and sections show it.
+    # The evidence always favours group 'idle', left-out errors only with its effect in all rows.
     truth = Truth()
     windows, up = table_of(truth, 10, np.random.default_rng(5), n_windows=30)
     rows = {
@@ -399,7 +399,7 @@ def test_windows_that_the_model_misses_count_in_the_lack_of_fit_in_spite_of_thei
     bump = 100.0 * MICRO * is_bump[:, None]
     bumped = replace(windows, mean=windows.mean + NOMINAL * bump)
     regression, chosen = selected_of(Truth(), bumped, up)
-    # WHY: the noise expected of a window of small weight was so large that it showed no excess.
+    # WHY: the noise assumed for windows of small weight was so large that it hid the lack of fit.
     assert np.median(regression.weight[is_bump]) < 0.1
     no_ramp = np.zeros_like(is_bump)
     table = SimpleNamespace(data=regression.windows, temperature=temperature, is_dynamic=no_ramp)

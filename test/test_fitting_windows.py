@@ -105,7 +105,7 @@ def test_columns_of_the_fit_equal_those_of_the_tracker(bags):
     mean = np.array([phi[np.abs(seconds - t) <= 30.0].mean(axis=0) for t in time])
     scale = np.sqrt(np.mean(phi**2, axis=0)) + 1e-9
     late = time > 300.0
-    # The tracker's lags follow estimates, not readings: plays reverse slightly earlier or later.
+    # The tracker's lags follow estimates, not readings: play operators reverse at other times.
     np.testing.assert_allclose(rows[late, n_sets:] / scale, mean[late] / scale, atol=0.05)
 
 
@@ -116,7 +116,7 @@ def test_columns_sections_and_initial_lag_states_agree_with_formulas(bags):
     assert data.groups[:6] == ('curve',) * 3 + ('set',) * 3
     np.testing.assert_allclose(data.columns[:, [0, 3]], np.column_stack((t, w)), atol=1e-9)
     assert data.in_scale[:6].tolist() == [True, True, True, False, True, True]
-    # An initial lag state decays as exp(-time / tau), and in a column lag * t as t times this.
+    # An initial lag state decays as exp(-time / tau), in a column lag * t as t * exp(-time / tau).
     taus = [lag.tau_s for lag in memory_of(bank()).lags]
     for k, column in enumerate(bank(), start=6):
         lag = data.lag[k]

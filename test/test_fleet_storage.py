@@ -332,7 +332,7 @@ class TestRow:
         assert [row[f'scale_slope_sd_{axis}_ppm_k'] for axis in 'xyz'] == [None] * 3
 
     def test_the_lag_of_a_board_that_changes_before_the_case_is_negative(self, tmp_path):
-        # WHY: a calibration without a measured board lag contains the default, 900 s.
+        # WHY: if the measured lag is negative, the calibration contains the default, 900 s.
         write_unit(tmp_path / 'u', 1, 4, is_exchanged=True)
         outcome = processed(tmp_path, fit=replace(OPTIONS.fit, allow=('swapped',)))
         assert outcome.row['board_lag_s'] < -100.0

@@ -111,7 +111,7 @@ def test_the_predicted_sd_agrees_with_hand_numbers_or_is_that_of_the_residual():
         dynamic=regime_set(*[axis_set((0.0, 0.3))] * 3),
         response=(term('board', (0.3, 0.0, 0.0), tau_s=600.0),),
     )
-    # Parameters of x: level and slope of the bias per set (0-3), lag (4), scale per set (5, 6).
+    # Parameters of x: level and slope of bias in each set (0-3), lag's weight (4), scales (5, 6).
     variances = np.zeros(parameter_layout(unit).n_parameters)
     variances[:7] = 4e-4, 1e-6, 9e-4, 0.0, 1e-6, 1e-12, 4e-12
     unit = replace(unit, posterior=posterior_of(np.diag(variances)))
@@ -171,7 +171,7 @@ def test_ramp_states_equal_those_of_the_memory_of_the_fit(rate):
             # `gradient` rises within 1 s in `memory_on_grid`, but at once in `ramp_states`.
             assert state[place] == pytest.approx(lived[place - first], rel=2e-3), quantity
         elif isinstance(quantity, Play) and not quantity.tau_s:
-            # Plays of lags are not tested: a lag needs half an hour to change by `width_k`.
+            # Play operators of lags are untested: a lag needs half an hour to change by `width_k`.
             assert state[place] == pytest.approx(-quantity.width_k * np.sign(rate))
             assert state[place] == pytest.approx(lived[place - first])
 

@@ -166,7 +166,7 @@ def test_a_gyroscope_is_read_back_from_a_file_and_messages_name_wrong_keys():
     np.testing.assert_array_equal(scale, 1.0)
     _, sd_bias, _, sd_scale = bias_scale_and_sd(triad, states[1:2])
     np.testing.assert_array_equal(sd_scale, 0.0)
-    # At 20 degC the bias is its level; variance: of the level + of a turn-on.
+    # At 20 degC the bias is its level; its variance: variance of the level + of a turn-on.
     np.testing.assert_allclose(bias[1], (0.02 + 1e-5, -0.03, 0.01 + 1e-5))
     expected = np.hypot((1e-5, 2e-5, 1e-5), np.sqrt(1.01e-10))
     np.testing.assert_allclose(sd_bias[0], expected, rtol=1e-5)
@@ -243,7 +243,7 @@ def test_the_changes_of_the_rate_are_compared_with_their_claimed_sd(unit, fitted
     assert judged.exit_code == 0
     for name in ('static', 'dynamic', 'all'):
         section = rate.sections[name]
-        # The claimed sd includes unknown initial lag states, so it exceeds the noise.
+        # The claimed sd exceeds the noise, because it includes unknown initial lag states.
         assert 0.7 < section.ratio < 1.2
         assert section.rms < 1.3 * FLOOR
         assert section.raw_rms > 50.0 * FLOOR

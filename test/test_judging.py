@@ -362,7 +362,7 @@ class TestShifts:
         assert '; shifted: x bias +' in judgement.reason
 
     def test_a_large_shift_is_written_without_an_exponent(self):
-        # WHY: the message was `x bias +829 +- 1.3e+02 ug`.
+        # WHY: the message was `x bias +829 +- 1.3e+02 ug`, with the sd as a power of ten.
         big = AxisShift(829.4 * MICRO_G, 129.2 * MICRO_G, 0.0, 1.0)
         small = AxisShift(-1.234 * MICRO_G, 0.0567 * MICRO_G, 0.0, 1.0)
         assert change_texts((big, small)) == ('x bias +829 +- 129 ug', 'y bias -1.234 +- 0.057 ug')

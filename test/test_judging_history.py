@@ -124,7 +124,7 @@ SLOW = pytest.mark.slow
 
 
 def walked(rate, bound, axes=1, mean=0.0):
-    """Forecast a walk that starts at `mean`; on each axis its variance grows by `rate` per day."""
+    """Forecast a random walk from `mean`, whose variance on each axis grows by `rate` per day."""
     start = np.full(axes, mean)
     return passage(start, np.zeros((axes, axes)), np.sqrt(rate) * np.eye(axes), bound)
 

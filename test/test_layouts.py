@@ -91,7 +91,7 @@ def test_foxglove_paths_name_numbers_of_messages_and_each_panel_is_shown_once(to
     (inputs,) = re.findall(r'export const inputs = (\[.*\])', script())
     assert set(json.loads(inputs)) <= set(topics)
     rendered = {p['topicToRender'] for p in panels().values() if 'topicToRender' in p}
-    assert rendered == {'/diagnostics'}  # which only the node publishes
+    assert rendered == {'/diagnostics'}  # only the node publishes /diagnostics
     layout = json.dumps(json.loads(FOXGLOVE.read_text())['layout'])
     shown = re.findall(r'"(?:first|second)": "([^"]*)"', layout)
     assert sorted(shown) == sorted(panels())

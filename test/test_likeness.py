@@ -45,7 +45,7 @@ def test_bags_of_one_environment_do_not_separate_lags_of_board_and_gradient():
     assert 'do not tell a lag of the board temperature from a lag of T_case - T_board' in message
     assert 'such as with the fan off' in message
     assert any(note.startswith('alike: ') for note in result.calibration.provenance.notes)
-    # These effects are below the noise: the unit starts in a soak, and its supports are rigid.
+    # Lag states and tilts are below the noise: the unit starts in a soak, on rigid supports.
     noise = result.fit.selected.score.noise
     assert max(result.contributions.initial_lag_states, result.contributions.support_tilt) < noise
     assert result.contributions.thermal_response > 50.0 * noise
@@ -58,7 +58,7 @@ def test_a_bag_without_fan_separates_lags_of_board_and_gradient():
     assert all(finding.name != 'environment' for finding in result.findings)
     assert not advice_of(result)
     # Without fan the gradient of a ramp is 1 / 0.7 = 1.43 times as large. With one such bag in ten
-    # the columns differ by 0.43 * sqrt(0.1 * 0.9) = 0.13 RMS: the inflation is 0.13^-2 = 60.
+    # the columns differ by 0.43 * sqrt(0.1 * 0.9) = 0.13 RMS: variance inflation 0.13^-2 = 60.
     assert 30.0 < inflation_of(result, 'board', 'gradient_lag') < 90.0
 
 
@@ -79,7 +79,7 @@ def test_one_attitude_in_the_chamber_does_not_separate_bias_and_scale():
     ('parts', 'correlation', 'n_directions', 'is_advised'),
     [
         (('bias', 'bias'), 0.996, 1, True),  # variance inflation factor: 125
-        (('bias', 'bias'), 0.994, 9, False),  # an inflation of 84
+        (('bias', 'bias'), 0.994, 9, False),  # variance inflation factor: 84
         (('bias', 'scale'), 0.996, 6, True),
         # The finding `positions` says that five attitudes do not separate bias and scale.
         (('bias', 'scale'), 0.996, 5, False),

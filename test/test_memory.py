@@ -89,7 +89,7 @@ def test_a_lag_of_two_stages_equals_two_parts_in_series(rng):
         streamed.append(memory.at(stamp, celsius, [celsius]))
     streamed = np.array(streamed)
     part = after_two_stages(times, board)
-    # The solver has an error of some uK, because it steps over the corners of the input.
+    # The solver has an error of some uK, because its steps do not end at corners of the input.
     np.testing.assert_allclose(streamed[:, 0], board - part, atol=1e-5)
     np.testing.assert_allclose(streamed[:, 2], part, atol=1e-5)
     assert np.abs(streamed[:, 4]).max() <= 0.4 + 1e-12

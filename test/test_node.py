@@ -116,7 +116,7 @@ def test_the_regime_flag_is_latched_and_not_published_while_unknown(peer, saved)
         late = peer.listen(Bool, 'regime/dynamic', LATCHED)
         peer.wait_for(lambda: late, 'the latched flag')
         assert not late[0].data
-        # `regime/stamped`, the flag with the stamp of the deciding reading, is latched, too.
+        # `regime/stamped` (stamp: that of the deciding reading) is latched like `regime/dynamic`.
         latched = peer.listen(DiagnosticArray, 'regime/stamped', LATCHED)
         peer.wait_for(lambda: latched and len(stamped_flags) == len(flags), 'the stamped flags')
         last_ns = ros.stamp_of(stamped_flags[-1])

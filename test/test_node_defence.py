@@ -276,7 +276,7 @@ raise SystemExit(node.main(['node', '--ros-args', '-p', 'calibration_file:=gone.
 
 
 def test_a_node_that_hangs_at_the_start_ends_with_one_or_with_repeated_signals():
-    # WHY: the first SIGTERM had no effect; later, each further SIGTERM prolonged the wait.
+    # WHY: the first SIGTERM had no effect; in a later version each SIGTERM delayed the end.
     words = [sys.executable, '-c', HANGING]
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout.readline() == 'reads\n'

@@ -306,7 +306,7 @@ def test_one_bag_of_ramps_beside_soaks_determines_the_lags():
 
 @pytest.mark.slow
 def test_a_bias_decay_after_power_on_is_not_fitted_by_a_lag():
-    # WHY: lags fitted a bias decay after power-on: from other starts the force error was 1.7 mg.
+    # WHY: lags fitted a bias decay: with other initial temperatures the force error was 1.7 mg.
     rng = rng_of('power-on', 4)
     unit = cases.consumer_grade(rng)
 
@@ -319,7 +319,7 @@ def test_a_bias_decay_after_power_on_is_not_fitted_by_a_lag():
         for way, n in ((cases.WARM, 12), (cases.WARM_HELD, 4))
     )
     study = cases.Study('', fit, cases.one_test(held), {'full_scale': 32767.0})
-    # The decay of the bias has an RMS of 0.32 mg; its mean, below 0.32 mg, is in the constants.
+    # The decay of the bias has an RMS of 0.32 mg; its mean, below 0.32 mg, is fitted as bias.
     assert judged(strangers.fitted(study), study).vector < np.sqrt(2.0) * 320.0
 
 

@@ -101,7 +101,7 @@ def test_a_frozen_sensor_is_detected_by_changes_of_the_second_sensor(sensor, fro
     other = tracker.checks['case'] if frozen == 'board' else tracker.checks['board']
     assert other.fault == Fault.NONE
     seen = getattr(tracker, frozen)
-    # Until detected, the frozen board is off by up to 4 quanta + 2 K, the case by 4 quanta + 12 K.
+    # Until detected a frozen board reading errs by <= 4 quanta + 2 K, a case reading by 10 K more.
     lead = 10.0 if frozen == 'case' else 0.0
     off = (board if frozen == 'board' else case) - seen.temperature
     assert abs(off) < 4.0 * quantum + 2.0 + lead
@@ -114,7 +114,7 @@ def test_a_frozen_sensor_is_detected_by_changes_of_the_second_sensor(sensor, fro
 
 @pytest.mark.parametrize('sensor', ['board', 'case'])
 def test_a_jump_that_stays_is_claimed_until_the_readings_jump_back(sensor):
-    # WHY: three lags after a jump by 5 K the claimed sd of the temperature no longer covered it.
+    # WHY: after three time constants the claimed sd no longer covered a wrong jump by 5 K.
     tracker = tracker_of(memory=LAG)
     place = VAR_BOARD if sensor == 'board' else VAR_GRADIENT
     for second in range(12_000):

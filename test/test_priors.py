@@ -112,7 +112,7 @@ def test_the_scatter_of_an_axis_is_averaged_over_the_axes_of_three_units(rng):
 
 
 def test_chance_correlations_between_parameters_of_twelve_units_are_reduced(rng):
-    # WHY: with a prior from twelve units the force error was 4.7 mg, the claimed sd 0.9 mg.
+    # WHY: due to chance correlations in a prior a force error was 4.7 mg, its claimed sd 0.9 mg.
     layout = parameter_layout(rich_calibration())
     n = layout.n_parameters
 

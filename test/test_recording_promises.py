@@ -179,7 +179,7 @@ def other(content):
 
 
 def one_by_one(data):
-    """Return (place, size, channel, log time) of each message, other records, last end."""
+    """Return (place, size, channel, log time) of each message, other records, end of the last."""
     at, messages, others = 0, [], []
     while at + 9 <= len(data):
         opcode, length = struct.unpack_from('<BQ', data, at)

@@ -163,7 +163,7 @@ def test_the_uncertainty_budget_adds_up_to_the_claimed_sd_or_a_larger_residual(t
     standards = {source.name: source.standard for source in budget(evidence(), CertificateInfo())}
     assert standards['gravity'] is None
     assert standards['thermometers'] is None
-    # The claimed sd is the root sum square of four rows.
+    # The claimed sd is the root sum square of four rows of the budget.
     windows = evidence().judgement.windows
     claim = float(np.sqrt(np.mean(windows.claimed_sd[windows.is_inside] ** 2)))
     parts = [standards[name] for name in ('noise', 'attitude', LACK, 'model')]

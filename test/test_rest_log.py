@@ -116,7 +116,7 @@ def test_logged_windows_are_means_over_10_s_at_rest_with_a_mean_rate_if_none_is_
 
 @pytest.mark.parametrize('rate', [1.0, 2.0, 3.3, 5.0, 50.0, 2000.0])
 def test_rests_are_found_at_any_rate_of_samples(rate, rng):
-    # Rests of one minute in two attitudes, with jitter; above `RATE_HZ` noise has equal density.
+    # Two rests of a minute, stamps with jitter; above `RATE_HZ` the noise has a constant density.
     n = round(120 * rate)
     cycles = np.arange(n) + 0.1 * rng.uniform(-1.0, 1.0, n)
     stamps = START_NS + np.rint(cycles * SECOND_NS / rate).astype(np.int64)
@@ -248,7 +248,7 @@ def test_a_killed_node_damages_at_most_one_line_of_its_rest_log(tmp_path, unit, 
     sent = 0
 
     def until(condition, what):
-        """Send bursts of 50 samples until a condition holds; DDS discovery loses the first."""
+        """Send bursts of 50 samples until a condition holds; DDS loses those before discovery."""
         nonlocal sent
         pause = threading.Event()
         for _ in range(len(samples) // RATE_HZ):

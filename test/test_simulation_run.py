@@ -185,7 +185,7 @@ def test_presets_agree_with_a_numerical_integrator(name):
         (0.0, program.duration_s), states[0], method='LSODA', t_eval=time, rtol=1e-10, atol=1e-10,
         max_step=60.0,
     )  # fmt: skip
-    # The integrator has an error of 2e-5 K, because it steps over the corners of the program.
+    # The integrator has an error of 2e-5 K, as its steps do not end at corners of the program.
     np.testing.assert_allclose(states, solved.y.T, atol=2e-5)
 
 

@@ -167,7 +167,7 @@ def test_time_and_size_of_a_jump_along_gravity_are_found(rng, with_gyro):
 
 @pytest.mark.parametrize('rate_hz', [0.5, 2.0, 5.0])
 def test_a_jump_is_found_at_low_sample_rates(rng, rate_hz):
-    # WHY: at 2 Hz the gap between the rests beside a jump lasted 60 s (limit: 30 s).
+    # WHY: no jump was found: at 2 Hz the gap between the rests beside it was 60 s (limit: 30 s).
     rest = Rest(rng, duration_s=8000.0 / rate_hz, rate_hz=rate_hz, pace_s=4000.0)
     rest.add((0.0, 0.0, 20.0 * MG), from_s=4000.0 / rate_hz)
     source = rest.source()

@@ -67,7 +67,7 @@ def test_the_claimed_sd_of_lags_covers_a_start_in_a_ramp():
 
 
 def test_without_case_readings_the_gradient_is_that_at_rest():
-    # WHY: the board is 1 K warmer than the case; without case readings 0 K was assumed.
+    # WHY: without case readings a gradient of 0 K was assumed, although the board is 1 K warmer.
     of_gradient = (term('gradient', (30.0, 0.0, 0.0)),)
     soak = np.full(2000, 20.0)
     _, corrected, _ = at_1_hz(calibration(response=of_gradient), soak, soak[:1500] - 1.0)
@@ -147,7 +147,7 @@ def test_a_state_beyond_the_edge_of_a_column_is_limited_and_increases_the_sd():
     edge, beyond = (correction.line(s, s, np.zeros(N_ROWS), 0.0) for s in (inside, outside))
     assert beyond[:12].tolist() == edge[:12].tolist()
     assert math.sqrt(beyond[12] - edge[12]) == pytest.approx(30.0 / 300.0 * 2.0)
-    of_y = [27, 29, 32]  # coefficients of 1, y and y^2 in the variance of y
+    of_y = [27, 29, 32]  # coefficients of 1, f and f^2 in the variance of axis y
     assert beyond[of_y].tolist() == edge[of_y].tolist()
     excess = correction.excess(outside, is_dynamic=False)
     assert (excess.relative, excess[:3]) == (pytest.approx(2.0), (0.0, 0.0, 2.0))
@@ -166,7 +166,7 @@ def sd_at(unit, board, behind=0.0, force=0.0):
 
 
 def test_a_line_of_many_states_takes_one_noise_excess_for_all():
-    # `update` evaluates the states of all rests of a log at once, without an excess of noise.
+    # `update` evaluates the states of all rests of a log at once, with a `noise_excess` of 0.
     correction = Correction(rich_calibration())
     states = ramp_states(rich_calibration(), np.linspace(10.0, 30.0, 2049)).T
     line = correction.line(states, states, np.zeros((N_ROWS, 2049)), 0.0)
@@ -176,7 +176,7 @@ def test_a_line_of_many_states_takes_one_noise_excess_for_all():
 
 
 def test_outside_the_range_the_claimed_sd_is_that_of_curve_and_parts():
-    # Outside of the range the claimed sd is that of the curve's slope, as if no lag cancelled it.
+    # Outside the range no lag cancels the curve's slope: the claimed sd is that of the slope.
     parts = regime_set(axis_set((0.0, 0.5), residual_sd_m_s2=1e-6))
     lag = term('board', (-0.5, 0.0, 0.0), tau_s=600.0)
     unit = calibration(static=parts, dynamic=parts, response=(lag,))
@@ -197,7 +197,7 @@ def test_outside_the_range_the_claimed_sd_is_that_of_curve_and_parts():
     # The range is 5 to 35 degC. A part at 34 degC adds no variance; a part at 41 degC does.
     assert sd_at(unit, 33.0, behind=-1.0) == pytest.approx(1e-6, rel=1e-6)
     assert sd_at(unit, 33.0, behind=-8.0) == pytest.approx(bends * 6.0 / 300.0, rel=0.05)
-    # WHY: a bump of the bias over a part's temperature caused 230 ug, with a claimed sd of 14 ug.
+    # WHY: for a bump of the bias over part temperature the error was 230 ug, claimed sd 14 ug.
     unit = calibration(response=(term('bend', (0.5, 0.0, 0.0), tau_s=600.0),))
     # The slope is 0 below 20 degC, 0.5 counts/K above: its sd over the range is 0.25 counts/K.
     assert sd_at(unit, 7.0, behind=5.0) == pytest.approx(0.25 * 3.0 / 300.0, rel=0.1)

@@ -27,7 +27,7 @@ KINK = np.array([0.0, 1e-5, -1e-5])
 
 
 def fit_of(temperature, up, position, slope=1e-5, gravity=10.0):
-    """Make the data that `thermal_ranges` reads of a fit; `slope`: of the scale factors [1/K]."""
+    """Make the data of a fit that `thermal_ranges` reads; `slope`: of the scale factors [1/K]."""
     kelvins, temperature = np.array([1.0]), np.asarray(temperature, dtype=float)
     data = Parts(position=np.asarray(position), groups=('curve',), kelvins=kelvins)
     weights = np.zeros((2, 3, 1))
@@ -211,7 +211,7 @@ def rms(values):
 
 @pytest.mark.slow
 def test_a_lag_is_corrected_at_twice_the_rates_of_the_fit():
-    # WHY: a fit with products of a lag, but not the lag, erred by over 1.7 mg at twice the rates.
+    # WHY: with products of a lag, but not the lag, fits erred by > 1.7 mg at twice the ramp rates.
     rng = np.random.default_rng(2)
     up = (0.0, -20.0), (1200.0, -20.0), (9000.0, 45.0), (10200.0, 45.0)
     down = tuple((t, 25.0 - celsius) for t, celsius in up)
@@ -226,7 +226,7 @@ def test_a_lag_is_corrected_at_twice_the_rates_of_the_fit():
     is_used = at_rest & np.isfinite(out.specific_force).all(axis=1)
     error = (out.specific_force - force)[is_used]
     error = error[: len(error) // 60 * 60].reshape(-1, 60, 3).mean(axis=1)
-    # A fit with products of the lag, but not the lag, has an error larger than this effect.
+    # A fit with products of the lag, but not the lag, has errors above the lag's effect `of_lag`.
     assert rms(of_lag) > 0.5e-3 * GRAVITY
     assert rms(error) < 0.25 * rms(of_lag)
 

@@ -204,7 +204,7 @@ OTHER = """\
 </profiles></dds>
 """
 
-#: A program with a reliable and a best-effort subscription, which prints the stamps of each.
+#: A program with a reliable and a best-effort subscription; it prints the stamps of both.
 RECEIVER = """
 from thermo_comp.text import keep_standard_output
 keep_standard_output()
