@@ -87,7 +87,7 @@ def evaluate(
         with table_writer(csv, {}, overwrite=force) as write:
             write(columns_of(judged.windows, [bag.source.name for bag in result.bags]))
     drifts = drifts_of(history_of([model for _, model in models]))
-    _print_sections(out, result.judgements)
+    print_sections(out, result.judgements)
     _print_axes(out, judged)
     _print_expectations(out, judged)
     _print_by_force(out, judged)
@@ -173,7 +173,7 @@ def _print_drifts(out: Output, drifts: Sequence['Drift']) -> None:
         )
 
 
-def _print_sections(out: Output, judgements: Mapping[str, Any]) -> None:
+def print_sections(out: Output, judgements: Mapping[str, Any]) -> None:
     (window_s,) = {judgement.windows.window_s for judgement in judgements.values()}
     out.table(
         ('section', 'model', 'windows', 'RMS ug', 'max ug', 'claimed ug', 'ratio'),
