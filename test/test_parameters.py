@@ -83,7 +83,7 @@ def test_an_update_ignores_other_nodes_and_one_wrong_parameter_changes_none(name
 def test_the_parameter_file_states_the_defaults():
     text = (ROOT / 'config' / 'thermo_comp.params.yaml').read_text(encoding='utf-8')
     # The file has QoS settings only as a comment, because they do not apply to remapped topics.
-    before, overrides_text = text.split('    # The defaults of the overrides:\n    #\n')
+    before, overrides_text = text.split('    # The defaults of the QoS overrides:\n    #\n')
     stated = yaml.safe_load(before)['/**']['ros__parameters']
     expected = {entry.name: entry.default for entry in fields(NodeConfig)}
     del expected['calibration_file'], stated['calibration_file']

@@ -174,6 +174,7 @@ def _print_drifts(out: Output, drifts: Sequence['Drift']) -> None:
 
 
 def print_sections(out: Output, judgements: Mapping[str, Any]) -> None:
+    """Print a row of errors and claimed sd for each section (static, dynamic) and model."""
     (window_s,) = {judgement.windows.window_s for judgement in judgements.values()}
     out.table(
         ('section', 'model', 'windows', 'RMS ug', 'max ug', 'claimed ug', 'ratio'),

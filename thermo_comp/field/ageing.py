@@ -370,7 +370,7 @@ class Solution:
     gravity: tuple[tuple[Change, float, float], ...] = ()
 
     def before(self, row: int) -> Floats:
-        """Return the shift of the file parameters due to the equations before number `row`."""
+        """Return the shift of the calibration's parameters due to the first `row` equations."""
         return np.asarray(self.gains[:row].T @ self.innovations[:row])
 
 

@@ -64,8 +64,8 @@ def claim_of(fit: Fit, gravity_sd: float = 0.0, known_offset_sd: float = 0.0) ->
     offsets by a prior calibration, or 0 [m/s^2]
     """
     regression, chosen = fit.regression, fit.posterior
-    # The rests of a mounting share an offset, but the regression has an offset for each rest. If
-    # these have `n_rests` times the variance, their mean over a mounting has that of one offset.
+    # The rests of a mounting share an offset, but the regression has an offset for each rest. Give
+    # each offset `n_rests` times the variance, so that the mounting's mean keeps the variance.
     mounting = regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
     prior = replace(chosen.prior, offset_sd=chosen.prior.offset_sd * n_rests**0.5)

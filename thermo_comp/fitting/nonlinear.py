@@ -250,7 +250,7 @@ def of_file(
     if forces is None:
         return None
     prior = options.prior.nonlinearity if options.prior else None
-    # The calibrated range of |f| extends 1 % beyond the |f| of the positions at both ends.
+    # The calibrated range of |f| extends 1 % beyond the least and largest |f| of the positions.
     valid = 0.99 * float(forces.sizes.min()), 1.01 * float(forces.sizes.max())
     if prior is None:
         return Nonlinearity(valid, options.nonlinear_sd('square'), tuple(terms))

@@ -231,7 +231,7 @@ class Point:
         If the step increases the energy, fractions of the step of the nonlinear unknowns (those
         that multiply other unknowns) are tried, each with a new step of the linear unknowns.
         """
-        # Energy and step need this point's linearisation, which that of the next point replaces.
+        # Take energy and step first: the next point's linearisation replaces this point's.
         energy, (step, _) = self.energy, self.solution
         result = self.with_step(step)
         if result.energy <= energy:

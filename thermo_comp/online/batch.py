@@ -28,7 +28,7 @@ from .status import DROPPED
 _Arrivals: TypeAlias = list[tuple[int, int, str, int, float]]
 #: Segments of the correction, each with its number of samples.
 Segments: TypeAlias = list[tuple[Segment, int]]
-#: Function of a `Correction.line` result, time since the segment's start [s], sample x, y, z.
+#: Corrects samples: from `Correction.line` results, time since segment start [s], and x, y, z.
 _Arithmetic: TypeAlias = Callable[..., Sequence[Floats]]
 #: Code of the reason for which a sample is dropped; the code 0 marks a published sample.
 _REASONS = {name: number for number, name in enumerate(DROPPED, 1)}

@@ -43,7 +43,8 @@ from .topics import WHOLE, Selected, Topics, select_topics, shown
 from .wire import decode_blocks
 
 _MAX_BYTES = 1 << 24  # largest size of metadata.yaml [bytes], and largest number of its nodes
-_COMPRESSIONS = {'none': '', 'file': 'file', 'message': 'message'}  # by `compression_mode`
+#: Compression by the `compression_mode` of metadata.yaml.
+_COMPRESSIONS = {'none': '', 'file': 'file', 'message': 'message'}
 #: Largest batch that is decoded at a time from a `ForeignFile`: messages, bytes, time [ns].
 _BATCH_MESSAGES, _BATCH_BYTES, _BATCH_NS = 1 << 14, 1 << 23, 10 * 10**9
 

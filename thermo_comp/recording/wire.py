@@ -47,8 +47,8 @@ def decode_blocks(
     keep_raw: bool = False,
 ) -> list[Block]:
     """
-    Decode messages in their order; a block ends where `frame_id` changes. `channels`: numbers and
-    topics of the channels of each input of the bag; `fields`: the field to read of a thermometer.
+    Decode messages in their order; a block ends where `frame_id` changes. `channels`: for
+    each role, the topic of each channel number; `fields`: the field with a thermometer's reading.
     A temperature in a field of another message type is in `raw` as a Temperature message.
     RecordingError, without a path, if the bytes do not fit the message type.
     """

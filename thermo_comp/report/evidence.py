@@ -124,7 +124,7 @@ class Evidence:
 
     @property
     def is_seen(self) -> bool:
-        """Whether the calibration was fitted on a bag of this evidence."""
+        """Whether the calibration was fitted on a bag of this report."""
         fitted = {source.sha256 for source in self.sources if source.sha256}
         shown = {source.sha256 for bag in self.bags for source in bag.sources}
         return bool(self.steps) or not fitted.isdisjoint(shown)

@@ -174,7 +174,7 @@ def bank(
     parts: Sequence[Part] | None = None,
 ) -> tuple[Column, ...]:
     """
-    Return all candidate columns, with ranges that contain every value. `at_rest`: gradient of each
+    Return all candidate columns, with ranges that exclude no value. `at_rest`: gradient of each
     sensor in a soak [K]; `span_k`: lowest and highest board temperature in the data, less the
     reference [K]; `parts`: the lag of the part of each axis; if given, no other lags are used.
     """

@@ -58,7 +58,7 @@ class Curves:
         return over, too_fast, np.abs(over) / (span / 2.0), np.abs(too_fast) / (rate_span / 2.0)
 
     def values(self, board: Floats) -> Floats:
-        """Evaluate bias [input units] and relative scale at board temperatures, (2, 6, n)."""
+        """Evaluate bias [input units] and relative scale of each regime and axis, (2, 6, n)."""
         t = board - self._reference
         held = hold(t, *self._t_range)
         result = self._evaluate(held)
