@@ -236,7 +236,11 @@ class TestVerdict:
         assert judgement.sections['all'].ratio == pytest.approx(residual / claimed)
         for value in (residual, raw, tolerance or claimed):
             assert ug_text(value * MICRO_G) in judgement.reason
-        assert ('limit 100 ug' in judgement.reason) == (tolerance is not None)
+        limited = 'in the worse regime, limit 100 ug' in judgement.reason
+        assert limited == (tolerance is not None)
+        # WHY: the regime was called the worse one also if only one regime had been judged.
+        one = judge(made(residual, raw, claimed, dynamic=0), CLAIMING, limit).reason
+        assert ('over these windows, limit' in one) == limited
 
     def test_the_verdict_on_bags_of_the_fit_states_the_left_out_error_first(self):
         # WHY: the verdict stated the error in fitted, not in new attitudes: 61 ug, not 1091 ug.

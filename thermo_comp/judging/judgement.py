@@ -214,7 +214,8 @@ def _verdict(judgement: Judgement, claims: bool, calibration: Calibration) -> tu
     if np.isfinite(left_out):
         parts = [f'{ug_text(left_out)} RMS of |f| - g on positions left out; in sample {parts[0]}']
     if tolerance is not None:
-        where = 'on positions left out' if worst == left_out else 'in the worse regime'
+        where = 'in the worse regime' if len(sections.regimes) > 1 else 'over these windows'
+        where = 'on positions left out' if worst == left_out else where
         parts.append(f'{ug_text(worst)} RMS {where}, limit {ug_text(tolerance)}')
     elif claims:
         parts.append(
