@@ -349,8 +349,8 @@ def _determines_norm(point: Point, posterior: PosteriorMode, root: Floats, p: in
     """
     Whether the fit without position `p`, of covariance ``root @ root.T``, determines |f| in `p`:
     the variance of |f| is below 10 times (variance by the fit to all data + offset variance), or
-    below the variance of usual mounting offsets. In a fit with poses only the former limit counts,
-    because there the prior of bias and scale makes the variance small.
+    below the variance of usual mounting offsets. Up to nine positions only the former counts:
+    eight other positions do not determine nine constants, so their priors make the variance small.
     """
     if not point.regression.gravity:
         return False
@@ -358,7 +358,7 @@ def _determines_norm(point: Point, posterior: PosteriorMode, root: Floats, p: in
     by_all = float(np.sum((along @ posterior.root) ** 2)) + point.prior.offset_sd**2
     if point.regression.has_turn_ons:
         by_all += point.prior.turn_on_sd**2
-    usual_sd = 0.0 if point.regression.windows.n_poses else point.prior.offset_scale
+    usual_sd = point.prior.offset_scale if point.regression.windows.n_positions > 9 else 0.0
     return float(np.sum((along @ root) ** 2)) < max(10.0 * by_all, usual_sd**2)
 
 
