@@ -348,9 +348,7 @@ def _determines_drift(point: Point, posterior: PosteriorMode, root: Floats, rows
 def _determines_norm(point: Point, posterior: PosteriorMode, root: Floats, p: int) -> bool:
     """
     Whether the fit without position `p`, of covariance ``root @ root.T``, determines |f| in `p`:
-    the variance of |f| is below 10 times (variance by the fit to all data + offset variance), or
-    below the variance of usual mounting offsets. Up to nine positions only the former counts:
-    eight other positions do not determine nine constants, so their priors make the variance small.
+    the variance of |f| is below 10 times (variance by the fit to all data + offset variance).
     """
     if not point.regression.gravity:
         return False
@@ -358,8 +356,7 @@ def _determines_norm(point: Point, posterior: PosteriorMode, root: Floats, p: in
     by_all = float(np.sum((along @ posterior.root) ** 2)) + point.prior.offset_sd**2
     if point.regression.has_turn_ons:
         by_all += point.prior.turn_on_sd**2
-    usual_sd = point.prior.offset_scale if point.regression.windows.n_positions > 9 else 0.0
-    return float(np.sum((along @ root) ** 2)) < max(10.0 * by_all, usual_sd**2)
+    return float(np.sum((along @ root) ** 2)) < 10.0 * by_all
 
 
 def _by_sections(
