@@ -415,6 +415,7 @@ def test_left_out_norms_of_faces_laid_by_hand_show_a_misalignment_of_20_mrad():
     np.testing.assert_allclose(calibration.misalignment, true, atol=4e-3)
 
 
+@pytest.mark.slow
 def test_a_clearly_larger_evidence_shows_the_misalignment_of_faces_laid_with_tilts_of_1_deg():
     # WHY: left-out |f| did not decide between prior sds of M; an element of M was 8 mrad wrong.
     rng = np.random.default_rng(508)
