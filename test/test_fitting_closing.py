@@ -130,13 +130,13 @@ def test_variance_ratio_and_correlation_time_are_estimated(rng, noise):
 MICRO = 9.80665e-6  # a micro-g [m/s^2]
 
 
-def score(drift, norms=(), by_thermometer=0.0):
+def score(drift, norms=(), by_thermometer=0.0, by_offsets=0.0):
     """Return a score of equal left-out drifts `drift` and left-out |f| errors `norms` [ug]."""
     drifts = Folds(np.full(18, (drift * MICRO) ** 2), np.full(18, 20.0))
     of_norms = Folds((np.array(norms) * MICRO) ** 2, np.full(len(norms), 20.0))
     none = np.zeros((0, 3))
-    error = by_thermometer * MICRO
-    return Score(drifts, drifts, of_norms, none, none, drifts, by_thermometer=error)
+    given = {'by_thermometer': by_thermometer * MICRO, 'by_offsets': by_offsets * MICRO}
+    return Score(drifts, drifts, of_norms, none, none, drifts, **given)
 
 
 def test_neither_few_norms_nor_errors_of_a_coarse_thermometer_select_a_model():
@@ -158,6 +158,18 @@ def test_neither_few_norms_nor_errors_of_a_coarse_thermometer_select_a_model():
     assert is_better(flat, curved)
     assert not is_better(curved, score(20.0, 30.0 * np.ones(9), by_thermometer))
     assert is_better(score(46.0, (), 5.0), score(20.0, (), 5.0))
+
+
+def test_left_out_norms_that_stated_offsets_explain_do_not_reject_a_model():
+    # WHY: with a stated mounting sd of 300 ug, random differences of left-out |f| rejected the
+    # lags of the parts, which lower the left-out drift from 9.4 ug to 1.0 ug.
+    norms = np.array([1016.0, 142.0, 1258.0, 244.0, 647.0, 467.0])
+    for by_offsets, is_accepted in ((700.0, True), (300.0, False)):
+        curve = score(9.4, norms, by_offsets=by_offsets)
+        parts = score(1.0, norms * (1.6, 2.8, 1.2, 2.2, 1.3, 1.5), by_offsets=by_offsets)
+        assert is_better(curve, parts) == is_accepted
+    # Equal drifts, and smaller |f| errors that offsets explain: no model is better.
+    assert not is_better(score(1.0, norms, by_offsets=700.0), score(1.0, 0.5 * norms))
 
 
 def test_a_fit_with_large_mounting_offsets_must_not_increase_left_out_norms():

@@ -149,23 +149,21 @@ def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Fl
     log prior density of the logarithm of this sd at these values.
 
     `scale`: `Prior.offset_scale` [m/s^2]; `known_sd`: offset sd by a prior calibration [m/s^2],
-    0 without a prior calibration; `kind`: 'mounting', 'turn-on' or 'both', see `largest_ratio`
+    0 without a prior calibration; `kind`: 'mounting', 'turn-on' or 'both', see `of_kind`
     """
     if known_sd:
         # A test of 12 positions determines the sd of mounting offsets within a factor of 1.5.
         ratio = 10.0 ** np.arange(-1.5, 1.51, 0.125)
         return known_sd * ratio, log_student(np.log(ratio) / np.log(1.5))
-    # Smallest usual ratio of offset sd to `scale`. By data sheets, the bias of navigation-grade
-    # triads repeats to 10 ug at best between turn-ons, better between mountings of a turn-on.
-    smallest_ratio = 0.01 if kind == 'mounting' else min(1e-4 / scale, 1.0)
-    # Largest usual ratio of offset sd to `scale`. 'mounting': mountings within a turn-on;
-    # 'turn-on': a single turn-on, which does not show how well the bias repeats (a value between 0
-    # and `LARGE_OFFSETS`); 'both': several turn-ons, or mountings that each begin with a turn-on.
-    largest_ratio = {'mounting': 1.0, 'turn-on': 2.0, 'both': LARGE_OFFSETS}[kind]
-    # The log evidence is smooth over the grid's step, a third of a decade of the sd.
-    ratio = 10.0 ** np.linspace(-3.45, 2.25, 19)
-    small = np.minimum(np.log(ratio / smallest_ratio), 0.0)
-    return scale * ratio, log_student(ratio / largest_ratio) + small
+    # Scale of the prior of the sd, a half-Student density, relative to `scale`. 'mounting':
+    # mountings within a turn-on; 'turn-on': a single turn-on, which does not show how well the
+    # bias repeats (a value between 0 and `LARGE_OFFSETS`); 'both': several turn-ons, or mountings
+    # that each begin with a turn-on.
+    of_kind = {'mounting': 1.0 / 3.0, 'turn-on': 1.0, 'both': LARGE_OFFSETS}[kind]
+    # The log evidence is smooth over the grid's step, a third of a decade of the sd. The density
+    # of the logarithm of the sd is the density of the sd times the sd.
+    ratio = 10.0 ** np.linspace(-2.5, 2.25, 16)
+    return scale * ratio, log_student(ratio / of_kind) + np.log(ratio)
 
 
 def _places(layout: Layout, widened: Layout) -> Ints:
@@ -267,9 +265,15 @@ def _over_mountings(
     n_rests = len(mounting) / (mounting[-1] + 1)
     priors = [replace(prior, offset_sd=sd) for sd in tried.tolist()]
     fits = [regression.solve(posterior.state, each, n_steps=1) for each in priors]
+    # The fitted sd of tilts of the supports is too large if drifts due to mounting offsets were
+    # fitted by tilts: try a small sd, too, with steps to the mode without tilts.
+    rigid = [
+        regression.solve(posterior.state, replace(each, tilt_sd=0.1 * each.tilt_sd), n_steps=3)
+        for each in priors
+    ]
     # With a large sd of mounting offsets attitudes absorb model errors, so the log evidence rises:
     # limit its rise to the rise of the log evidence of |f|, plus `CLEAR_GAIN`.
-    of_data = np.array([fit.log_evidence for fit in fits])
+    of_data = np.logaddexp([fit.log_evidence for fit in fits], [fit.log_evidence for fit in rigid])
     of_norms = _norm_evidence(regression, posterior, tried, fits[-1].root)
     nearest = int(np.argmin(np.abs(np.log(tried * n_rests**0.5 / prior.offset_sd))))
     of_data, of_norms = of_data - of_data[nearest], of_norms - of_norms[nearest]

@@ -124,6 +124,8 @@ class Score:
     noise: white noise of a window, RMS of the axes [m/s^2]
     by_thermometer: error of a window due to a coarse board thermometer, RMS of the axes [m/s^2]
     settled: expected error of the bias at settled temperatures [m/s^2] (`settled_error`), or 0
+    by_offsets: expected error of left-out |f| [m/s^2] if the user states the sd of the mounting
+        offsets, which determines most of this error; else 0
     """
 
     positions: Folds
@@ -135,6 +137,7 @@ class Score:
     noise: float = 0.0
     by_thermometer: float = 0.0
     settled: float = 0.0
+    by_offsets: float = 0.0
 
     @property
     def kinds(self) -> tuple[Folds, Folds, Folds]:
@@ -203,9 +206,13 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
 
 
 def is_worse_by_norms(before: Score, after: Score) -> bool:
-    """Whether errors of left-out |f| are larger in `after` by more than a standard error."""
+    """
+    Whether errors of left-out |f| are larger in `after` by more than a standard error, and stated
+    mounting offsets do not explain them.
+    """
     norms = before.norms.gain_of(after.norms)
-    return norms is not None and norms[0] < -norms[1]
+    is_explained = after.norms.rms <= _NOISE_RATIO * after.by_offsets
+    return norms is not None and norms[0] < -norms[1] and not is_explained
 
 
 def is_undecided(before: Score, after: Score) -> bool:
@@ -228,11 +235,12 @@ def is_near(chosen: Score, other: Score) -> bool:
 def _beyond_thermometer(before: Score, after: Score) -> list[tuple[float, float] | None]:
     """
     Return the log ratio of mean square errors, `before` / `after` (`Folds.gain_of`), for each kind
-    of folds; None if a coarse thermometer explains the errors. Thermometer errors repeat in all
+    of folds; None if a coarse thermometer or stated offsets explain the errors. Thermometer errors repeat in all
     bags of one chamber program: a model that fits these errors is better on left-out bags, but
     fails in another program.
     """
-    is_norm_kept = before.norms.rms > _NOISE_RATIO * before.by_thermometer
+    explained = float(np.hypot(before.by_thermometer, before.by_offsets))
+    is_norm_kept = before.norms.rms > _NOISE_RATIO * explained
     keep = (not before.is_by_thermometer, not before.is_by_thermometer, is_norm_kept)
     ratios = _gains(before, after)
     return [ratio if kept else None for ratio, kept in zip(ratios, keep, strict=True)]
@@ -247,7 +255,8 @@ def score_of(regression: Regression, posterior: PosteriorMode) -> Score:
     regression.whiten(posterior.prior.noise)
     last = int(regression.windows.section.max())
     numbers = np.arange(last + 1 if last else 0)
-    positions, norms, force, drift = _by_positions(regression, posterior)
+    positions, norms, force, drift, norm_sd = _by_positions(regression, posterior)
+    by_offsets = 0.0 if posterior.prior.offset_scale else norm_sd
     sections, section_drift = _by_sections(regression, posterior, numbers[:, None])
     halves = np.array_split(numbers, 2) if len(numbers) else []
     by_halves, _ = _by_sections(regression, posterior, halves, n_steps=2, is_within=True)
@@ -256,7 +265,7 @@ def score_of(regression: Regression, posterior: PosteriorMode) -> Score:
     by_thermometer = thermometer_error_of(regression.windows, scale, beyond_noise=True)
     errors = white_noise_of(regression.windows, scale), by_thermometer
     rms = (float(np.sqrt(np.mean(error**2))) for error in errors)
-    score = Score(positions, sections, norms, force, drift, by_halves, *rms)
+    score = Score(positions, sections, norms, force, drift, by_halves, *rms, by_offsets=by_offsets)
     settled = regression.windows.settled
     if settled is None:
         return score
@@ -300,15 +309,18 @@ def _variance(layout: Layout, columns: Floats, force: Floats, root: Floats) -> f
 
 def _by_positions(
     regression: Regression, posterior: PosteriorMode
-) -> tuple[Folds, Folds, Floats, Floats]:
-    """Leave out mountings; return `positions`, `norms`, `force` and `drift` of the `Score`."""
+) -> tuple[Folds, Folds, Floats, Floats, float]:
+    """
+    Leave out mountings; return `positions`, `norms`, `force` and `drift` of the `Score`, and the
+    expected RMS error of the scored |f| [m/s^2].
+    """
     windows, share = regression.windows, regression.weight / regression.windows.weight
     point, edges = regression.at(posterior.state, posterior.prior), windows.edges
     counts = np.diff(edges).astype(np.float64)
     force = np.full((len(windows.time), 3), np.nan)
     sizes = regression.norms(point.state)
     drift = np.full_like(force, np.nan)
-    squares, norms = np.full((2, windows.n_positions), np.nan)
+    squares, norms, expected = np.full((3, windows.n_positions), np.nan)
     for places, matrix in point.without_each():
         step, factor = point.unit_step(matrix)
         state = point.with_step(np.pad(step, (0, point.layout.n - len(step)))).state
@@ -320,12 +332,15 @@ def _by_positions(
             if counts[p] >= _FEWEST_WINDOWS and is_known:
                 drift[rows] = corrected - np.average(corrected, axis=0, weights=weight)
                 squares[p] = np.average(np.mean(drift[rows] ** 2, axis=1), weights=weight)
-            if _determines_norm(point, posterior, root, p):
+            expected[p] = _norm_variance(point, posterior, root, p)
+            if np.isfinite(expected[p]):
                 force[rows] = corrected
                 error = np.linalg.norm(corrected, axis=1) - sizes[p]
                 norms[p] = np.average(error**2, weights=weight)
     of_drift, of_norm = (Folds.of(square, counts, windows.mounting) for square in (squares, norms))
-    return of_drift, of_norm, force, drift
+    is_scored = np.isfinite(expected)
+    norm_sd = float(np.sqrt(expected[is_scored].mean())) if is_scored.any() else 0.0
+    return of_drift, of_norm, force, drift, norm_sd
 
 
 def _determines_drift(point: Point, posterior: PosteriorMode, root: Floats, rows: slice) -> bool:
@@ -345,18 +360,21 @@ def _determines_drift(point: Point, posterior: PosteriorMode, root: Floats, rows
     return by_others < 10.0 * (by_all + noise)
 
 
-def _determines_norm(point: Point, posterior: PosteriorMode, root: Floats, p: int) -> bool:
+def _norm_variance(point: Point, posterior: PosteriorMode, root: Floats, p: int) -> float:
     """
-    Whether the fit without position `p`, of covariance ``root @ root.T``, determines |f| in `p`:
-    the variance of |f| is below 10 times (variance by the fit to all data + offset variance).
+    Return the variance of |f| in position `p` by the fit without it, of covariance
+    ``root @ root.T``, plus the offset variance; NaN if the fit does not determine |f| in `p`: its
+    variance is not below 10 times (variance by the fit to all data + offset variance).
     """
     if not point.regression.gravity:
-        return False
+        return np.nan
     along = point.norms_by_unit[p]
-    by_all = float(np.sum((along @ posterior.root) ** 2)) + point.prior.offset_sd**2
+    by_offset = point.prior.offset_sd**2
     if point.regression.has_turn_ons:
-        by_all += point.prior.turn_on_sd**2
-    return float(np.sum((along @ root) ** 2)) < 10.0 * by_all
+        by_offset += point.prior.turn_on_sd**2
+    by_all = float(np.sum((along @ posterior.root) ** 2))
+    by_others = float(np.sum((along @ root) ** 2))
+    return by_others + by_offset if by_others < 10.0 * (by_all + by_offset) else np.nan
 
 
 def _by_sections(
