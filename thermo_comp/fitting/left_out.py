@@ -235,9 +235,9 @@ def is_near(chosen: Score, other: Score) -> bool:
 def _beyond_thermometer(before: Score, after: Score) -> list[tuple[float, float] | None]:
     """
     Return the log ratio of mean square errors, `before` / `after` (`Folds.gain_of`), for each kind
-    of folds; None if a coarse thermometer or stated offsets explain the errors. Thermometer errors repeat in all
-    bags of one chamber program: a model that fits these errors is better on left-out bags, but
-    fails in another program.
+    of folds; None if a coarse thermometer or stated offsets explain the errors. Errors of a
+    thermometer repeat in all bags of one chamber program: a model that fits these errors is better
+    on left-out bags, but fails in another program.
     """
     explained = float(np.hypot(before.by_thermometer, before.by_offsets))
     is_norm_kept = before.norms.rms > _NOISE_RATIO * explained
@@ -256,7 +256,6 @@ def score_of(regression: Regression, posterior: PosteriorMode) -> Score:
     last = int(regression.windows.section.max())
     numbers = np.arange(last + 1 if last else 0)
     positions, norms, force, drift, norm_sd = _by_positions(regression, posterior)
-    by_offsets = 0.0 if posterior.prior.offset_scale else norm_sd
     sections, section_drift = _by_sections(regression, posterior, numbers[:, None])
     halves = np.array_split(numbers, 2) if len(numbers) else []
     by_halves, _ = _by_sections(regression, posterior, halves, n_steps=2, is_within=True)
@@ -265,9 +264,10 @@ def score_of(regression: Regression, posterior: PosteriorMode) -> Score:
     by_thermometer = thermometer_error_of(regression.windows, scale, beyond_noise=True)
     errors = white_noise_of(regression.windows, scale), by_thermometer
     rms = (float(np.sqrt(np.mean(error**2))) for error in errors)
-    score = Score(positions, sections, norms, force, drift, by_halves, *rms, by_offsets=by_offsets)
-    settled = regression.windows.settled
-    if settled is None:
+    score = Score(positions, sections, norms, force, drift, by_halves, *rms)
+    if not posterior.prior.offset_scale:
+        score = replace(score, by_offsets=norm_sd)
+    if (settled := regression.windows.settled) is None:
         return score
     return replace(score, settled=settled_error(regression, posterior, score.excess, settled))
 
