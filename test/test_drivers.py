@@ -54,6 +54,8 @@ LAYOUTS = {
 }  # fmt: skip
 #: Drivers whose bags are fitted: one for each type of temperature message, one without readings.
 FITTED = {'mavros', 'px4', 'phidgets', 'ardupilot'}
+# Drivers whose bag takes the longest time: they run in `make slow`.
+SLOW = {'px4', 'phidgets'}
 #: Seven rests of REST_S [s]: six faces, the first again; the board warms by WARMING [K/s].
 UPS = np.concatenate((np.eye(3), -np.eye(3), [[1.0, 0.0, 0.0]]))
 RATE, REST_S, WARMING = 5, 75, 0.05
@@ -122,7 +124,14 @@ def test_every_driver_has_a_layout_and_a_line_in_the_page():
             assert name == 'output' or topic.partition(':')[0] in line, (path.stem, topic)
 
 
-@pytest.mark.parametrize(('path', 'bag'), [(file, file.stem) for file in FILES], indirect=['bag'])
+@pytest.mark.parametrize(
+    ('path', 'bag'),
+    [
+        pytest.param(file, file.stem, marks=[pytest.mark.slow] * (file.stem in SLOW))
+        for file in FILES
+    ],
+    indirect=['bag'],
+)
 def test_every_command_reads_a_bag_with_the_topics_of_the_driver(path, bag, tmp_path, cli):
     names, topics = read_names(path), ('--topics', path)
     has_board = path.stem not in {'ardupilot', 'realsense', 'mpu6050'}

@@ -127,6 +127,7 @@ def test_a_move_between_parts_gives_two_rests_and_parts_without_a_rest_are_joine
     assert second.begin_s == pytest.approx(second.time[0] - 0.5 * bag.window_s, abs=0.01)
 
 
+@pytest.mark.slow
 def test_a_split_recording_gives_the_calibration_of_the_whole_recording():
     # WHY: each part was fitted with a separate turn-on and separate lag states: the claimed sd was
     # 6 times that of a fit to the whole recordings.

@@ -213,7 +213,8 @@ def after(change, ups):
     return np.array([after[0] - before[0], after[1], after[2] / before[2] - 1.0, after[3]])
 
 
-@pytest.mark.parametrize('n_faces', [1, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize('n_faces', [1, 3])
 def test_one_to_three_faces_of_an_unchanged_unit_keep_the_calibration(n_faces):
     # WHY: a rest on one face increased the claimed sd of bias and scale from 0.2 to 424 ug.
     bias, bias_sd, scale, scale_sd = after(lambda counts, _: counts, np.eye(3)[:n_faces])

@@ -181,6 +181,7 @@ def test_the_uncertainty_budget_adds_up_to_the_claimed_sd_or_a_larger_residual(t
     assert whole == pytest.approx(3.0 * claim)
 
 
+@pytest.mark.slow
 def test_the_lack_of_fit_is_a_row_of_the_budget_and_not_part_of_the_model():
     # WHY: the budget did not name the lack of fit, which the row `model` contained.
     def with_lack(*sds):
