@@ -210,9 +210,9 @@ class Tangent:
     and of the unit (kappa, bias, weights, nonlinear coefficients, radius, 3 of the misalignment, 2
     of each pose). The last element is for the residual, measured minus predicted.
 
-    combined: the combinations of base series, shape (n_positions, 3, n_base, n_combined)
-    place: index of the series of each unknown, shape (k + 1,)
-    factor: factor of the series of each unknown, shape (n_positions, 3, k + 1)
+    combined: weights of the base series in each combination, (n_positions, 3, n_base, n_combined)
+    place: index of each unknown's series, a base series or one of `combined`, shape (k + 1,)
+    factor: factor of this series in the unknown's derivative, shape (n_positions, 3, k + 1)
     n_local: number of unknowns of position and bag
     n_bias: number of unknowns after kappa that have the factor 1: the bias and its weights
     n_scale: number of weights of the scale, which follow the weights of the bias
@@ -228,7 +228,10 @@ class Tangent:
     scale: Floats
 
     def normal(self, products: Floats) -> Normal:
-        """Build normal equations from `products` of base series, (n_positions, n_base, n_base)."""
+        """
+        Build normal equations from `products`, sums of the products of all pairs of base series in
+        each position, shape (n_positions, n_base, n_base).
+        """
         first, with_combined = self.n_local, products[:, None] @ self.combined
         place = self.place[first:]
         n, bias = len(place), slice(1, 1 + self.n_bias)

@@ -336,7 +336,7 @@ def _cross(a: Floats, b: Floats) -> Floats:
 
 
 def inverse_misalignment(misalignment: Floats) -> Floats:
-    """Return the inverse of M, from its three elements below the diagonal of 1, (3, 3)."""
+    """Return the inverse of M, (3, 3), from the inverse's three elements below the diagonal."""
     matrix = np.eye(3)
     matrix[1, 0], matrix[2, 0], matrix[2, 1] = misalignment
     return matrix
