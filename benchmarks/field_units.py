@@ -207,9 +207,9 @@ class BestFilter:
         """
         Update the filter with a rest.
 
-        now: time [days]; start: number of the turn-on; counts: mean sample of the rest / `K`
-        [m/s^2]; variance: variance of the norm of `counts` [m^2/s^4]; warmth: board temperature
-        less the reference temperature [K]
+        now: time [days]; start: number of the turn-on; counts: mean sample of the rest in counts,
+        divided by `K` [m/s^2]; variance: variance of the norm of `counts` [m^2/s^4]; warmth: board
+        temperature less the reference temperature [K]
         """
         process = self.process
         if start != self._start:

@@ -295,7 +295,7 @@ def paper(found: Measured) -> None:
 
 
 def makespan(tasks: Sequence[float] | np.ndarray, n_workers: int, per_task: float) -> float:
-    """Return the duration of a fit [s] if the scheduler needs `per_task` [s] to send a task."""
+    """Return the duration of all tasks [s] if the scheduler takes `per_task` [s] to send each."""
     free = [0.0] * n_workers
     scheduler = end = 0.0
     for task in tasks:

@@ -20,7 +20,7 @@ from thermo_comp.recording.reader import read_recording
 from thermo_comp.recording.writer import BagWriter
 
 ROOT = Path(__file__).resolve().parent.parent
-#: Kind of each unit ('sample': the unit of the sample bags), and options of its fit.
+#: Options of each unit's fit, by its name in `simulate --unit`, or 'sample' for the sample bags.
 UNITS: dict[str, tuple[str, ...]] = {
     'thermostatted': (), 'bare-quartz': (), 'mems': ('--mounting-sd', '30ug'), 'sample': (),
 }  # fmt: skip

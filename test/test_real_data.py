@@ -134,7 +134,8 @@ def test_the_error_of_the_freezer_run_on_held_out_minutes(
     assert len(raw) >= 17 * len(sets) // n_sets
     # One attitude does not determine the constants, so compare the sd of |a|.
     assert np.std(raw) / MG == pytest.approx(drift, abs=0.2)
-    # Means over 60 s have 0.19 mg of noise; part 1 of 5 is outside the temperatures of the rest.
+    # Means over 60 s have 0.19 mg of noise; the first of 5 parts is outside the temperature range
+    # of the other parts.
     assert np.sqrt(np.mean(np.square(left))) / MG == pytest.approx(mg, rel=0.35)
 
 

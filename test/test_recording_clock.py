@@ -45,7 +45,7 @@ def test_a_jump_becomes_an_hour_and_other_intervals_stay(tmp_path, jump_ns):
     after = np.arange(1000) >= 500
     stamp_ns = true_ns + jump_ns * after
     blocks = blocks_of(tmp_path / 'bag.mcap', stamp_ns, stamp_ns[::100])
-    # At equal log times readings precede samples: the sixth reading is the first after the jump.
+    # At equal log times readings precede samples: the first message after the jump is a reading.
     hour = LONGEST_PAUSE_NS * after
     offsets = joined(blocks, 'accel') - true_ns
     assert offsets[:500].tolist() == [0] * 500

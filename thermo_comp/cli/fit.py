@@ -93,8 +93,8 @@ def fit(
 
     Groups of regression columns: curve, set, part, gradient, board,
     gradient_lag, product, gradient_x_temperature, square, gradient_even,
-    gradient_even_about_rest, play, bend. A group is kept if it improves the
-    correction of data left out of the fit.
+    gradient_even_about_rest, play, bend. A group of columns is kept if it
+    improves the correction of data left out of the fit.
 
     Example:
       thermo_comp fit bags/unit42/* -o unit42.yaml --gravity 9.8154

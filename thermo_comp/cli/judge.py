@@ -154,7 +154,7 @@ def _print_by_force(out: Output, judged: 'Judgement') -> None:
                 )
                 for size, section in judged.by_force.items()
             ],
-            title='residual by |f|: corrected magnitude less the known |f|',
+            title='residual for each known |f|: corrected magnitude less known |f|',
         )
 
 

@@ -331,7 +331,7 @@ def _stamp(
     shortest_s = span / _FASTEST_K_S  # shortest plausible duration of the log [s]
     longest = _SLOW_S if _turns_at_once(accel) else _STEPS_S[1]
     # Take the largest unit that gives dates or plausible intervals. An interval above `longest`
-    # is accepted if the log would be shorter than `shortest_s` in the next smaller unit.
+    # is accepted if times in the next smaller unit would make the log shorter than `shortest_s`.
     for unit, exponent in STAMP_EXPONENTS.items():
         size = 10.0 ** (exponent - 9)
         begin, step_s = first * size, step * size

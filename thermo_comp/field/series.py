@@ -271,7 +271,7 @@ def series_of(
 
 
 def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
-    """Return the indices in `memory` of the state elements, and of the lags, of `wanted`."""
+    """Return the place in `memory` of each state element, and of each lag, of `wanted`."""
     try:
         logged, target = StateLayout(memory).numbers, StateLayout(wanted).numbers
         places = np.array([logged.index(number) for number in target], np.int64)

@@ -120,7 +120,8 @@ def rough_centre(means: Floats) -> Floats:
         return zero
     arms = means - means.mean(axis=0)
     spread = float(np.sqrt(np.mean(np.sum(arms**2, axis=1))))
-    # The result is 0 if the norms' sd is below 30 % of the readings' RMS distance from their mean.
+    # Take 0 as centre if the sd of the norms is below 30 % of the readings' RMS distance from
+    # their mean.
     if np.std(np.linalg.norm(means, axis=1)) < 0.3 * spread:
         return zero
     values = np.linalg.eigvalsh(arms.T @ arms)

@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the elimination of the unknowns of positions and bags from the normal equations.
+Owns the elimination of the unknowns of positions and bags from the normal equations of a fit.
 
-Each position has unknowns (attitude, offsets, tilts) that occur in no other position. The
-unknowns of positions are eliminated first, then the initial lag states and the turn-on offset of
-each bag. After the elimination, normal equations for the unknowns of the unit remain.
+Each position has unknowns (attitude, error of |f|, bias offset, tilts) that occur in no other
+position, and each bag has unknowns (initial lag states, turn-on offset) that occur in no other
+bag. The unknowns of the positions are eliminated first, then those of the bags (Schur complement).
+The normal equations of the unit's unknowns remain.
 """
 
 from __future__ import annotations
@@ -90,11 +91,12 @@ def inverse_root(factor: Floats) -> Floats:
 @dataclass(frozen=True)
 class Blocks:
     """
-    Eliminated diagonal blocks of the normal equations: of positions, bags, or `Reduced.common`.
+    Diagonal blocks of the normal equations whose k unknowns are eliminated: the blocks of the n
+    positions or of the n bags, or the single block `Reduced.common`.
 
-    root: inverse of each block's Cholesky factor, shape (n, k, k)
-    whitened: `root` times the off-diagonal block with the m remaining unknowns and, in the last
-        column, `root` times the gradient, shape (n, k, m + 1)
+    root: inverse of each block's lower Cholesky factor, shape (n, k, k)
+    whitened: `root` times the off-diagonal block of the eliminated and the m remaining unknowns
+        and, in the last column, `root` times the gradient, shape (n, k, m + 1)
     """
 
     root: Floats
@@ -130,13 +132,14 @@ class Reduced:
 
     of_bag_prior: prior precision of the unknowns of bags, and this precision times their distance
         from the prior mean, shape (2, n_bags, r)
-    matrix: Hessian (with the prior `common`) and, in the last column, gradient, (n + 1, n + 1)
-    positions: blocks of the positions, with columns for unknowns of the bag, then of the unit
-    shares: contribution of each position to block, off-diagonal blocks and gradient of its bag,
-        shape (n_positions, r, r + n + 1); and its contribution to the block's diagonal before the
-        elimination of the positions, shape (n_positions, r)
-    bags: the blocks of the bags
-    common: the prior on the sum of the initial lag states over the bags, as a block, or None
+    matrix: Hessian without the prior of the unit's unknowns and, in the last column, the gradient,
+        shape (n + 1, n + 1)
+    positions: blocks of the positions; remaining unknowns: those of the bag, then the unit's
+    shares: contribution of each position to the block, the off-diagonal blocks and the gradient of
+        its bag, shape (n_positions, r, r + n + 1); and its contribution to the diagonal of the
+        bag's block before the elimination of the positions, shape (n_positions, r)
+    bags: blocks of the bags
+    common: block of the prior on the sum of the initial lag states over the bags, or None
     """
 
     layout: Layout

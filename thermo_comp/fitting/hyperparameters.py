@@ -121,7 +121,8 @@ def _updated(
 
     return moved, max(
         change('column_sd', moves & (effective > 0.3)),
-        # A change of the sd of offsets counts only if the data determine more than one offset.
+        # A change of `offset_sd` delays convergence only if the data determine more than one
+        # offset.
         change('offset_sd') * bool(determined[layout.offset].sum() > 1.0),
         change('turn_on_sd') * bool(determined[layout.turn_on].sum() > 1.0),
         # A change of the sd of tilts by 15 % hardly changes the fit.

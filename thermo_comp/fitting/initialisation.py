@@ -361,8 +361,8 @@ def _steepness(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool) -
         powers = np.vander(sizes / sizes.max(), 4)
         errors -= powers @ np.linalg.lstsq(powers, errors, rcond=None)[0]
     if is_at_rest:
-        # Divide the sd of the errors of |f| by the RMS error of |f| that slopes of bias and scale
-        # of size 1 would cause, less the part that a constant bias and scale explain.
+        # Divide the sd of the errors of |f| by the RMS effect on |f| of unit slopes of bias and
+        # scale, less the part of this effect that a constant bias and scale explain.
         constants = norm_columns(force / norms[:, None])[:, :6]
         celsius = windows.temperature[data.edges[:-1]]
         of_slopes = (celsius - celsius.mean())[:, None] * constants

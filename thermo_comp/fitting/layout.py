@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the indices of the unknowns, and the measurement equation linearised w.r.t. them."""
+"""
+Owns the index of each unknown of a fit in the vector of unknowns, and the measurement equations
+linearised with respect to the unknowns.
+"""
 
 from __future__ import annotations
 
@@ -20,16 +23,18 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class Layout:
     """
-    Indices of the unknowns (named as in `State`) in the vector of parameters, the unit's first.
+    Indices of the unknowns of a fit, named as in `State`, in the vector of all unknowns: first the
+    unknowns of the unit, then for each bag those of its positions and those of the bag itself.
 
-    axis: scale ratio kappa, bias, active weights and nonlinear coefficients of each axis, (3, k)
-    weights, nonlinear: indices of the weights, shape (2, 3, m), and of the nonlinear coefficients,
-        shape (3, 2 k); -1 for an inactive unknown
-    start, turn_on: unknowns of each bag: initial lag states, and the bias offset of its turn-on,
-        shapes (n_bags, r) and (n_bags, 3) or (n_bags, 0)
-    own: attitude, error of |f|, bias offset and tilts of each position, shape (n_positions, k)
-    pose_of: index of each position's pose, -1 without a pose
-    bag: index of each position's bag
+    axis: kappa, bias, active weights and active nonlinear coefficients of each axis, shape (3, k)
+    weights: weights of each column in the bias and in the scale, -1 if inactive, shape (2, 3, m)
+    nonlinear: nonlinear coefficients, -1 if inactive, shape (3, 2 k)
+    start, turn_on: initial lag states of each bag, shape (n_bags, r), and the bias offset of its
+        turn-on, shape (n_bags, 3) or (n_bags, 0)
+    own: all unknowns of each position, in the order `up` (attitude, 2), `stretch` (error of the
+        known |f|, 1 or 0), `offset` (bias offset, 3), `tilt`; shape (n_positions, k)
+    pose_of: number of each position's pose (not an index of unknowns), -1 without a pose
+    bag: number of each position's bag
     n_unit, n: number of unknowns of the unit, and number of all unknowns
     """
 
@@ -175,12 +180,13 @@ def lay_out(
 
 class Normal(NamedTuple):
     """
-    Normal equations of each axis without the prior; the order of unknowns is that of `Tangent`.
+    The data's part of the normal equations of each axis (without the prior): sums over whitened
+    windows of products of the readings' derivatives and residual, in the order of `Tangent`.
 
-    local: products of the derivatives w.r.t. the unknowns of a position and its bag with all
-        derivatives and the residual, shape (n_positions, 3, n_local, k + 1)
-    unit: sums, over the positions, of the products of the derivatives w.r.t. the unknowns of the
-        unit, and of the residual, with each other, shape (3, n, n)
+    local: for each position, the products of the derivatives w.r.t. the unknowns of the position
+        and its bag with all derivatives and the residual, shape (n_positions, 3, n_local, k + 1)
+    unit: for all positions together, the products with each other of the derivatives w.r.t. the
+        unknowns of the unit and of the residual, shape (3, n, n)
     """
 
     local: Floats
@@ -199,24 +205,24 @@ class Normal(NamedTuple):
 @dataclass(frozen=True)
 class Tangent:
     """
-    The measurement equations linearised about a state, as factors of base series (`series.Base`)
-    at the initial lag states of this state.
+    The measurement equations linearised about a state, by the base series (`series.Base`) at the
+    initial lag states of this state.
 
-    The derivative of the readings w.r.t. an unknown is a factor times a base series, or times one
-    of the combinations `combined` of base series. For axis i, position p and unknown u the
+    The derivative of the readings w.r.t. an unknown is a factor times a base series, or times a
+    linear combination of base series (one of `combined`). For axis i, position p and unknown u the
     derivative is ``factor[p, i, u]`` times series ``place[u]``: a base series or, from index
     n_base on, one of `combined`. The order of the unknowns of an axis is: those of the position
     (2 of the attitude, stretch, offset, tilts), of the bag (initial lag states, turn-on offset),
     and of the unit (kappa, bias, weights, nonlinear coefficients, radius, 3 of the misalignment, 2
     of each pose). The last element is for the residual, measured minus predicted.
 
-    combined: the combinations of base series, shape (n_positions, 3, n_base, n_combined)
-    place: index of the series of each unknown, shape (k + 1,)
-    factor: factor of the series of each unknown, shape (n_positions, 3, k + 1)
-    n_local: number of unknowns of position and bag
+    combined: weights of the base series in each combination, (n_positions, 3, n_base, n_combined)
+    place: index of each unknown's series, a base series or one of `combined`, shape (k + 1,)
+    factor: factor of this series in the unknown's derivative, shape (n_positions, 3, k + 1)
+    n_local: number of the unknowns of position and bag, which are the first of an axis
     n_bias: number of unknowns after kappa that have the factor 1: the bias and its weights
-    n_scale: number of weights of the scale, which follow the weights of the bias
-    scale: factor of the weights of the scale, shape (n_positions, 3)
+    n_scale: number of weights in the scale, which follow the weights in the bias
+    scale: the factor of the weights in the scale, shape (n_positions, 3)
     """
 
     combined: Floats
@@ -228,7 +234,10 @@ class Tangent:
     scale: Floats
 
     def normal(self, products: Floats) -> Normal:
-        """Build normal equations from `products` of base series, (n_positions, n_base, n_base)."""
+        """
+        Build normal equations from `products`, sums of the products of all pairs of base series in
+        each position, shape (n_positions, n_base, n_base).
+        """
         first, with_combined = self.n_local, products[:, None] @ self.combined
         place = self.place[first:]
         n, bias = len(place), slice(1, 1 + self.n_bias)

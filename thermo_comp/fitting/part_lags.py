@@ -56,7 +56,7 @@ class _Shape(NamedTuple):
     has_gradient: bool = False
 
 
-# Ratio of the RMS residual to the noise up to which no other shape or lag is tried.
+# Up to this ratio of RMS residual to noise, no further curve shape or lag is tried.
 _EXPLAINED_RATIO = 1.1
 # Shapes of curves over part temperature, in the order of trials. A spline of 4 nodes determines a
 # lag best, but cannot describe a kink of the bias, so its limit `most_noise` is low.

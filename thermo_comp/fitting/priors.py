@@ -123,8 +123,8 @@ def informative_priors(
     if options.ageing_bias or options.ageing_scale:
         tried.append(tried[-1])
     else:
-        # The sds of bias and scale are equal, as data sheets state similar numbers for both, and
-        # few rests do not separate bias and scale.
+        # The sds of bias [g] and relative scale are equal, as data sheets state similar numbers
+        # for both, and few rests do not separate them.
         tried += [(ageing, 0.0) for ageing in (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)]
         # Priors for a unit whose temperature effects have changed, besides bias and scale factor.
         # A `share` of 1, 1e3 and 1e6 increases the prior sd 1.4, 30 and 1000 times, as the sd may

@@ -7,13 +7,14 @@ filter that whitens these series for slow noise, and the sums of products of whi
 All terms of the measurement equation (`equations`) are linear combinations of the base series, so
 the sums of the products of whitened base series in each position are sufficient statistics.
 
-The error of window k of a position is ``c_k + e_k``: e_k is white noise of variance ``sigma^2 /
-weight_k``, c_k a stationary first-order Gauss-Markov process of variance ``ratio sigma^2`` and
-correlation time T (IEEE Std 952, Annex B.4.3); a random walk is the limit for a long T. Flicker
-noise, the bias instability of a sensor, is the sum of Gauss-Markov processes of equal variance,
-with the correlation times T, 10 T, 100 T and so on [2]_. The innovations of a Kalman filter for
-this noise, divided by their standard deviations, are white and contain all information of the
-series: for the innovations of means and columns least squares is the optimal estimator [1]_.
+The error of the mean reading of window k in a position is ``c_k + e_k``. e_k is white noise of
+variance ``sigma^2 / weight_k``. c_k is slow noise (`unknowns.Noise`): a stationary first-order
+Gauss-Markov process of variance ``ratio sigma^2`` and correlation time T (IEEE Std 952, Annex
+B.4.3), whose limit for a long T is a random walk; or flicker noise, the bias instability of a
+sensor, which is the sum of Gauss-Markov processes of equal variance with the correlation times T,
+10 T, 100 T and so on [2]_. The innovations of a Kalman filter for the error ``c_k + e_k``, divided
+by their standard deviations, are white and contain all information of a series. Least squares
+with the innovations of readings and columns is therefore the optimal estimator [1]_.
 
 References
 ----------
@@ -38,7 +39,12 @@ from .unknowns import Noise, State, Windows
 
 
 class Whitener:
-    """Filters series of windows, sorted by position and time, separately for each position."""
+    """
+    A Kalman filter that whitens series of window values, separately in each position.
+
+    position, time: index of each window's position, and its time [s]; the windows are sorted by
+        position and time, shape (n,)
+    """
 
     def __init__(self, position: Ints, time: Floats) -> None:
         starts = np.flatnonzero(np.r_[True, position[1:] != position[:-1]])
@@ -158,14 +164,15 @@ def _vertex(values: Floats, at: int) -> float:
 @dataclass(frozen=True)
 class Base:
     """
-    The base series of the active columns, in this order: 1; the columns; for each column with a
-    lag its derivative w.r.t. the initial state of the lag; `Series.t`, if it has columns; the
-    functions `Windows.tilt`; the readings of the three axes less their mean in the position.
+    The order of the base series, for given active columns: the constant 1; the columns; for each
+    column with a lag its derivative w.r.t. the initial state of the lag; the temperature t of the
+    nonlinear terms, if the fit has such terms; the functions `Windows.tilt`; the readings of the
+    three axes less their mean in the position.
 
-    columns: indices of the active columns; lagged: indices in `columns` of columns with a lag
-    lag: index of the lag of each column in `lagged`
-    at_start, t, tilts, measured: indices of the derivatives w.r.t. the initial lag states, of t,
-        (1,) or (0,), of the functions `Windows.tilt`, and of the readings, in the base series
+    columns: indices of the active columns among all columns
+    lagged: places in `columns` of the columns with a lag; lag: index of the lag of each of these
+    at_start, t, tilts, measured: places, among the base series, of the derivatives w.r.t. initial
+        lag states, of t (shape (1,) or (0,)), of the functions `Windows.tilt`, and of the readings
     """
 
     columns: Ints
@@ -193,10 +200,12 @@ class Base:
 @dataclass(frozen=True)
 class Products:
     """
-    Sums, over windows, of the products of all pairs of whitened base series.
+    Sums over windows of the products of all pairs of whitened base series. A cell is the set of
+    the windows of one position in one section of the chamber program.
 
-    means: mean of each series (not whitened) in each position, shape (n_positions, n_base)
-    cells: sums over each cell, the windows of one position and section, (n_cells, n_base, n_base)
+    base: order of the base series
+    means: mean of each base series, not whitened, in each position, shape (n_positions, n_base)
+    cells: sums of products over the windows of each cell, shape (n_cells, n_base, n_base)
     first: index of each position's first cell; section: index of each cell's section
     """
 
@@ -222,8 +231,10 @@ class Products:
 
 class Series:
     """
-    The base series of a fit's windows; readings are converted to m/s^2 by nominal scale factors.
+    The values of the base series in the windows of a fit, and their sums of products. Nominal
+    scale factors convert the readings to m/s^2.
 
+    windows: the data of the fit
     nominal_scale: nominal scale factors [input units per m/s^2], shape (3,)
     t: board temperature less the reference for nonlinear terms [K], shape (n, 1) or (n, 0)
     """

@@ -233,7 +233,7 @@ def known_force(path: Path, info: RecordingInfo, asked: ForceOptions) -> KnownFo
     """
     Return the known |f| of a bag from the options (`asked`) or its metadata; None if |f| is g.
 
-    Raises FitError for a text of |f| that cannot be parsed, and for a rotation topic without data.
+    Raises FitError for a stated |f| that cannot be parsed, and for a rotation topic without data.
     """
     metadata = info.metadata
     try:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the data types of the regression: windows, prior and unknowns."""
+"""Owns the data types of the regression: the windows of a fit, the prior and the unknowns."""
 
 from __future__ import annotations
 
@@ -38,7 +38,8 @@ def misalignment_scale(noise: float) -> float:
 @dataclass(frozen=True)
 class Windows:
     """
-    The data of a fit: windows sorted by position and time, and the values of all columns.
+    The data of a fit: the mean readings of n windows, sorted by position and time, and the values
+    of all m columns in these windows.
 
     position, bag: index of each window's position (within one bag), and of its bag, shape (n,)
     section: index of each window's section of its position, see `windows.N_SECTIONS`, shape (n,)
@@ -46,14 +47,15 @@ class Windows:
     weight: number of samples of each window, divided by the median of these numbers, shape (n,)
     mean: mean raw samples, in input units, shape (n, 3)
     columns: columns in their physical units, for initial lag states at the prior mean, (n, m)
-    kelvins: RMS / largest slope over temperature of each column [K]; 0: constant, shape (m,)
+    groups: name of each column's group, m names
+    kelvins: RMS of each column / its largest slope over temperature [K]; 0: constant, shape (m,)
     lag: index of each column's lag; -1 for a column without lag, shape (m,)
     start: derivative of each column w.r.t. the initial state of its lag, shape (n, m)
     start_covariance: prior covariance of the initial lag states [K^2], shape (n_lags, n_lags)
     in_scale: whether each column may act on the scale as well as on the bias, shape (m,)
-    tilt: functions of temperature, of RMS 1, of which a support's tilt is a sum, shape (n, k)
+    tilt: k functions of temperature, of RMS 1, whose weighted sum is a support's tilt, (n, k)
     forces: known |f| and nonlinear terms, or None if |f| is gravity in all positions
-    undisturbed: factors of the weights, < 1 for an outlier, (n,); None: the fit estimates them
+    undisturbed: factors of `weight`, < 1 for an outlier, (n,); None: the fit estimates the factors
     acts_on: axes on which each column acts, shape (m, 3); None if on all axes
     pose: index of each position's pose, -1 without a pose, shape (n_positions,); None: no poses
     has_prior: whether the fit has a prior calibration
@@ -192,12 +194,13 @@ class Noise(NamedTuple):
 @dataclass(frozen=True)
 class InformativePrior:
     """
-    Gaussian prior of the unit's parameters in the order of `Layout`, from a prior calibration.
+    Gaussian prior of the unit's unknowns, in the order of `Layout`, from a prior calibration.
 
-    mean: mean of the parameters, shape (n_unit,)
+    mean: prior mean of the unknowns, shape (n_unit,)
     root: upper triangular R with ``R.T @ R`` the inverse covariance, shape (n_unit, n_unit)
-    log_density: log prior density of the ageing that this prior assumes
-    is_changed: whether the covariance is far larger than that of the prior calibration
+    log_density: log prior density of the ageing, since the prior calibration, that this prior
+        assumes
+    is_changed: whether this prior's covariance is far larger than that of the prior calibration
     """
 
     mean: Floats
@@ -221,16 +224,19 @@ class Prior:
     turn_on_sd: sd of the bias offset of a turn-on, common to the positions of a bag [m/s^2]
     sigma: sd of the white noise of a window of weight 1 [m/s^2], shape (3,)
     least_sigma: lower bound of sigma [m/s^2]; by default it is below the noise of any sensor
-    offset_scale: scale of the half-Student priors of offset_sd and turn_on_sd, 0: constant [m/s^2]
-    misalignment_scale: value of misalignment_sd before the data are used [rad]
+    noise: slow noise of the readings
+    offset_scale: scale of the half-Student priors of offset_sd and turn_on_sd [m/s^2]; 0: both sds
+        are constant
+    misalignment_scale: built-in prior sd of the elements of M, see `misalignment_scale` [rad]
     unseen_misalignment_sd: sd of the elements of M [rad] in the published covariance, if positions
         near the faces do not determine M and the fit has a smaller `misalignment_sd`; else 0
     tilt_sd: sd of the coefficients of the tilts of a support [rad], see `Windows.tilt`
     pose_sd: sd of attitudes about their pose [rad]; attitudes without a pose have a flat prior
     start_variance_ratio: variance of the initial lag states, divided by that in the node's prior
-    nonlinear_sd: sd of nonlinear coefficients, then of changes per kelvin; 0: inactive, (2 k,)
-    informative: prior that replaces all sds of the unit's parameters; column_sd then only marks
-        the active columns, by values above 0
+    nonlinear_sd: sds of the k nonlinear coefficients of an axis, then of their changes per kelvin;
+        0 for an inactive coefficient, shape (2 k,)
+    informative: prior that replaces all sds of the unit's unknowns, or None; with such a prior
+        column_sd only marks the active columns, by values above 0
     """
 
     column_sd: Floats
@@ -256,9 +262,10 @@ class Prior:
 @dataclass(frozen=True)
 class State:
     """
-    The unknowns of the regression.
+    The values of the unknowns of the regression.
 
-    kappa, bias: scale ratio and bias [m/s^2], shape (3,)
+    kappa: scale factor of each axis divided by its nominal scale factor, shape (3,)
+    bias: bias of each axis [m/s^2], shape (3,)
     weights: weights of the columns, each divided by its RMS, in the bias [m/s^2] and in the scale
         (relative), shape (2, 3, m)
     misalignment: elements of the inverse of M below the diagonal, shape (3,)
@@ -336,7 +343,7 @@ def _cross(a: Floats, b: Floats) -> Floats:
 
 
 def inverse_misalignment(misalignment: Floats) -> Floats:
-    """Return the inverse of M, from its three elements below the diagonal of 1, (3, 3)."""
+    """Return the inverse of M, (3, 3), from the inverse's three elements below the diagonal."""
     matrix = np.eye(3)
     matrix[1, 0], matrix[2, 0], matrix[2, 1] = misalignment
     return matrix

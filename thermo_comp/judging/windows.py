@@ -45,14 +45,14 @@ class JudgedWindows:
     A window lasts exactly `window_s` from `start_ns`; `time`: from the bag's first sample to the
     window's middle [s]; `count`, `mean`: number and mean of the window's raw samples. A position
     is a still interval, numbered through all bags. `rate`: rate of the board temperature [K/s].
-    `is_dynamic`: the dynamic set has more than half the weight; `is_inside`: the window is
-    entirely inside the calibrated ranges; `is_swapped`: the board temperature leads the case
-    temperature. `raw` is the specific force with the constants at the reference temperature,
-    `force` with the calibration, shapes (n, 3). `size`: the known |f|, which is gravity unless the
-    bag states another value. `claimed_sd`: sd of ``|force| - size`` due to the calibration, `size`
-    and white noise of the mean; `noise_sd`, `lack_sd`: sd due to the white noise alone, and due to
-    the lack of fit alone. Rows of `gyro`: raw and corrected angular rate, claimed variances,
-    thermal state; empty without a gyroscope.
+    `is_dynamic`: the coefficients of the dynamic regime have more than half the weight;
+    `is_inside`: the window is entirely inside the calibrated ranges; `is_swapped`: the board
+    temperature leads the case temperature. `raw` is the specific force with the constants at the
+    reference temperature, `force` with the calibration, shapes (n, 3). `size`: the known |f|,
+    which is gravity unless the bag states another value. `claimed_sd`: sd of ``|force| - size``
+    due to the calibration, `size` and white noise of the mean; `noise_sd`, `lack_sd`: sd due to
+    the white noise alone, and due to the lack of fit alone. Rows of `gyro`: raw and corrected
+    angular rate, claimed variances, thermal state; empty without a gyroscope.
     """
 
     window_s: float
@@ -106,7 +106,7 @@ def sum_length(window_s: float) -> float:
 
 
 def usual_window(bags: Sequence[ReducedBag]) -> float:
-    """Return the window length [s]: 60 s rounded up to a multiple of the longest partial sum."""
+    """Return the window length [s]: 60 s rounded up to a multiple of the largest `window_s`."""
     longest = max(bag.window_s for bag in bags)
     return float(np.ceil(WINDOW_S / longest - 1e-6)) * longest
 

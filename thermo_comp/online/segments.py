@@ -33,7 +33,7 @@ from .status import CompensatorConfig, Counters
 
 #: Longest segment [ns].
 SEGMENT_NS: Final = 1_000_000_000
-SLOW_NS: Final = 10_000_000_000  # longest use of a `SlowState` and its variance [ns]
+SLOW_NS: Final = 10_000_000_000  # longest time a `SlowState` and its variance are used [ns]
 YOUNG_READINGS: Final = 30  # number of readings that determine the rate of the board temperature
 EVER_NS: Final = -NEVER_NS  # a stamp earlier than any real stamp
 #: Sd of the temperature of a unit without thermometer about the reference temperature [K].

@@ -83,7 +83,7 @@ class Span:
     """Part of a file: a chunk, a chunk without end ('torn'), messages outside chunks ('loose')."""
 
     position: int
-    length: int  # without the message indexes after the part
+    length: int  # number of bytes, without the message indexes after the part
     index_length: int = 0
     size: int = 0  # number of bytes after decompression
     start_ns: int = 0

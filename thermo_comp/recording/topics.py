@@ -67,7 +67,10 @@ class BagPart:
         return max(self.begin or 0.0, self.end or 0.0) >= _FIRST_STAMP_S
 
     def limits_ns(self, first_ns: float) -> tuple[float, float]:
-        """Return begin and end as stamps; `first_ns`: first stamp, infinity if not known."""
+        """
+        Return the part's begin and end as stamps; `first_ns`: the bag's first stamp, inf if not
+        known.
+        """
         origin = 0 if self.is_stamped else first_ns
         begin = -inf if self.begin is None else origin + round(self.begin * 1e9)
         return begin, inf if self.end is None else origin + round(self.end * 1e9)

@@ -4,8 +4,8 @@
 Owns the set-up of a process before its first node: handling of signals, Fast DDS profile.
 
 The middleware's signal handlers shut down a context that is in use, which sometimes ends in a
-segmentation fault. With this module a thread asks the loop to stop, and the loop shuts
-everything down in order.
+segmentation fault. With `SignalWatch` a thread asks the main loop to stop, and the main thread
+shuts everything down in order.
 """
 
 from __future__ import annotations

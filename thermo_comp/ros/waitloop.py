@@ -310,7 +310,7 @@ class WaitLoop:
 
 
 class _WaitSet:
-    """A wait set of rclpy for fixed entities, which rclpy needs again before each wait."""
+    """A wait set of rclpy for fixed entities, which are added again before each wait."""
 
     def __init__(self, context: rclpy.context.Context, entities: Sequence[Any]) -> None:
         types = [type(entity) for entity in entities]

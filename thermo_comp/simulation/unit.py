@@ -135,7 +135,7 @@ class GyroModel:
     turn_on: float
 
     def bias(self, history: PartHistory) -> Floats:
-        """Return the bias on the thermal grid [rad/s], shape (m, 3)."""
+        """Return the gyroscope's bias at the times of `history` [rad/s], shape (m, 3)."""
         drift, _ = drift_of(self.drift, history)
         return np.asarray((drift + np.array(self.bias_at_reference)) * MILLIDEGREE)
 

@@ -45,7 +45,7 @@ class Quantity:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Names of the input thermometers; for a gradient the sensor alone, without the board."""
+        """Names of the input thermometers; of a gradient (sensor less board) only the sensor."""
         return (self.input,)
 
     @property

@@ -231,7 +231,7 @@ def _family(
 
 
 def memory_of(columns: Iterable[Column], sensors: Sequence[str] = ('case',)) -> MemorySpec:
-    """Return lags, plays and rates that columns use; ValueError: sensor not in `sensors`."""
+    """Return lags, hysteresis plays and rates of columns; ValueError: sensor not in `sensors`."""
     sources: set[Quantity] = set()
     for column in columns:
         sources.add(column.source)

@@ -28,7 +28,7 @@ from .functions import hold, in_order
 from .gravity import MICRO_G
 from .nonlinearity import ForceCorrection, beyond_force
 
-#: Largest rate of change of the force in a transition between the sets [m/s^3]: 1 ug per second; a
+#: Largest rate of change of the force in a transition between regimes [m/s^3]: 1 ug per second; a
 #: faster transition is lengthened, by a factor of at most `LONGEST_TRANSITION`.
 GENTLE_RATE = MICRO_G
 LONGEST_TRANSITION = 10.0

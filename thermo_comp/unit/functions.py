@@ -204,7 +204,7 @@ class Exponential(_Family):
         return self.amplitudes
 
     def with_free(self, values: tuple[float, ...], at_reference: float) -> Exponential:
-        """Return exponentials of the present e-folds, with the amplitudes `values`."""
+        """Return these exponentials with the amplitudes `values`; the e-folds stay the same."""
         return replace(self, constant=at_reference - math.fsum(values), amplitudes=values)
 
     def _evaluate(self, t: Floats, *, is_slope: bool = False) -> Floats:
