@@ -103,6 +103,20 @@ def test_the_fitted_lag_of_each_axis_is_that_of_its_part_and_the_results_are_pri
 
 
 @pytest.mark.slow
+def test_an_axis_without_a_determined_lag_does_not_exclude_the_lags_of_the_other_axes():
+    # WHY: the bias of one axis hardly changed with temperature, so that its lag was undetermined:
+    # the fit then had a lag per part on no axis.
+    curve = np.array([[15.0, -12.0, 0.05], [0.05, -0.04, 0.0]])
+    scale = np.array([[60.0, 40.0, 0.5], [0.1, 0.1, 0.0]])
+    given = {'part_s': PARTS_S, 'bias_curve': curve, 'scale_curve': scale}
+    unit, study = study_of('weak axis', **given)
+    calibration = strangers.fitted(study)
+    taus = np.array(taus_of(calibration)[:2])
+    assert taus == pytest.approx(unit.part_s[:2, None], rel=0.02)
+    assert judged(calibration, study).norm < 2.0
+
+
+@pytest.mark.slow
 def test_lags_of_parts_coupled_to_board_and_case_are_fitted():
     case_share = np.array([0.6, 0.3, 0.0])
     unit, study = study_of('between', part_s=PARTS_S, case_share=case_share)

@@ -88,7 +88,7 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> list[Part
     Find the lag of each axis, and reduce the weights of windows that deviate from the model.
 
     Returns [] if the model with one lag per axis does not explain the drift of all axes, or if the
-    data do not determine a time constant. If the residual exceeds the noise for all shapes of the
+    data determine no axis's time constant. If the residual exceeds the noise for all shapes of the
     curves, a second stage may describe slow noise or a tilt of the support: lags of one stage then
     come first in the result, if they more than halve the RMS residual of each axis.
     """
@@ -172,14 +172,20 @@ class _PartCurves:
         self._measured = self._centred(data.mean[rows] / start.scale)
 
     def lags(self, noise: Floats) -> list[Part] | None:
-        """Return the lag of each axis, or None if a lag is not useful or not determined."""
-        lags = []
+        """
+        Return the lag of each axis, or None if a lag is not useful or longer than the bags show,
+        or if no axis determines its lag. The lag of a single axis can be undetermined because its
+        bias hardly depends on temperature, or because the lag is shorter than the windows.
+        """
+        lags, is_determined = [], False
+        longest_s = float(self._age.max()) / np.log(10.0)
         for axis in range(3):
             lag = self._lag(axis, noise[axis])
-            if not self._is_useful(lag, axis, noise[axis]) or not self._is_determined(lag, axis):
+            if not self._is_useful(lag, axis, noise[axis]) or lag.tau_s > longest_s:
                 return None
+            is_determined = is_determined or self._is_determined(lag, axis)
             lags.append(lag)
-        return lags
+        return lags if is_determined else None
 
     def _is_useful(
         self, lag: Part, axis: int, noise: float, most_noise: float = 3.0, reduction: float = 4.0
@@ -311,11 +317,9 @@ class _PartCurves:
     def _is_determined(self, lag: Part, axis: int) -> bool:
         """
         Whether time constants longer and shorter by `_TAU_RATIO` (for a lag of 0 s: 21 s) increase
-        the RMS residual by over 5 %, and the longest bag lasts at least ln(10) time constants.
+        the RMS residual by over 5 %.
         """
         tau, second, share, lead = lag
-        if tau > float(self._age.max()) / np.log(10.0):
-            return False
         others = [
             Part(ratio * tau, ratio * second, share, ratio * lead)
             for ratio in (1.0 / _TAU_RATIO, _TAU_RATIO)
