@@ -170,7 +170,7 @@ def test_the_pieces_of_a_rest_contain_every_window_of_the_rest(n_minutes, window
     assert pieces.intervals[-1].end_ns == bag.intervals[-1].end_ns
 
 
-def test_the_reports_of_the_pieces_of_a_rest_are_combined_also_for_a_single_sample(rng):
+def test_the_reports_of_the_pieces_of_a_rest_are_combined(rng):
     bag = reduce_source(Rest(rng, duration_s=7200.0, rate_hz=2.0).source(), full_scale=None)
     first, second = in_pieces(bag).intervals
     reports = [
@@ -184,6 +184,12 @@ def test_the_reports_of_the_pieces_of_a_rest_are_combined_also_for_a_single_samp
     assert whole.duration_s == pytest.approx(7200.0, abs=120.0)
     assert whole.residual_rms == pytest.approx(np.sqrt(12.5))
     assert whole.left_out_rms == pytest.approx(10.0 * np.sqrt(12.5))
+    # WHY: a fit stopped with StopIteration if the temperature of a piece or rest was unknown.
+    unknown, known = (replace(bag, source=replace(bag.source, name=name)) for name in 'ab')
+    (alone,) = of_whole_rests([replace(reports[1], source='b')], [unknown, known])
+    assert (alone.source, alone.start_ns) == ('b', rest.start_ns)
+    assert alone.duration_s == whole.duration_s
+    assert alone.left_out_rms == pytest.approx(40.0)
     # WHY: the fit of a real recording, whose first rest had one sample, ended in a division by 0.
     single = replace(rest, end_ns=rest.start_ns, time=rest.time[:1])
     report = PositionReport('rest', rest.start_ns, 0.0, (0.0, 0.0, 1.0), 3.0, 30.0)

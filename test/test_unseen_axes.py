@@ -103,6 +103,25 @@ def test_after_one_cold_bag_the_claimed_sd_covers_the_scale_errors_of_all_axes(n
     assert score.ratio < 2.0
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize('number', [1, 2])
+def test_after_cold_starts_with_a_ramp_the_claimed_sd_is_at_most_ten_times_the_error(number):
+    # WHY: bags with ramps of 20 to 45 K counted as rests at a constant temperature: the claimed sd
+    # was 40 to 80 times the error.
+    rng = rng_of('cold starts before a ramp', number)
+    unit = navigation(rng)
+    ramps = [program(begin, 30, (end, 1, 15)) for begin, end in ((20, 0), (45, 20), (0, 45))] * 4
+    bags = tuple(
+        record(unit, ramp, up, rng, name=f'{k}', is_cold=True)
+        for k, (ramp, up) in enumerate(zip(ramps, spread(12, rng), strict=True))
+    )
+    held = tuple(cases.positions(unit, cases.HELD, spread(2, rng), rng))
+    study = cases.Study('', bags, {'': held}, cases.FULL_SCALE)
+    tests = {'': [minutes(bag) for bag in held]}
+    score = strangers.scored(study, strangers.fitted(study), tests)['']
+    assert 0.1 < score.ratio < 1.9
+
+
 @pytest.mark.parametrize('poses', [1, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize('unit', [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_rests_in_one_pose_at_four_temperatures_determine_the_drift_of_level_axes(unit, poses):

@@ -93,7 +93,7 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
         return of_means
     trials = of_means.selected.trials
     has_curve = any(trial.is_chosen and CURVE in trial.groups for trial in trials)
-    if has_curve and rests.is_constant(windows, windows.data.bag):
+    if has_curve and rests.only_warms_up(windows):
         return fit._replace(of_means=of_means.posterior.state)
     return fit
 

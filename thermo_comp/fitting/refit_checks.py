@@ -7,6 +7,7 @@ certain with the chosen model than with a smaller model, and whether supports ti
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -112,11 +113,20 @@ def _pieces(rest: StillInterval, window_s: float) -> Iterator[StillInterval]:
 def of_whole_rests(
     pieces: Sequence[PositionReport], bags: Sequence[ReducedBag]
 ) -> tuple[PositionReport, ...]:
-    """Make one report per rest from the reports of its pieces: mean attitude, RMS residuals."""
-    result, left = [], iter(pieces)
+    """
+    Make one report per rest from the reports of its pieces: mean attitude, RMS residuals. A piece
+    without a known temperature has no report, so a rest of such pieces has none either.
+    """
+    result, left = [], deque(pieces)
     for bag in bags:
         for rest in bag.intervals:
-            parts = [next(left) for _ in _pieces(rest, bag.window_s)]
+            parts = []
+            for piece in _pieces(rest, bag.window_s):
+                key = bag.source.name, piece.start_ns
+                if left and (left[0].source, left[0].start_ns) == key:
+                    parts.append(left.popleft())
+            if not parts:
+                continue
             # Weight of a piece: its duration (0 s if it has one cell), at least a window's length.
             share = np.array([max(part.duration_s, bag.window_s) for part in parts])
             up = share @ np.array([part.up for part in parts])
@@ -127,6 +137,6 @@ def of_whole_rests(
                 for rms in zip(*pairs, strict=True)
             )
             duration_s = (rest.end_ns - rest.start_ns) * 1e-9
-            new = replace(parts[0], duration_s=duration_s, up=(x, y, z))
+            new = replace(parts[0], start_ns=rest.start_ns, duration_s=duration_s, up=(x, y, z))
             result.append(replace(new, residual_rms=in_sample, left_out_rms=left_out))
     return tuple(result)

@@ -18,6 +18,9 @@ from .initial_triad import block_means, white_noise_of, within_positions
 from .unknowns import Windows
 from .windows import LAGS, ThermalWindows
 
+# Largest change of the board temperature that the unit's electronics cause after power-on [K].
+_WARM_UP_K = 10.0
+
 
 def is_constant(windows: ThermalWindows, part: Ints) -> bool:
     """
@@ -27,6 +30,16 @@ def is_constant(windows: ThermalWindows, part: Ints) -> bool:
     t = windows.temperature
     within = within_positions(t[:, None], part)[:, 0]
     return bool(np.var(within) < np.var(t - within))
+
+
+def only_warms_up(windows: ThermalWindows) -> bool:
+    """
+    Whether no bag contains a ramp of a chamber: the board temperature changes by at most
+    `_WARM_UP_K` in each bag, and changes less (RMS) within bags than from bag to bag.
+    """
+    t, bag = windows.temperature, windows.data.bag
+    changes = [float(np.ptp(t[bag == number])) for number in np.unique(bag)]
+    return max(changes) <= _WARM_UP_K and is_constant(windows, bag)
 
 
 def is_bench(windows: ThermalWindows, up: Floats) -> bool:

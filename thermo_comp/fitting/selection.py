@@ -81,8 +81,8 @@ class Fit(NamedTuple):
 
     typical: typical prior sd of all columns that the selection could have chosen, shape (2, m), or
         None if there was no selection of columns
-    of_means: state of the fit to the means of the positions, if the temperatures of each bag are
-        constant and this fit has a curve, but is worse on left-out data; else None
+    of_means: state of the fit to the means of the positions, if no bag contains a ramp
+        (`rests.only_warms_up`), and this fit has a curve, but is worse on left-out data; else None
     """
 
     windows: ThermalWindows
