@@ -160,9 +160,10 @@ def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Fl
     # bias repeats (a value between 0 and `LARGE_OFFSETS`); 'both': several turn-ons, or mountings
     # that each begin with a turn-on.
     of_kind = {'mounting': 1.0 / 3.0, 'turn-on': 1.0, 'both': LARGE_OFFSETS}[kind]
-    # The log evidence is smooth over the grid's step, a third of a decade of the sd. The density
-    # of the logarithm of the sd is the density of the sd times the sd.
-    ratio = 10.0 ** np.linspace(-2.5, 2.25, 16)
+    # The log evidence is smooth over the grid's step, a third of a decade of the sd. The smallest
+    # sd is far below the error of a long test (0.05 ug). The density of the logarithm of the sd is
+    # the density of the sd times the sd.
+    ratio = 10.0 ** np.linspace(-3.45, 2.25, 19)
     return scale * ratio, log_student(ratio / of_kind) + np.log(ratio)
 
 
