@@ -149,7 +149,7 @@ def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Fl
     log prior density of the logarithm of this sd at these values.
 
     `scale`: `Prior.offset_scale` [m/s^2]; `known_sd`: offset sd by a prior calibration [m/s^2],
-    0 without a prior calibration; `kind`: 'mounting', 'turn-on' or 'both', see `of_kind`
+    0 without a prior calibration; `kind`: 'mounting', 'turn-on' or 'both', see `prior_ratio`
     """
     if known_sd:
         # A test of 12 positions determines the sd of mounting offsets within a factor of 1.5.
@@ -159,12 +159,12 @@ def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Fl
     # mountings within a turn-on; 'turn-on': a single turn-on, which does not show how well the
     # bias repeats (a value between 0 and `LARGE_OFFSETS`); 'both': several turn-ons, or mountings
     # that each begin with a turn-on.
-    of_kind = {'mounting': 1.0 / 3.0, 'turn-on': 1.0, 'both': LARGE_OFFSETS}[kind]
+    prior_ratio = {'mounting': 1.0 / 3.0, 'turn-on': 1.0, 'both': LARGE_OFFSETS}[kind]
     # The log evidence is smooth over the grid's step, a third of a decade of the sd. The smallest
     # sd is far below the error of a long test (0.05 ug). The density of the logarithm of the sd is
     # the density of the sd times the sd.
     ratio = 10.0 ** np.linspace(-3.45, 2.25, 19)
-    return scale * ratio, log_student(ratio / of_kind) + np.log(ratio)
+    return scale * ratio, log_student(ratio / prior_ratio) + np.log(ratio)
 
 
 def _places(layout: Layout, widened: Layout) -> Ints:
@@ -266,8 +266,8 @@ def _over_mountings(
     n_rests = len(mounting) / (mounting[-1] + 1)
     priors = [replace(prior, offset_sd=sd) for sd in tried.tolist()]
     fits = [regression.solve(posterior.state, each, n_steps=1) for each in priors]
-    # The fitted sd of tilts of the supports is too large if drifts due to mounting offsets were
-    # fitted by tilts: try a small sd, too, with steps to the mode without tilts.
+    # If tilts of the supports were fitted to drifts that mounting offsets cause, the fitted sd of
+    # the tilts is too large: try a tenth of this sd, too. Its mode is some steps from the fit.
     rigid = [
         regression.solve(posterior.state, replace(each, tilt_sd=0.1 * each.tilt_sd), n_steps=3)
         for each in priors
