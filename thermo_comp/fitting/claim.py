@@ -356,7 +356,8 @@ def _norm_evidence(
 def _jackknifed(regression: Regression, posterior: PosteriorMode) -> Floats:
     """
     Return the covariance of the unit's unknowns by the jackknife over the sections of the test,
-    shape (n_unit, n_unit); 0 for one section, or if noise explains the changes of the unknowns.
+    less the share of noise, shape (n_unit, n_unit); 0 for one section, or if noise explains the
+    changes of the unknowns.
     """
     n = posterior.layout.n_unit
     last = int(regression.windows.section.max())
@@ -374,7 +375,9 @@ def _jackknifed(regression: Regression, posterior: PosteriorMode) -> Floats:
     # Under noise alone each ratio (of squared change to variance) has mean 1 and variance 2.
     if ratio.sum() - len(ratio) < 2.0 * np.sqrt(2.0 * len(ratio)):
         return np.zeros((n, n))
-    return np.asarray(last / (last + 1) * without.T @ without)
+    # Noise contributes about len(ratio) to the sum of the ratios: the rest is by lacking effects.
+    share = 1.0 - len(ratio) / ratio.sum()
+    return np.asarray(share * last / (last + 1) * without.T @ without)
 
 
 def _ratios_to_noise(change: Floats, remaining: Floats) -> Floats:
