@@ -312,3 +312,14 @@ def test_forced_groups_are_fitted_together_with_permitted_groups(rng):
         gravity=STANDARD_GRAVITY, input='m/s^2', groups=('curve',), forced=('gradient',)
     )
     assert {column.group for column in fit(bags, options).calibration.response} == {'gradient'}
+
+
+def test_a_named_group_without_columns_is_reported(rng):
+    # WHY: --groups part gave constants alone, without a word, for bags that show no lag.
+    bags = [recorded(rng, up, f'p{k}', (20.0, 30.0, 20.0)) for k, up in enumerate(positions(3, 3))]
+    options = FitOptions(gravity=STANDARD_GRAVITY, input='m/s^2', groups=('curve', 'part'))
+    texts = [str(finding) for finding in fit(bags, options).findings if finding.name == 'groups']
+    assert len(texts) == 1
+    assert 'no columns of part,' in texts[0]
+    known = fit(bags, replace(options, groups=('curve',)))
+    assert all(finding.name != 'groups' for finding in known.findings)

@@ -286,6 +286,19 @@ def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator
         )
 
 
+def judge_groups(fit: Fit, options: FitOptions) -> Iterator[Finding]:
+    """Report the groups of `options` of which the chosen model has no columns."""
+    wanted = dict.fromkeys((*(options.groups or ()), *options.forced))
+    absent = [group for group in wanted if group not in fit.windows.data.groups]
+    if absent and options.prior is None:
+        yield advice(
+            'groups',
+            f'the model has no columns of {", ".join(absent)}, which --groups or --force-groups '
+            'names: the fit makes columns of part if the drifts show a lag of each axis, and most '
+            'columns of gradient groups if each bag has a case temperature',
+        )
+
+
 def determines_misalignment(up: Floats) -> bool:
     """
     Whether the number and the spread of positions are sufficient to estimate the misalignment M.

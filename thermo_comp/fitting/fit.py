@@ -316,6 +316,7 @@ def _fit(
     findings += enforce(data_checks.judge_constants(fit, residuals[-1].raw.rms, options), options)
     findings += data_checks.judge_result(fit, residuals[-1], in_sample, fit.offset_sd, options)
     findings += data_checks.judge_mountings(fit, claim.offset_sd, options)
+    findings += data_checks.judge_groups(fit, options)
     try:
         nonlinearity = of_file(fit.regression, terms, options)
         calibration = build_calibration(
