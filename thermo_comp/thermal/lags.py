@@ -81,7 +81,7 @@ class Lag(_Lag, Quantity):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Thermometers of the lag: `input` and, for a part between board and sensor, `sensor`."""
+        """Names of the thermometers: `input`, and for a part between board and sensor `sensor`."""
         return (self.input, self.sensor) if self.sensor else (self.input,)
 
     @property

@@ -312,7 +312,7 @@ class Calibration:
 
     @property
     def needs_case(self) -> bool:
-        """Whether `detector.case` is not the default, or a column depends on one of `sensors`."""
+        """Whether the case is needed: `detector.case` is set, or a column depends on a sensor."""
         is_default = self.detector.case == ThermometerSettings()
         return not is_default or any(column.is_of_sensor for column in self.columns)
 

@@ -286,7 +286,7 @@ class ColumnTable:
         terms = np.array([c.term for c in columns], object)
         bent = [term for term in dict.fromkeys(terms.tolist()) if term.form is not LINE]
         self._terms = [(np.flatnonzero(terms == term), term) for term in bent]
-        # The temperature of a part is the board temperature less the lag of the part.
+        # The temperature of a part is the board temperature less the lag of the part [K].
         self._parts = np.flatnonzero([term.is_temperature for term in terms])
         self._is_lagging = self._places[self._parts][:, np.newaxis] != BOARD
 

@@ -43,7 +43,10 @@ class Source:
 
 @dataclass(frozen=True)
 class ResidualSummary:
-    """``|f| - g`` of fitted data in one regime or both; raw: with bias and scale at T_ref only."""
+    """
+    Residual ``|f| - g`` of the fitted windows of one regime or both. `raw_rms_m_s2` is the RMS if
+    only bias and scale at T_ref are corrected.
+    """
 
     section: str
     n_windows: _Number
