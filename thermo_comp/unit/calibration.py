@@ -210,7 +210,8 @@ class Calibration:
         'Standard deviations of M[1][0], M[2][0], M[2][1], used if `posterior` is null.',
     ] = (0.0, 0.0, 0.0)
     sensors: Annotated[
-        tuple[str, ...], "Thermometers except the board's; in a ramp the board lags the first."
+        tuple[str, ...],
+        "Thermometers except the board's; in a ramp the board lags the first of them.",
     ] = ('case',)
     response: Annotated[
         tuple[ResponseTerm, ...], QUANTITIES['columns'], 'Columns of the thermal response.'

@@ -61,8 +61,8 @@ class ResidualSummary:
     left_out_drift_m_s2: Annotated[
         _Error | None,
         'RMS drift of an axis (force less its mean in the position) on data that the fit leaves '
-        'out: each position in turn or, if the rest does not determine its drift, each section of '
-        'the temperature program; null if unknown.',
+        'out: each position in turn or, if the other positions do not determine its drift, each '
+        'section of the temperature program; null if unknown.',
     ] = None
 
 
