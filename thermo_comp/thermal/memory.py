@@ -43,7 +43,7 @@ class LagBank:
         self.stamp_ns: int | None = None
         self.start_ns: int | None = None
         self.input = 0.0
-        #: Input less lagged input of each lag [K]; variance for a known initial state [K^2].
+        #: For each lag: input less lagged input [K]; variance if the initial state is known [K^2].
         self.lagging = self.extra = [0.0] * len(self.taus)
 
     def step(self, stamp_ns: int, value: float, sd: float = 0.0) -> None:
@@ -143,7 +143,7 @@ class ThermalMemory:
             bank.forget()
         self._held: list[float] = []  # output of each play; empty before the first temperature
         #: Rate of a ramp in which the unit may have been switched on [K/s], estimated from the
-        #: board's rate shortly afterwards; `sure_rate`: lower bound, largest rate less 2 sd.
+        #: board's rate shortly afterwards; `sure_rate`: its lower bound, largest rate less 2 sd.
         self.start_rate = self.sure_rate = 0.0
 
     def forget_input(self, name: str) -> None:

@@ -24,7 +24,7 @@ LARGEST_RATE: Final = 0.2  # additional change per second [K/s]
 #: may be wrong.
 SETTLED_READINGS: Final = 5
 #: A sensor's first reading is wrong if the second reading differs from it by an impossible step,
-#: and the third from the second by less than this share of the step, in K and in K/s.
+#: and the third differs from the second by less than this share of the step, in K and in K/s.
 CONTINUED_SHARE: Final = 0.25
 #: A sensor stands still after `STILL_S` [s] with this number of equal readings or, if larger, the
 #: number of equal readings that noise gives with the probability `STILL_PROBABILITY`.

@@ -313,7 +313,7 @@ class Calibration:
 
     @property
     def needs_case(self) -> bool:
-        """Whether the case is needed: `detector.case` is set, or a column depends on a sensor."""
+        """Whether case readings are needed: `detector.case` is set, or a column is of a sensor."""
         is_default = self.detector.case == ThermometerSettings()
         return not is_default or any(column.is_of_sensor for column in self.columns)
 

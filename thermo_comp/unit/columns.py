@@ -313,7 +313,7 @@ class ColumnTable:
         return raw - hold(raw, *self._range)
 
     def excess(self, raw: Floats) -> Floats:
-        """Return each u's distance d from its range [half ranges]; order p: (1 + d)^(1/p) - 1."""
+        """Return (1 + d)^(1/p) - 1; d: half ranges from u to its range, p: order of the column."""
         lower, upper = self._range
         excess = np.asarray(np.abs(self.beyond(raw)) / ((upper - lower) / 2.0))
         for order in {*self._orders.tolist()} - {1}:
