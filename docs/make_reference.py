@@ -56,7 +56,7 @@ format_version: 2
 unit: {serial: EXAMPLE-1, input: counts, full_scale: 32767.0, cycle_time_s: 0.01}
 reference_temperature_c: 20.0
 gravity_m_s2: 9.80665                # local gravity, input of the fit
-gravity_sd_m_s2: 0.0                 # its sd, input of the fit
+gravity_sd_m_s2: 0.0                 # sd of local gravity, input of the fit
 axes:                                # at the reference temperature
   x: {scale_factor: 299.1, bias: 4.2}   # counts per m/s^2, counts
 static:                              # the set of the static regime
@@ -97,8 +97,9 @@ BOUNDS = """\
 Each number in a calibration is one of the quantities in the table. The bounds are wider than any instrument needs; a
 calibration within them gives finite results and a positive definite covariance. The bias at the reference temperature, and
 its change over temperature, must each be within twice the full scale of the unit. The relative scale, plus or minus the sum
-of the largest effects of its columns, must stay between 0.1 and 10. The effect of a column on the bias, and of a parameter's
-sd on bias or relative scale, must be at most a million times the limit of that quantity.
+of the largest effects of its columns, must stay between 0.1 and 10. The largest effect of a column on the bias must be at most
+a million times the limit of the bias. The effect of a parameter's sd on the bias, or on the relative scale, must be at most
+a million times the limit of the bias, or of the relative scale.
 """
 
 INTERFACE = """\

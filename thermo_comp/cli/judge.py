@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from ..judging.judgement import Judgement
     from ..unit.calibration import Calibration
 
-#: Exit code of an update that determines no axis, or is not clearly better on left-out days.
+#: Exit code of an update that determines the bias and scale of no axis, or does not clearly reduce
+#: |f| - g on left-out days.
 NOTHING_GAINED = 3
 
 

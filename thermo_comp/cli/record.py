@@ -122,7 +122,7 @@ def _read_earlier(
 def _accounts(
     out: Output, news: Iterable['News | None'], test: 'Acquisition', bags: 'PositionBags'
 ) -> Iterator['Account']:
-    """Write blocks until test or bag ends; yield the state of the test at each None in `news`."""
+    """Write blocks until test or bag ends; yield the test's state each time `news` gives None."""
     chosen: str | None = None
     for new in news:
         if new is not None:

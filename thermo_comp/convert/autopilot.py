@@ -45,7 +45,7 @@ T = TypeVar('T')
 
 
 class _Correction(NamedTuple):
-    """A parameter that is 1 while the autopilot corrects thermal drift, and its values."""
+    """A parameter, 1 while the autopilot corrects thermal drift, and the parameter's history."""
 
     parameter: str
     history: Sequence[tuple[int, float]]  # (time since boot [ns], value from this time on)

@@ -52,7 +52,7 @@ class Content:
     """Content of a tool's file: ``a = matrix (N - bias)``, with the reading N."""
 
     matrix: Floats  # shape (3, 3); the identity in an autopilot's file
-    bias: Floats  # coefficients of the cubic of each axis, in units of N, shape (3, 4)
+    bias: Floats  # cubic over temperature of each axis: coefficients in units of N, (3, 4)
     reference_c: float  # temperature at which the argument of the cubics is 0
     range_c: tuple[float, float]
     notes: list[str]  # parts of the calibration that are lost or missing

@@ -297,8 +297,9 @@ def learn(
 
 def _best(candidates: Iterable[Change], is_gravity_certain: bool) -> Change | None:
     """
-    Return the most probable `Change`, or None if no log Bayes factor reaches `_LEAST_GAIN`. The
-    log Bayes factor of a gravity jump must exceed that of any other change by `_LEAST_LEAD`.
+    Return the most probable `Change`, or None if no log Bayes factor reaches `_LEAST_GAIN`. A
+    gravity jump is returned only if its log Bayes factor exceeds those of all other changes, and
+    0, by `_LEAST_LEAD` or more.
     """
     gravity = other = Change('levels', None, 0.0, log_bayes_factor=-np.inf)
     for change in candidates:

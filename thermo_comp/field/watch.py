@@ -83,7 +83,7 @@ class Watch:
 
     @property
     def exit_code(self) -> int:
-        """Exit code of the command: 1 if the error of the unit exceeds its claim, else 0."""
+        """Exit code: 1 if the verdict is *outside* (|f| - g is beyond its limit), else 0."""
         return 1 if self.outside_since else 0
 
     def __str__(self) -> str:
@@ -201,9 +201,10 @@ def _forecasts(
     of_parameters, of_levels = np.split(root, [recent.by_parameter.shape[1]], axis=1)
     walk = of_levels * np.repeat([ageing.bias, ageing.scale], 3)
     bias, scale = (float((part**2).sum()) for part in np.split(walk, 2, axis=1))
-    # Bias offsets of node starts add to the error, so their variance is subtracted from the square
-    # of the limit. After a disturbance the ageing model may overestimate the offsets' variance:
-    # use the variance of |f| - g at the recent rests instead, if this variance is smaller.
+    # Each start of the node gives the biases new offsets, which add to the error, so the variance
+    # of these offsets is subtracted from the square of the limit. After a disturbance the ageing
+    # model may overestimate the offsets' variance: use the variance of |f| - g at the recent rests
+    # instead, if this variance is smaller.
     scatter = ageing.turn_on**2 * float((of_levels[:, :3] ** 2).sum()) + ageing.rest**2
     left = recent.residual - recent.by_parameter @ solution.shift
     scatter = min(scatter, float(share @ left**2))

@@ -53,7 +53,7 @@ def build_calibration(
     """Return a fit's calibration; its valid ranges contain those of the calibration `earlier`."""
     (windows, regression, *_), posterior = fit, fit.posterior
     model, prior, state, layout = windows.model, posterior.prior, posterior.state, claim.layout
-    # Response columns whose weights have rows in the covariance; a weight may be 0.
+    # Columns of the response whose weights are in the covariance, also if the weight is 0.
     used = _of_columns(windows, np.any(layout.weights[:, 0] >= 0, axis=0))
     kinds = tuple(term.kind for term in nonlinearity.terms) if nonlinearity else ()
     to_file = file_jacobian(regression, layout, state, model, used, kinds)
@@ -146,8 +146,8 @@ def _valid_columns(
                 values, order = np.append(values, coldest - column.knee_k), 0
             valid = ranges.valid_range(values, 0.01, order)
             if k not in weighed:
-                # A column with zero weight contributes only to the covariance, so all values that
-                # the temperature range allows are valid.
+                # A column with zero weight contributes only to the covariance. Its range therefore
+                # includes every value that it can have within the temperature range.
                 largest = (upper - lower) ** column.term.order
                 valid = ranges.union((valid, (-largest, largest)))
         if k in of_parts and column.term.order % 2:

@@ -48,8 +48,8 @@ def contradicting_bag(fit: Fit) -> list[int]:
     Return, in a list, the index of a bag that may be of another environment; [] without such.
 
     A bag is suspect if its left-out drift exceeds five times both the median over the bags and the
-    white noise of a window. If the left-out drift of exactly one bag is unknown, this bag is
-    suspect if the median left-out drift of the other bags exceeds five times the noise.
+    white noise of a window. If the left-out drift of exactly one bag is unknown, that bag is
+    suspect as soon as the median left-out drift of the other bags exceeds five times this noise.
     """
     square = _square_of_bags(fit)
     is_scored = np.isfinite(square)
@@ -126,7 +126,7 @@ def contradiction(
 def _at_calibration(
     calibration: Calibration, data: Windows, gravity: float
 ) -> tuple[Regression, State]:
-    """Return the regression of windows, and its state with the values of a calibration."""
+    """Return the regression of windows, and the state of its unknowns that a calibration gives."""
     constants = constants_of(calibration)
     regression = Regression(data, gravity, constants.scale)
     state = initial_state(regression, constants, constants.directions(data))

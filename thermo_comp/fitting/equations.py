@@ -13,7 +13,8 @@ Equation [m/s^2] of the mean reading N of window w, position p, axis i; K0: nomi
 B and S are columns of the table in `unit.columns`, each divided by its RMS, with the weights beta
 and s. For an angular rate g is 0, which leaves bias b, columns B beta and offsets o_p. If |f|
 differs between positions, |f| replaces g, and the terms ``kappa sum_j (k_j + k'_j t) n_j(a)`` of
-`nonlinear` are added, t: T_board - T_reference. All terms are linear combinations of base series.
+`nonlinear` are added, t: T_board - T_reference. All terms of this equation are linear combinations
+of the base series (`series`).
 """
 
 from __future__ import annotations
@@ -263,7 +264,7 @@ class Equations(Series):
         return result
 
     def deviation(self, state: State, prior: Prior, layout: Layout) -> Floats:
-        """Return unknowns less prior means, (n,); for attitudes in a pose, rotations from it."""
+        """Return unknowns less prior means, (n,); of an attitude in a pose, rotation from it."""
         result = as_vector(state, layout)
         if prior.informative is not None:
             result[: layout.n_unit] -= prior.informative.mean

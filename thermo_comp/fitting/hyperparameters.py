@@ -244,8 +244,9 @@ def white_noise(regression: Regression, posterior: PosteriorMode) -> Floats:
     # the noisiest axis.
     least_sigma = np.full(3, max(posterior.prior.least_sigma, 0.01 * float(sigma.max())))
     if not regression.windows.has_drifts:
-        # If no column changes within a position, slow noise may explain the whole residual: the
-        # white noise is at least the noise of differences of windows, which contain no drift.
+        # If no column changes within a position, slow noise may absorb the whole residual. The
+        # white noise is then at least the noise of differences of windows, because these
+        # differences contain no drift.
         least_sigma = np.maximum(
             least_sigma, white_noise_of(regression.windows, regression.nominal_scale)
         )

@@ -46,8 +46,8 @@ class Problem:
 
     start: initial bias, scale and misalignment, without effects of temperature
     up: attitudes of the positions, upward unit vectors, shape (n_positions, 3)
-    is_by_settled: whether the selection refuses an increase of `left_out.settled_error`
-    has_pieces: whether each position is a piece, of about an hour, of a rest (`refit_checks`)
+    is_by_settled: whether the selection rejects a model with a larger `left_out.settled_error`
+    has_pieces: whether each position is a piece of a rest, about an hour long (`refit_checks`)
     """
 
     bags: Sequence[ReducedBag]
@@ -255,8 +255,8 @@ def _with_faces(prior: Prior, up: Floats) -> Prior:
 def _narrowed(prior: Prior, regression: Regression, state: State) -> Prior:
     """
     Return the prior for the selection of the columns: the sds of bias and scale are five times the
-    largest error of |f|, within 5..100 % of the sds of `prior`. With wider priors, bias and scale
-    would take large values in a model that lacks columns, as few attitudes do not determine both.
+    largest error of |f|, within 5..100 % of the sds of `prior`. With larger prior sds, bias and
+    scale, which few attitudes do not separate, would be large in a model that lacks columns.
     """
     norms = np.linalg.norm(position_means(regression.windows) / regression.nominal_scale, axis=1)
     limit = 5.0 * float(np.abs(norms - regression.norms(state)).max())
@@ -362,7 +362,8 @@ def _steepness(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool) -
         errors -= powers @ np.linalg.lstsq(powers, errors, rcond=None)[0]
     if is_at_rest:
         # Divide the sd of the errors of |f| by the RMS effect on |f| of unit slopes of bias and
-        # scale, less the part of this effect that a constant bias and scale explain.
+        # scale. The part of this effect that a constant bias and scale explain is subtracted
+        # first.
         constants = norm_columns(force / norms[:, None])[:, :6]
         celsius = windows.temperature[data.edges[:-1]]
         of_slopes = (celsius - celsius.mean())[:, None] * constants
@@ -379,7 +380,7 @@ def sizes_of(windows: ThermalWindows, options: FitOptions) -> Floats:
 
 
 def initial_triad(windows: ThermalWindows, options: FitOptions) -> ConstantCalibration:
-    """Fit constant bias, scale, M; in few attitudes only a common scale (1 for input in m/s^2)."""
+    """Fit constant bias, scale, M; for few attitudes one scale of all axes (1: input in m/s^2)."""
     means, gravity = position_means(windows.data), sizes_of(windows, options)
     norms = np.linalg.norm(means, axis=1)
     if not norms.all() or (len(means) > 1 and not means.any(axis=0).all()):

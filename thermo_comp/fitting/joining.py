@@ -54,7 +54,7 @@ def _continues(part: ReducedBag, bag: ReducedBag) -> bool:
 
 
 def _step(part: ReducedBag, bag: ReducedBag) -> float:
-    """Return the norm of the change of the readings from `part` to `bag`; 0 without rests."""
+    """Return the norm of the change of the mean sample from `part` to `bag`; 0 without rests."""
     if not (part.intervals and bag.intervals):
         return 0.0
     return float(np.linalg.norm(bag.intervals[0].mean[0] - part.intervals[-1].mean[-1]))

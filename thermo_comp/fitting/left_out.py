@@ -118,9 +118,9 @@ class Score:
     positions, sections: drift of left-out positions, and of left-out sections of the program
     norms: ``|f| - g`` of left-out positions in which the other positions determine |f|
     force: force in each window by a fit without its position, (n, 3); NaN if |f| is not scored
-    drift: drift of each window, (n, 3), by a fit without its position or, if that fit does not
-        determine the drift, without its section
-    halves: drift of left-out halves of the program, at temperatures that occur in the other half
+    drift: drift of each window, (n, 3), by a fit without its position; if that fit does not
+        determine the drift, by a fit without its section
+    halves: drift in each half of the program by a fit without it, at temperatures of both halves
     noise: white noise of a window, RMS of the axes [m/s^2]
     by_thermometer: error of a window due to a coarse board thermometer, RMS of the axes [m/s^2]
     settled: expected error of the bias at settled temperatures [m/s^2] (`settled_error`), or 0
@@ -217,9 +217,9 @@ def is_worse_by_norms(before: Score, after: Score) -> bool:
 
 def is_undecided(before: Score, after: Score) -> bool:
     """
-    Whether left-out data do not decide between two models, of which `after` is not better: the
-    drifts agree to 5 %; the errors of |f| are smaller in `after` by more than a standard error, or
-    cannot be compared (no fold is scored for both, or a coarse thermometer explains the errors).
+    Whether left-out data do not decide between `before` and a model `after` that is not better:
+    their drifts agree to 5 %, and the errors of |f| are smaller in `after` by more than a standard
+    error or cannot be compared (no fold scored for both, or a coarse thermometer explains them).
     """
     *drift, norms = _beyond_thermometer(before, after)
     is_equal = all(abs(gain[0]) < _NEGLIGIBLE_LOG_RATIO for gain in drift if gain)

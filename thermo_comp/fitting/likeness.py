@@ -97,7 +97,7 @@ def likenesses(fit: Fit) -> tuple[Likeness, ...]:
     try:
         pairs = [_likeness(point, groups, pair) for pair in _PAIRS if used & {*pair.groups}]
     except np.linalg.LinAlgError:
-        # The fit succeeded: rounding errors in a table of correlations are no reason to refuse it.
+        # The fit has succeeded: a rounding error in this table of correlations must not end it.
         return ()
     return tuple(likeness for likeness in pairs if likeness is not None)
 

@@ -127,9 +127,10 @@ def informative_priors(
         # for both, and few rests do not separate them.
         tried += [(ageing, 0.0) for ageing in (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)]
         # Priors for a unit whose temperature effects have changed, besides bias and scale factor.
-        # A `share` of 1, 1e3 and 1e6 increases the prior sd 1.4, 30 and 1000 times, as the sd may
-        # be a thousandth of the effect. `_root` limits the added sd to the size of the effect:
-        # with a larger sd, effects at temperatures without rests would be unknown.
+        # A `share` of 1, 1e3 or 1e6 multiplies the prior sd of each parameter by up to 1.4, 30 or
+        # 1000, because an effect of temperature may be a thousand times its prior sd. `_root`
+        # limits the added sd to the size of the effect: with a larger sd, effects at temperatures
+        # without rests would be unknown.
         tried += [(ageing, share) for share in (1.0, 1e3, 1e6) for ageing in (3e-5, 3e-4, 3e-3)]
     K, places = constants_of(calibration).scale, parameter_layout(calibration)
     layout = regression.layout(regression.windows.parts)

@@ -221,7 +221,7 @@ def _dead_axes(bags: Sequence[ReducedBag]) -> Iterator[_DeadAxis]:
 
 
 def constant_axes(bags: Sequence[ReducedBag], usual: Bools) -> Iterator[_DeadAxis]:
-    """Find axes that are constant throughout a rest, of the axes in the mask `usual`, (3,)."""
+    """Find axes of the mask `usual`, (3,), whose samples are constant throughout a rest."""
     for bag in bags:
         for rest in bag.intervals:
             is_dead = ~(rest.sample_sd > 0.0) & usual & (np.ptp(rest.mean, axis=0) == 0.0)

@@ -4,11 +4,11 @@
 Owns the statistics of a bag: still intervals, their windows, temperature readings, counters.
 
 The blocks of a bag are read once, in bounded memory. Samples are averaged to cells of about half a
-second (see `stillness`), and the cells of a still interval to windows of ten seconds. A short
-interval, and the end of an interval, may have shorter windows. Within a window the deviation of
-every thermal regressor from a straight line is far below the noise, so the mean of a window is a
-sufficient statistic. The regression estimates the noise of the means of windows; with a
-charge-balancing converter this noise is smaller than the scatter of the samples implies.
+second (see `stillness`), and the cells of a still interval to windows of ten seconds. Windows
+of a short interval, or at the end of an interval, may be shorter than ten seconds. In a window the
+deviation of every thermal regressor from a straight line is far below the noise, so the mean of a
+window is a sufficient statistic. The regression estimates the noise of the means of windows; with
+a charge-balancing converter this noise is smaller than the scatter of the samples implies.
 """
 
 from __future__ import annotations

@@ -67,8 +67,8 @@ class Whitener:
             time_s *= 10.0**0.5
         #: Upper bound of the correlation time in a search [s]: half a decade above `times_s[-1]`.
         self._longest_s = time_s
-        #: Number of processes of flicker noise: their correlation times are 3 windows times powers
-        #: of ten, up to the first that is at least as long as a position.
+        #: Number of processes that make up flicker noise: their correlation times are 3, 30, 300,
+        #: ... windows, up to the first time that is at least as long as a position.
         self.n_flicker = 1 + math.ceil(math.log10(max(span_s / (3.0 * typical_s), 1.0)))
 
     def shows(self, time_s: float) -> bool:
@@ -294,8 +294,8 @@ class Series:
 
     def products_of(self, columns: Ints, base: Base, state: State) -> tuple[Floats, Floats]:
         """
-        Return the sums of products of k columns, at the initial lag states of `state`, with each
-        other and with base series, shapes (n_positions, k, k) and (n_positions, k, n_base).
+        For the initial lag states of `state`, return the sums of products of k columns with each
+        other, (n_positions, k, k), and of k columns with base series, (n_positions, k, n_base).
         """
         values, lag = self.columns[:, columns], self.windows.lag[columns]
         lagged, start = lag >= 0, (state.start @ self.start_root.T)[self.windows.bag]

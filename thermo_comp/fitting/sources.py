@@ -59,7 +59,7 @@ class Magnitude(NamedTuple):
 
     @property
     def norm(self) -> float:
-        """|f| with the radius as stated [m/s^2]."""
+        """|f| with the centripetal acceleration at the stated radius [m/s^2]."""
         return math.hypot(self.still, self.spin)
 
 

@@ -60,7 +60,7 @@ class Sets:
     is_shared: bool = True
 
     def columns(self, t: Floats, weight: Floats) -> list[Floats]:
-        """Evaluate the columns of the curves of the static and the dynamic set."""
+        """Return basis functions of the static and dynamic curves at `t`, each of shape (n,)."""
         static, dynamic = self.static.basis(t), self.dynamic.basis(t)
         if not self.is_shared:
             static = [(1.0 - weight) * value for value in static]
@@ -344,7 +344,7 @@ def _windows(
     sums, groups, columns = model.part_sums, model.sets.groups, model.columns
     n_curves, lags = len(groups), StateLayout(spec).lags
     t, gradient = rows.thermal[:, 0] - model.reference_temperature, rows.thermal[:, 4]
-    # A support's tilt is linear in board and case temperature, and in the square of the case's.
+    # A support's tilt is linear in board temperature, case temperature and its square.
     tilt = np.column_stack((t, gradient, (t + gradient) ** 2))
     tilt_rms = np.sqrt(np.mean(tilt**2, axis=0))
     is_tilting = tilt_rms > 0.0

@@ -268,7 +268,7 @@ def _joined(sums: _Table) -> _Table:
 
 
 def _correct(calibration: Calibration, bag: ReducedBag, sums: _Table) -> None:
-    """Correct partial sums with the compensator and the readings up to each sum's middle."""
+    """Correct the mean samples in `sums`, each by the readings up to its middle time."""
     # The checks for stuck samples and gravity do not apply to means of samples.
     config = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
     compensator = Compensator(calibration, config)

@@ -126,8 +126,8 @@ def _push(
     while arrivals and arrivals[-1][0] <= place:
         _, _, name, stamp_ns, celsius = arrivals.pop()
         if len(thermal.queue) >= PENDING_LIMIT:
-            # A full queue is applied up to `DISORDER_NS` before the new reading, as the node does
-            # while no samples come; after the first sample, readings after `due_ns` keep waiting.
+            # If the queue is full, apply its readings up to `DISORDER_NS` before the new reading,
+            # as the node does without samples; after the first sample, only those up to `due_ns`.
             limit_ns = NEVER_NS if compensator.now_ns is None else due_ns
             thermal.flush(min(limit_ns, stamp_ns - DISORDER_NS))
         thermal.push(name, stamp_ns, celsius)

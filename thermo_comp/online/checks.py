@@ -94,7 +94,8 @@ class StuckCheck:
         self._noisy = [NOISY_SDS * sd or math.inf for sd in noise_sds]
         self._visible = [sd / VISIBLE_SDS for sd in noise_sds]
         self.last = (math.nan, math.nan, math.nan, 0)  # the last sample and its stamp
-        #: Present run of equal readings of each axis; empty if the last sample changed all axes.
+        #: For each axis, the run of equal readings that ends with the last sample; empty if the
+        #: last sample changed the reading of every axis.
         self.runs: tuple[Run, ...] = ()
 
     def again(self, stamp_ns: int, x: float, y: float, z: float) -> bool:
@@ -210,7 +211,7 @@ class RateCheck:
     def __init__(self, cycle_s: float, counts_cycles: bool = True) -> None:
         self._cycle_s, self._counts_cycles = cycle_s, counts_cycles
         self._allowance = max(BURST_SAMPLES, BURST_S / cycle_s)
-        self.is_too_fast = False  # whether more samples come than the converter can make
+        self.is_too_fast = False  # whether samples arrive faster than the converter makes them
         self.ratio = 1.0  # samples per calibrated conversion cycle over the last `_WINDOW_S`
         self._level = 0.0
         self._last: tuple[int, int] | None = None
@@ -389,7 +390,7 @@ class GravityCheck:
         self.result = GravityResidual(residual, sd, n + 1, is_still=True)
 
     def _is_accelerated(self, mean: Sequence[float], size: float) -> bool:
-        """Whether an acceleration of the platform may explain the |f| of a window, `size`."""
+        """Whether motion of the platform may explain `size`, the |f| of a window [m/s^2]."""
         if self.is_refuted or self._agreed is None or not self._has_moved:
             return False
         agreed, agreed_ns = self._agreed

@@ -63,7 +63,8 @@ class CompensatorStatus:
     """State of a compensator at the stamp of its last sample."""
 
     stamp_ns: int | None
-    #: Fault of each thermometer, and size of a rejected step or excess of a loose thermometer [K].
+    #: Fault of each thermometer, and its size [K]: the rejected step, the shift, or the
+    #: unexplained gradient of a loose thermometer.
     faults: Mapping[str, tuple[Fault, float]]
     #: Time from the last sample to the latest queued temperature reading [s].
     pending_ahead_s: float
@@ -106,7 +107,7 @@ class Compensator:
         self.reading_ns = EVER_NS  # the latest stamp of a reading
         #: The present segment: start [ns], result of `Correction.line`, and misalignment.
         self._segment: tuple[int, list[float], tuple[float, ...]] = (0, [], ())
-        #: `Correction.line` of the angular rate, present segment; empty without a gyroscope.
+        #: `Correction.line` of the angular rate in the present segment; empty without a gyroscope.
         self.rate_line: list[float] = []
 
     def _use(self, calibration: Calibration) -> None:

@@ -34,7 +34,7 @@ from .status import CompensatorConfig, Counters
 #: Longest segment [ns].
 SEGMENT_NS: Final = 1_000_000_000
 SLOW_NS: Final = 10_000_000_000  # longest time a `SlowState` and its variance are used [ns]
-YOUNG_READINGS: Final = 30  # number of readings that determine the rate of the board temperature
+YOUNG_READINGS: Final = 30  # board readings after which the estimate of their rate is precise
 EVER_NS: Final = -NEVER_NS  # a stamp earlier than any real stamp
 #: Sd of the temperature of a unit without thermometer about the reference temperature [K].
 UNMEASURED_SD_K: Final = 10.0
@@ -57,7 +57,7 @@ class Segment(NamedTuple):
     start_ns: int
     # False if an earlier call of `ThermalSide.segment` has opened this segment.
     is_new: bool
-    is_too_fast: bool  # whether samples come faster than the converter can make them
+    is_too_fast: bool  # whether samples arrive faster than the converter makes them
     noise_excess: float  # relative excess of the noise variance because of the samples' rate
     start: tuple[float, ...]  # thermal state at the start of the segment
     end: tuple[float, ...]  # thermal state at the end of the segment

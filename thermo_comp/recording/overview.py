@@ -224,7 +224,7 @@ def survey_thermometer(readings: Sequence[Readings]) -> ThermometerSurvey | None
     stamp_ns, celsius = stamp_ns[use], celsius[use]
     if not len(celsius):
         return None
-    # Rates are taken between two-minute means, so that a step by a quantum is not a ramp.
+    # Temperature rates are taken between two-minute means: one quantum step is then no ramp.
     time = (stamp_ns - stamp_ns[0]) * 1e-9
     bins = np.maximum(time // _RAMP_WINDOW_S, 0).astype(np.int64)
     mean_time, mean = means_by(bins, np.column_stack((time, celsius))).T

@@ -137,7 +137,7 @@ _USUAL = Topics()
 
 
 class Selected(NamedTuple):
-    """Topics and fields by role; input of the samples; `chosen`: notes on topics, or None."""
+    """Topic and field of each role; `input`: kind of the samples; `chosen`: notes on topics."""
 
     topics: dict[Role, str]
     fields: dict[Role, str]

@@ -30,7 +30,7 @@ STAMP_END_NS = 2**31 * 10**9  # upper limit of ROS stamps, exclusive [ns]
 _AUTO_FLUSH_BYTES = 1 << 26
 TABLES: Mapping[str, Kind] = {'.csv': CSV, '.parquet': PARQUET}  # formats by the file's suffix
 WriteRows = Callable[[Mapping[str, NDArray[Any]]], None]
-#: Field of a message: indices of its numbers, name, values of all messages.
+#: One field: slice of a message's numbers, name of the field, values (one row per message).
 _Column = tuple[slice, str, ArrayLike]
 
 

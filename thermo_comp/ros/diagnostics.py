@@ -37,8 +37,8 @@ IDLE_S = 5.0
 AHEAD_S = 5.0
 #: Samples have stopped if none arrives for the longer of these conversion cycles and time [s].
 SILENT_CYCLES, SILENT_S = 5.0, 0.5
-#: Time for which the level must stay lower until the lower level is logged [s], so that a fault
-#: that comes and goes does not fill the log.
+#: Time for which the level of the diagnostics must stay below the logged level before the lower
+#: level is logged [s]; a fault that comes and goes then does not fill the log.
 RELIEF_S = 5.0
 #: Largest error of |f| at rest without a warning, in standard deviations of the error.
 GRAVITY_SIGMAS = 5.0

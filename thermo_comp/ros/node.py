@@ -32,8 +32,9 @@ from .waitloop import WaitLoop, overrides
 
 NODE_NAME = 'thermo_comp'
 
-#: Pause after a wake-up [s], for best-effort samples at 7 kHz or more. At 10 kHz the pause saves a
-#: third of the CPU time; at 5 kHz a pause would delay a sample by more than its correction takes.
+#: Pause after a wake-up [s], for best-effort samples at 7 kHz or more. This pause saves a third of
+#: the CPU time at 10 kHz. At 5 kHz it would delay a sample by more time than the correction of the
+#: sample takes.
 PAUSE_S = 0.2e-3
 
 #: Time after a signal at which a process is ended even if a call hangs [s].

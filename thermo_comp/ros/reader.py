@@ -71,7 +71,7 @@ def read(name: str, directory: str = '') -> LoadedCalibration:
             raise
         raise CalibrationError(error.rule, name) from error
     except Exception as error:
-        # No error of a file may end the node; `expanduser` raises RuntimeError for unknown users.
+        # A wrong file must not end the node; `expanduser` raises RuntimeError for unknown users.
         has_reason = isinstance(error, OSError) or type(error) in (ValueError, RuntimeError)
         reason = getattr(error, 'strerror', None) or (has_reason and str(error))
         raise CalibrationError(

@@ -30,7 +30,7 @@ from .reader import LoadedCalibration
 from .rest_log import BLOCK, RestKeeper
 from .waitloop import RawSubscription, RCLError, WaitLoop
 
-#: Without samples, a reading is used once the newest reading is later by this time [ns].
+#: Without samples, a reading is used once a reading with a stamp later by this time [ns] has come.
 IDLE_NS = 1_000_000_000
 
 _SECOND = slice(4, 8)  # bytes of a CDR message that hold the seconds of its stamp

@@ -58,7 +58,7 @@ Serve = Callable[[Any, Callable[[Any], None]], None]
 
 class Sources:
     """
-    Decides whether the messages of a topic with several listed publishers come from only one.
+    Decides whether the messages of a topic with several publishers come from only one of them.
 
     The middleware lists a killed publisher until its lease of 20 s ends. Messages do not
     identify their publisher, but each publisher numbers its messages, so consecutive numbers over

@@ -5,7 +5,7 @@ Owns the detection of departures of a temperature's rate from the baseline, the 
 
 Two Kalman filters of temperature and rate, with a long and a short memory, model d2T/dt2 as white
 noise. A rate has departed if it exceeds the baseline, away from 0, by more than the sum of its
-swing, the error of the baseline and k times the sd of the rate's noise; k follows from the
+swing, the error of the baseline and h times the sd of the rate's noise; h follows from the
 permitted number of false alarms per hour (Rice's formula [1]_, docs/regime.md). If noise cannot
 change the reading of a quantized sensor, the filters are not used: the mean rate follows from two
 successive crossings of edges between cells of one quantum.
@@ -23,12 +23,12 @@ from typing import Final
 from .settings import ThermometerSettings
 from .thermometer import Thermometer
 
-# d2T/dt2 that each of the two filters detects best / d2T/dt2 at the onset of the slowest ramp.
+# For each filter: d2T/dt2 that it detects best / d2T/dt2 at the onset of the smallest ramp.
 BEND_SHARES = (1.0, 10.0)
 TUNING: Final = 1.45  # best memory of a filter [s] / (noise sd / d2T/dt2)^0.4, readings at 1 Hz
 # Noise variance of a filter's rate / rate variance by the filter, if noise is mostly quantization.
 CELL_NOISE_SHARE: Final = 0.4
-SETTLING_MEMORIES: Final = 5.0  # age / memory of a filter from which its noise is stationary
+SETTLING_MEMORIES: Final = 5.0  # age / memory above which a filter's noise is stationary
 LONGEST_HALF_SWING_S: Final = 600.0  # longest half period of a temperature ripple [s]
 LARGEST_BASELINE_SHARE: Final = 0.25  # largest baseline rate of a soak / smallest ramp's rate
 SWING_MARGIN: Final = 1.25  # assumed swing / observed swing of the rate about its trend
@@ -77,7 +77,7 @@ class ChangeDetector:
         self._peak = self._peak_before = 0.0  # largest distances of the rate from its trend [K/s]
 
     def settle(self, sensor: Thermometer, least_error: float = 0.0) -> None:
-        """Begin a soak: the rate becomes the baseline, with at least the error `least_error`."""
+        """Begin a soak: the rate becomes the baseline, with an error of at least `least_error`."""
         self._baseline = self.rate
         self._baseline_error = max(self.swing, least_error, 2.0 * sqrt(sensor.var_rate))
         self._edge = nan  # last edge of a cell crossed in the soak: none yet

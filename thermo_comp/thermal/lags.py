@@ -81,7 +81,7 @@ class Lag(_Lag, Quantity):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Thermometers of the lag: `input` and, for a part between board and sensor, `sensor`."""
+        """Names of the thermometers: `input`, and for a part between board and sensor `sensor`."""
         return (self.input, self.sensor) if self.sensor else (self.input,)
 
     @property
@@ -186,8 +186,8 @@ def start_root(lags: Sequence[tuple[Any, ...]]) -> Floats:
 
     The input before the first reading is modelled as a random walk with ``D = 2 sd^2 /
     START_TAU_S`` [K^2/s]: lags k, l of one input have the covariance ``P_kl = D tau_k tau_l /
-    (tau_k + tau_l)``, lags of different inputs 0. In s seconds P_kl changes by the factor
-    ``exp(-s/tau_k - s/tau_l)``.
+    (tau_k + tau_l)``, lags of different inputs are uncorrelated. In s seconds P_kl changes by the
+    factor ``exp(-s/tau_k - s/tau_l)``.
     """
     all_lags = [Lag(*lag) for lag in lags]
     terms = first_order_lags(all_lags)

@@ -43,7 +43,7 @@ class LagBank:
         self.stamp_ns: int | None = None
         self.start_ns: int | None = None
         self.input = 0.0
-        #: Input less lagged input of each lag [K]; variance for a known initial state [K^2].
+        #: For each lag: input less lagged input [K]; variance if the initial state is known [K^2].
         self.lagging = self.extra = [0.0] * len(self.taus)
 
     def step(self, stamp_ns: int, value: float, sd: float = 0.0) -> None:
@@ -82,7 +82,7 @@ class LagBank:
         self.extra = [variance + change * change for variance in self.extra]
 
     def at(self, stamp_ns: int, value: float) -> tuple[list[float], list[float]]:
-        """Return `lagging` and `extra` at a stamp at which the input is `value` [K]."""
+        """Return each lag [K] and its variance [K^2] at a stamp, for the input `value` [K]."""
         seen_ns = self.stamp_ns
         if seen_ns is None or stamp_ns <= seen_ns or not self.taus:
             return self.lagging, self.extra
@@ -125,13 +125,13 @@ class ThermalMemory:
         }
         self.board = self.banks[BOARD_INPUT]
         self.is_empty = not spec.lags and not spec.plays
-        #: For each lag: index and weight of its first-order lags; [] if all lags are first-order.
+        #: For each lag: index and weight of the first-order lags in it; [] if all are first-order.
         self._sums = [weights(lag) for lag in spec.lags]
         if self._sums == [[(k, 1.0)] for k in range(len(terms))]:
             self._sums = []
         #: For each play: index of the lag of its input, -1 for the board; half-width [K].
         self._inputs = [spec.lags.index(play.lag) if play.lag else -1 for play in spec.plays]
-        #: For each play: index and weight of the first-order lags of its input; [] if not lagged.
+        #: For each play: index and weight of each first-order lag in its input; [] without a lag.
         self._followed = [weights(play.lag) if play.lag else [] for play in spec.plays]
         self._needs_sensors = any(play.inputs != (BOARD_INPUT,) for play in spec.plays)
         self._widths = [play.width_k for play in spec.plays]
@@ -143,7 +143,7 @@ class ThermalMemory:
             bank.forget()
         self._held: list[float] = []  # output of each play; empty before the first temperature
         #: Rate of a ramp in which the unit may have been switched on [K/s], estimated from the
-        #: board's rate shortly afterwards; `sure_rate`: lower bound, largest rate less 2 sd.
+        #: board's rate shortly afterwards; `sure_rate`: its lower bound, largest rate less 2 sd.
         self.start_rate = self.sure_rate = 0.0
 
     def forget_input(self, name: str) -> None:

@@ -24,7 +24,7 @@ LARGEST_RATE: Final = 0.2  # additional change per second [K/s]
 #: may be wrong.
 SETTLED_READINGS: Final = 5
 #: A sensor's first reading is wrong if the second reading differs from it by an impossible step,
-#: and the third from the second by less than this share of the step, in K and in K/s.
+#: and the third differs from the second by less than this share of the step, in K and in K/s.
 CONTINUED_SHARE: Final = 0.25
 #: A sensor stands still after `STILL_S` [s] with this number of equal readings or, if larger, the
 #: number of equal readings that noise gives with the probability `STILL_PROBABILITY`.
@@ -36,7 +36,7 @@ DOUBTFUL_READINGS: Final = 4
 # Constant readings of a sensor are frozen if the other sensor's temperature changes by more than
 # noise, quanta and this margin [K].
 OTHER_MOVED: Final = 0.3
-OTHER_MOVED_BEYOND_CELL: Final = 0.7  # the margin for a quantum far above the noise
+OTHER_MOVED_BEYOND_CELL: Final = 0.7  # this margin [K] if the quantum is far above the noise
 LARGEST_ERROR: Final = 60.0  # largest assumed error of a sensor with constant readings [K]
 
 # In a ramp the sensor with the larger temperature change leads if the changes of the two sensors
@@ -86,7 +86,8 @@ class SensorCheck:
 
     def __init__(self, sensor: Thermometer, other: Thermometer, lag_s: float) -> None:
         self.sensor, self._other, self.lag_s = sensor, other, lag_s
-        #: Signed sum of the impossible jumps after which readings were used [K].
+        #: Signed sum [K] of the jumps that no part's temperature can make and after which the
+        #: readings were used.
         self.shift = 0.0
         settings = sensor.settings
         self._quantum = settings.quantum_c
@@ -234,8 +235,8 @@ class SensorCheck:
 
     def still(self, stamp_ns: int) -> tuple[float, float]:
         """
-        Return the possible error of constant readings [K], and the time since their last change
-        [s]; zeros if the readings change, or stay equal only because of a wide quantum.
+        Return the possible error of constant readings [K], and the time since they last changed
+        [s]. Both are 0 if noise or a large quantum explains why the readings are equal.
         """
         changed_ns = self.sensor.changed_ns
         is_explained = self._has_cells and self.fault is not Fault.FROZEN

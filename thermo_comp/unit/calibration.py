@@ -210,7 +210,8 @@ class Calibration:
         'Standard deviations of M[1][0], M[2][0], M[2][1], used if `posterior` is null.',
     ] = (0.0, 0.0, 0.0)
     sensors: Annotated[
-        tuple[str, ...], "Thermometers except the board's; in a ramp the board lags the first."
+        tuple[str, ...],
+        "Thermometers except the board's; in a ramp the board lags the first of them.",
     ] = ('case',)
     response: Annotated[
         tuple[ResponseTerm, ...], QUANTITIES['columns'], 'Columns of the thermal response.'
@@ -312,7 +313,7 @@ class Calibration:
 
     @property
     def needs_case(self) -> bool:
-        """Whether `detector.case` is not the default, or a column depends on one of `sensors`."""
+        """Whether case readings are needed: `detector.case` is set, or a column is of a sensor."""
         is_default = self.detector.case == ThermometerSettings()
         return not is_default or any(column.is_of_sensor for column in self.columns)
 

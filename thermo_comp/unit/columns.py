@@ -286,7 +286,7 @@ class ColumnTable:
         terms = np.array([c.term for c in columns], object)
         bent = [term for term in dict.fromkeys(terms.tolist()) if term.form is not LINE]
         self._terms = [(np.flatnonzero(terms == term), term) for term in bent]
-        # The temperature of a part is the board temperature less the lag of the part.
+        # The temperature of a part is the board temperature less the lag of the part [K].
         self._parts = np.flatnonzero([term.is_temperature for term in terms])
         self._is_lagging = self._places[self._parts][:, np.newaxis] != BOARD
 
@@ -313,7 +313,7 @@ class ColumnTable:
         return raw - hold(raw, *self._range)
 
     def excess(self, raw: Floats) -> Floats:
-        """Return each u's distance d from its range [half ranges]; order p: (1 + d)^(1/p) - 1."""
+        """Return (1 + d)^(1/p) - 1; d: half ranges from u to its range, p: order of the column."""
         lower, upper = self._range
         excess = np.asarray(np.abs(self.beyond(raw)) / ((upper - lower) / 2.0))
         for order in {*self._orders.tolist()} - {1}:

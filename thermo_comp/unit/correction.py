@@ -61,7 +61,7 @@ class Excess(NamedTuple):
     temperature: float  # board temperature beyond the range of the present regime, signed [K]
     rate: float  # rate of the board temperature beyond this regime's range, signed [K/s]
     gradient: float  # excess of the gradient farthest outside its range, signed [K]
-    relative: float  # excess of temperature + of rate + largest of a column [half ranges]
+    relative: float  # sum of excess temperature, rate and worst column [half ranges]
 
 
 class Correction:

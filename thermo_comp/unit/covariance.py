@@ -80,7 +80,7 @@ class CovarianceMap:
 
 
 def grown(between: Floats, growth: Floats) -> Floats:
-    """Scale covariances of pairs `BETWEEN`, (36, n), for axis variances times `growth`, (3, n)."""
+    """Scale covariances `BETWEEN`, (36, n), for axis variances multiplied by `growth`, (3, n)."""
     # The misalignment does not depend on the temperature, so its errors do not grow.
     roots = np.concatenate((np.repeat(np.sqrt(growth), 2, 0), np.ones_like(growth)))
     return np.asarray(between * roots[_FIRST] * roots[_SECOND])

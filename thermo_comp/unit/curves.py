@@ -51,7 +51,7 @@ class Curves:
         self._lacks = {regime: np.array(rows).T for regime, rows in enumerate(lacks) if rows}
 
     def excess(self, states: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Return T_board [K], rate [K/s] beyond each set's range; both in half ranges, (2, n)."""
+        """Return excess of T_board [K] and rate [K/s] for each set, and in half ranges, (2, n)."""
         t, rate = states[BOARD] - self._reference, states[RATE]
         over, too_fast = t - hold(t, *self._t_range), rate - hold(rate, *self._rate_range)
         span, rate_span = (edges[1] - edges[0] for edges in (self._t_range, self._rate_range))

@@ -100,8 +100,8 @@ class SlowUncertainty:
         of_misalignment, var_misalignment = self._misalignment
         n_start, (n, rank) = len(of_start), (states.shape[1], of_misalignment.shape[1])
         errors = np.zeros((9, n_start + rank, n))
-        # A larger element of the misalignment increases the corrected force; a larger bias or
-        # scale factor decreases the corrected force.
+        # For positive forces, a larger element of the misalignment matrix increases the corrected
+        # force, and a larger bias or scale factor decreases it.
         errors[6:, n_start:] = -of_misalignment[:, :, np.newaxis]
         variance = np.zeros((3, 3, n))
         of_nonlinearity: list[Floats] = []

@@ -43,7 +43,10 @@ class Source:
 
 @dataclass(frozen=True)
 class ResidualSummary:
-    """``|f| - g`` of fitted data in one regime or both; raw: with bias and scale at T_ref only."""
+    """
+    Residual ``|f| - g`` of the fitted windows of one regime or both. `raw_rms_m_s2` is the RMS if
+    only bias and scale at T_ref are corrected.
+    """
 
     section: str
     n_windows: _Number
@@ -58,8 +61,8 @@ class ResidualSummary:
     left_out_drift_m_s2: Annotated[
         _Error | None,
         'RMS drift of an axis (force less its mean in the position) on data that the fit leaves '
-        'out: each position in turn or, if the rest does not determine its drift, each section of '
-        'the temperature program; null if unknown.',
+        'out: each position in turn or, if the other positions do not determine its drift, each '
+        'section of the temperature program; null if unknown.',
     ] = None
 
 
