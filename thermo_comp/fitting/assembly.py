@@ -50,7 +50,7 @@ def build_calibration(
     earlier: Calibration | None = None,
     nonlinearity: Nonlinearity | None = None,
 ) -> Calibration:
-    """Return a fit's calibration; its valid ranges contain those of the calibration `earlier`."""
+    """Return a fit's calibration; valid ranges include the ranges of the prior, `earlier`."""
     (windows, regression, *_), posterior = fit, fit.posterior
     model, prior, state, layout = windows.model, posterior.prior, posterior.state, claim.layout
     # Columns of the response whose weights are in the covariance, also if the weight is 0.
@@ -64,8 +64,8 @@ def build_calibration(
     lag_s = earlier.board_lag_s if earlier else ranges.usable_board_lag(windows)
     sensors = {*model.sensors[:1], *(column.sensor for column in columns)}
     window_s = windows.typical_count * float(np.median([bag.cycle_s for bag in bags]))
-    # Slow noise fitted to a drift that no column describes may absorb most of the white noise. If
-    # it does, the white noise is that of differences of windows, in which a drift cancels.
+    # Slow noise fitted to a drift that no column describes may absorb most of the white noise. The
+    # white noise is then estimated from differences of windows, in which a drift cancels.
     sigma, white = prior.sigma, white_noise_of(regression.windows, regression.nominal_scale)
     sigma = np.where(sigma < 0.7 * white, white, sigma)
     blank = Calibration(
@@ -89,7 +89,7 @@ def build_calibration(
         nonlinearity=nonlinearity,
     )
     if earlier is not None and not (earlier.needs_temperature or windows.has_temperature):
-        # Without a thermometer, the dependence on temperature is a rounding error: remove it.
+        # Without a thermometer, the fitted effect of temperature is a rounding error: set it to 0.
         places = parameter_layout(blank)
         for block in (*places.bias, *places.scale):
             level = values[block.static]
@@ -209,7 +209,7 @@ def blank_terms(columns: Iterable[Column]) -> tuple[ResponseTerm, ...]:
 
 
 def parameters_of(calibration: Calibration) -> Floats:
-    """Return the parameters in the posterior's order; those for errors of scale factors are 0."""
+    """Return the parameters in the posterior's order; errors of scale factors are set to 0."""
     values: list[float] = []
     pairs = zip(calibration.static.axes(), calibration.dynamic.axes(), strict=True)
     for axis, (reference, sets) in enumerate(zip(calibration.axes, pairs, strict=True)):
@@ -233,7 +233,7 @@ def with_parameters(
     """
     Replace the scale factors and the parameters of a calibration.
 
-    `values`: parameters in the posterior's order; those for errors of scale factors are not used
+    `values`: parameters in the posterior's order; the errors of scale factors in it are not used
     """
     layout = parameter_layout(calibration)
     levels = values[[bias.static for bias in layout.bias]]
@@ -289,7 +289,7 @@ def file_jacobian(
     """
     sets, sums = model.sets, model.part_sums
     n, m = sets.static.n_free, sets.dynamic.n_free
-    # The last row is zero: the index -1 of a parameter that is not estimated selects this row.
+    # The last row of `unknown` is 0: index -1, of a parameter that is not estimated, selects it.
     unknown = np.eye(layout.n_unit + 1, layout.n_unit)
     rows: list[Floats] = []
     for axis, K in enumerate(regression.nominal_scale):

@@ -24,14 +24,14 @@ from .regression import PosteriorMode, Regression
 @dataclass(frozen=True)
 class Contributions:
     """
-    RMS contributions to the readings of an axis [m/s^2]; None: the fit has no such unknown.
+    RMS contributions to the readings of an axis [m/s^2]; None if the fit lacks the unknowns.
 
     thermal_response: response of the unit, less its value at the mean of the columns over all
         windows; RMS over the windows
     initial_lag_states: effect of the initial lag states, RMS over the windows
     support_tilt: effect of the tilts less its mean in each position, RMS over the windows
-    mounting_offsets, turn_on_offsets: bias offsets of positions and of bags, RMS over these; the
-        posterior variance is included, because |f| shows only the vertical part of an offset
+    mounting_offsets, turn_on_offsets: RMS of the bias offsets of all positions, and of all bags;
+        it includes the posterior variance, as |f| shows only the vertical part of an offset
     slow_noise: sd of the slow noise, see `Noise`
     """
 

@@ -4,9 +4,9 @@
 Owns the covariance of a triad's constants after a test, and the choice of a further position.
 
 At rest |f| = g is known, so each position gives one equation for the nine constants of a triad:
-bias x y z [g], relative scale x y z, elements yx zx zy of M [rad], in this order. The equations
-are linearised about an ideal triad. Together with the prior of the fit, the directions of the
-positions and the noise determine the covariance of the constants.
+bias x y z [g], relative scale x y z, elements yx zx zy of the misalignment matrix M [rad], in this
+order. The equations are linearised about an ideal triad. The directions of the positions, the
+noise and the prior of the fit determine the covariance of the constants.
 """
 
 from __future__ import annotations
@@ -61,10 +61,10 @@ def next_direction(covariance: Floats, sd: float, positions: Floats) -> Floats:
     Find the direction of a new position, of noise `sd` [g], that most reduces the variance of the
     force, averaged over all attitudes.
 
-    A cube is held most easily on a face: the direction of a face is returned if it reduces the
-    variance at least half as much as the best direction; else that of an edge, else of a corner,
-    else any other. Directions within 20 degrees of one in `positions`, shape (n, 3), are not
-    proposed; if `positions` leave no other direction, the result is +z.
+    Faces, edges and corners of a cube, which is held most easily on a face, are tried in this
+    order, then all other directions: the first kind is used that has a direction at least half as
+    good as the best direction. Directions within 20 degrees of a vector in `positions`, shape
+    (n, 3), are not proposed; if no direction is left, the result is +z.
     """
     columns = force_columns(_SPHERE)
     weight = np.einsum('nij,nik->jk', columns, columns) / len(columns)
@@ -81,7 +81,7 @@ def next_direction(covariance: Floats, sd: float, positions: Floats) -> Floats:
 
 
 def farthest(up: Floats) -> tuple[Floats, float]:
-    """Return the direction farthest from all `up`, (n, 3), and its angle to the nearest [deg]."""
+    """Return the direction farthest from all `up`, (n, 3), and its angle to the closest [deg]."""
     nearest = np.max(_SPHERE @ up.T, axis=1, initial=-1.0)
     chosen = int(np.argmin(nearest))
     return _SPHERE[chosen], float(np.degrees(np.arccos(np.minimum(nearest[chosen], 1.0))))
@@ -98,7 +98,7 @@ def distinct_directions(up: Floats) -> Floats:
 
 
 def directions(means: Floats, centre: Floats) -> Floats:
-    """Return unit vectors from a centre to mean readings (n, 3); NaN where both are equal."""
+    """Return unit vectors from a centre to readings, (n, 3); NaN for a reading at the centre."""
     norms = np.linalg.norm(means - centre, axis=1, keepdims=True)
     return np.asarray((means - centre) / np.where(norms > 0.0, norms, np.nan))
 
@@ -146,7 +146,7 @@ def rough_centre(means: Floats) -> Floats:
 
 
 def geometry(up: Floats, with_misalignment: bool) -> float:
-    """Return the largest ratio of a constant's sd to the noise of |f|, inf if undetermined."""
+    """Return the largest ratio of a constant's sd to the noise of |f|, inf without a solution."""
     jacobian = norm_columns(up)[:, : 9 if with_misalignment else 6]
     values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
     if values[0] < 1e-9 * values[-1]:
@@ -156,12 +156,12 @@ def geometry(up: Floats, with_misalignment: bool) -> float:
 
 def best_rests(candidates: list[Floats]) -> int:
     """
-    Return the index of the best of candidate sets of n rests, given by mean readings, (n, 3).
+    Return the index of the best of several sets of n rests, each given by mean readings, (n, 3).
 
     The largest sd of a calibration constant follows from the directions of a set's rests and the
-    residuals of |f|. The first set whose largest sd is at most 2 % above that of every other set
-    is the best, because earlier sets have longer, quieter rests. The index is 0 if no set has
-    rests in six attitudes.
+    residuals of |f|. The first set whose largest sd is at most 2 % above the smallest such value
+    of all sets is the best, because earlier sets have longer, quieter rests. The index is 0 if no
+    set has rests in six attitudes.
     """
     counts = [n_directions(means) for means in candidates]
     costs = np.array([

@@ -4,7 +4,7 @@
 Owns the checks of the windows of a fit, and of the fitted calibration, with advice to the user.
 
 Data that contradict themselves or the model are refused; missing data increase the posterior
-uncertainty. A refusal stops the fit, unless its `Finding.name` is allowed; advice stops no fit.
+uncertainty. A refusal stops the fit unless the user allows its name; advice stops no fit.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from .evidence import ResidualRow
     from .selection import Fit
 
-#: Smallest numbers of positions that determine: bias and scale factor of the axes (6 constants);
-#: these and the misalignment (9 constants); these and, by |f|, the sd of mounting offsets.
+#: Smallest numbers of positions that determine 6 constants (bias and scale factor of the axes), 9
+#: constants (misalignment, too), and the 9 constants and, by |f|, the sd of mounting offsets.
 POSITIONS_NEEDED, POSITIONS_FOR_MISALIGNMENT, POSITIONS_FOR_MOUNTINGS = 6, 9, 12
 #: Span of the board temperature below which no temperature dependence is visible [K].
 LEAST_SPAN_K = 3.0
@@ -110,7 +110,7 @@ def _judge_order(windows: ThermalWindows) -> Iterator[Finding]:
     of_bags = np.array([_correlation(windows, moving & (bag == number)) for number in numbers])
     if least > -0.3 and of_bags.max() >= 0.3 and of_bags.min() <= -0.3:
         # One bag of twelve with exchanged thermometers hardly changes the correlation of all bags,
-        # but the fit would take a temperature halfway between board and case for that of a part.
+        # but the fit would give a part a temperature halfway between those of board and case.
         bags = (windows.rests[k][0] for k in windows.data.position[first][of_bags <= -0.3])
         least = float(of_bags.min())
         where = f'{", ".join(bag.source.name for bag in bags)}, unlike in other bags: '
@@ -124,7 +124,7 @@ def _judge_order(windows: ThermalWindows) -> Iterator[Finding]:
 
 
 def _correlation(windows: ThermalWindows, rows: Bools) -> float:
-    """Correlate gradient and rate over windows; 0 for fewer samples than 30 full windows have."""
+    """Return the correlation of gradient and rate; 0 if the samples fill less than 30 windows."""
     if windows.data.weight[rows].sum() < 30.0 * windows.data.weight.max():
         return 0.0
     # The case leads the board in a ramp, so the gradient has the sign of the board's rate.
@@ -143,7 +143,7 @@ def _judge_span(windows: ThermalWindows) -> Finding:
 
 
 def _judge_beyond(windows: ThermalWindows, prior: Calibration) -> Finding:
-    # A fit with a prior omits windows beyond the prior's temperatures; `tracks` has all states.
+    # A fit with a prior omits windows beyond the prior's temperatures, which `tracks` includes.
     tracks = (track.states[track.is_known, BOARD] for track in windows.tracks)
     temperature = np.concatenate((windows.temperature, *tracks))
     edges = [edge for part in prior.regime_sets() for edge in part.temperature_range_c]
@@ -267,7 +267,7 @@ def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator
     n, n_turn_ons = int(fit.windows.data.mounting[-1]) + 1, fit.windows.data.n_turn_ons
     if options.mounting_sd is not None or options.prior is not None or n < POSITIONS_NEEDED:
         return
-    assumed = f'it is assumed to repeat to {ug_text(offset_sd)} (1 sd): state --mounting-sd'
+    assumed = f'the bias is assumed to repeat to {ug_text(offset_sd)} (1 sd): state --mounting-sd'
     # Smallest number of turn-ons that determine the sd of turn-on offsets.
     needed = 4
     if n_turn_ons < min(n, needed):
@@ -287,7 +287,7 @@ def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator
 
 
 def judge_groups(fit: Fit, options: FitOptions) -> Iterator[Finding]:
-    """Report the groups of `options` of which the chosen model has no columns."""
+    """Report the groups that `options` name but that have no column in the chosen model."""
     wanted = dict.fromkeys((*(options.groups or ()), *options.forced))
     absent = [group for group in wanted if group not in fit.windows.data.groups]
     if absent and options.prior is None:
@@ -339,8 +339,8 @@ def judge_constants(fit: Fit, raw: float, options: FitOptions) -> Iterator[Findi
 
 def check_scale(fit: Fit) -> None:
     """
-    Refuse scale factors, in a fit of few attitudes, that deviate by more than six sd from the
-    prior: the fit attributes drifts, steps or motions in the bags to a scale factor.
+    Refuse a scale factor that, in a fit of few attitudes, deviates by more than six sd from the
+    prior mean: drifts, steps or motions in the bags then appear as an error of the scale factor.
     """
     state, prior = fit.posterior.state, fit.posterior.prior
     if prior.informative or len(distinct_directions(state.up)) >= POSITIONS_NEEDED:
@@ -350,9 +350,9 @@ def check_scale(fit: Fit) -> None:
     if abs(ratio[axis] - 1.0) > 6.0 * prior.scale_sd:
         raise UndeterminedError(
             f'by the fit the scale factor of {"xyz"[axis]} is {ratio[axis]:.2f} times the mean of '
-            'the axes, which no triad has, and too few attitudes determine it: are all rests of '
-            f'one unit, and was the unit still? {POSITIONS_NEEDED} attitudes determine the scale '
-            'factors'
+            'the axes, which no triad has, and the attitudes are too few to determine the scale '
+            'factor: are all rests of one unit, and was the unit still? '
+            f'{POSITIONS_NEEDED} attitudes determine the scale factors'
         )
 
 
@@ -391,8 +391,8 @@ def judge_result(
     else:
         yield Finding('residual', 'good', text)
     alone = overall.two_sets.rms
-    # A large residual does not contradict the prior if it is due to bias shifts of up to 2 `slow`,
-    # or to initial lag states: the fit estimates these, so they do not increase its noise `sigma`.
+    # A large residual that is due to bias shifts of up to 2 `slow`, or to initial lag states, does
+    # not contradict the prior: the fit estimates both, so neither increases its noise `sigma`.
     contradiction, sigma = '', float(np.mean(prior.sigma))
     is_above = overall.fitted.rms > np.hypot(1.5 * alone, 2.0 * slow) and sigma > 1.5 * alone
     if options.prior is not None and is_above:

@@ -134,7 +134,7 @@ class Reduced:
         from the prior mean, shape (2, n_bags, r)
     matrix: Hessian without the prior of the unit's unknowns and, in the last column, the gradient,
         shape (n + 1, n + 1)
-    positions: blocks of the positions; remaining unknowns: those of the bag, then the unit's
+    positions: blocks of the positions; the remaining unknowns are the bag's, then the unit's
     shares: contribution of each position to the block, the off-diagonal blocks and the gradient of
         its bag, shape (n_positions, r, r + n + 1); and its contribution to the diagonal of the
         bag's block before the elimination of the positions, shape (n_positions, r)
@@ -205,10 +205,10 @@ class Reduced:
         Eliminate the unknowns of positions and bags from the equations of m new unknowns per axis.
 
         `rows`: products of the derivatives w.r.t. the new unknowns with the derivatives w.r.t. the
-        fit's unknowns and with the residual, shape (n_positions, 3, m, k + 1). Returns what the
-        elimination subtracts from the Hessian of the new unknowns, shape (3 m, 3 m); and, after
-        the elimination, the products of the new unknowns with the unit's unknowns and with the
-        residual (the gradient), shape (n + 1, 3 m).
+        fit's unknowns and with the residual, shape (n_positions, 3, m, k + 1). Returns the
+        matrix that the elimination subtracts from the Hessian of the new unknowns, (3 m, 3 m); and
+        the products, after the elimination, of the new unknowns with the unit's unknowns and with
+        the residual (the gradient), shape (n + 1, 3 m).
         """
         layout, whitened = self.layout, self.positions.whitened
         n_positions, n_own, _ = whitened.shape
@@ -240,7 +240,7 @@ def eliminate(normal: Normal, layout: Layout, precision: Floats, deviation: Floa
     Eliminate the unknowns of positions and bags.
 
     normal: the normal equations in units of the noise
-    precision, deviation: inverse prior variances, and values less prior means, shape (n,)
+    precision, deviation: inverse prior variances, and unknowns less prior means, shape (n,)
     """
     n_positions, n_own = layout.own.shape
     r, n_local = layout.of_bag.shape[1], layout.n_local

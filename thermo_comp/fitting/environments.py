@@ -5,8 +5,8 @@ Owns the exclusion of bags that were recorded in another thermal environment (su
 than most bags or a prior, and the error that the calibration states for these bags.
 
 In still air the board temperature responds to the case temperature in another way than in a
-chamber with a fan. No thermometer is at the axes, so the bias is another function of the measured
-temperatures in another environment. A bag from still air in the fit would increase the error of
+chamber with a fan. No thermometer is at the axes, so in another environment the bias is another
+function of the measured temperatures. A bag from still air in the fit would increase the error of
 the calibration in a chamber with a fan. The error of the correction in an excluded bag is
 published as a lack of fit.
 """
@@ -45,11 +45,11 @@ def _is_far_above(square: Floats | float, usual: float) -> Bools:
 
 def contradicting_bag(fit: Fit) -> list[int]:
     """
-    Return, in a list, the index of a bag that may be of another environment; [] without such.
+    Return, in a list, the index of a bag that may be of another environment; [] if no bag is.
 
     A bag is suspect if its left-out drift exceeds five times both the median over the bags and the
     white noise of a window. If the left-out drift of exactly one bag is unknown, that bag is
-    suspect as soon as the median left-out drift of the other bags exceeds five times this noise.
+    suspect as soon as the other bags' median left-out drift exceeds five times the white noise.
     """
     square = _square_of_bags(fit)
     is_scored = np.isfinite(square)
@@ -83,7 +83,7 @@ def contradiction(
 ) -> tuple[list[int], bool]:
     """
     Return the indices of the bags whose drift the calibration `earlier` of their unit does not
-    explain with any initial lag states; the indices of all bags if these are more than half.
+    explain with any initial lag states; all indices if more than half of the bags are such bags.
 
     Also return whether the bags can update `earlier`: either ``|f| - g`` far exceeds the drift and
     the published sd of |f|, which shows a change of bias or scale; or the bags have the six

@@ -264,7 +264,7 @@ class Equations(Series):
         return result
 
     def deviation(self, state: State, prior: Prior, layout: Layout) -> Floats:
-        """Return unknowns less prior means, (n,); of an attitude in a pose, rotation from it."""
+        """Return unknowns less prior means, (n,); for attitudes in poses, rotations from poses."""
         result = as_vector(state, layout)
         if prior.informative is not None:
             result[: layout.n_unit] -= prior.informative.mean
@@ -290,7 +290,7 @@ def as_vector(state: State, layout: Layout) -> Floats:
 
 
 def without_inactive(state: State, layout: Layout) -> State:
-    """Set inactive weights and coefficients to 0; if all of them are 0, return `state` itself."""
+    """Set inactive weights and coefficients to 0; return `state` itself if all are already 0."""
     kept = {name: getattr(layout, name) >= 0 for name in ('weights', 'nonlinear')}
     if not any(getattr(state, name)[~active].any() for name, active in kept.items()):
         return state

@@ -65,11 +65,11 @@ class ResidualRow:
     Statistics of ``|f| - g`` over the windows of a regime, after each step of the correction.
 
     section: regime of the windows, ``static``, ``dynamic`` or ``all``
-    raw: corrected with the constants at the reference temperature
-    one_set: corrected with one curve for both regimes; empty if each regime has its own curve
-    two_sets: corrected with a curve for each regime
-    fitted: corrected with the calibration, in sample
-    left_out: corrected by fits without the position; the drift if such fits do not determine |f|
+    raw: residuals after correction with the constants at the reference temperature
+    one_set: residuals with one curve for both regimes; empty if each regime has a separate curve
+    two_sets: residuals with a curve for each regime
+    fitted: residuals with the calibration, in sample
+    left_out: residuals by fits without the position; the drift if these do not determine |f|
     left_out_drift: drift of an axis by fits without the position or section (`Score.drift`)
     """
 

@@ -54,7 +54,7 @@ class FitResult:
 
     rates: residuals of the gyroscope
     contributions: effects of the unknowns of bags and positions; None before the end of a fit
-    likeness: correlations of terms that the bags may not tell apart
+    likeness: correlations of terms that the bags may not separate
     """
 
     calibration: Calibration

@@ -99,7 +99,7 @@ def _candidates(data: Windows, options: FitOptions) -> Candidates:
     is_candidate = np.isin(data.groups, allowed) & (data.kelvins > 0.0)
     kelvins = np.outer((1.0, 0.0), is_candidate * data.kelvins)
     none = np.zeros(kelvins.shape, dtype=bool)
-    # Typical and largest (consumer MEMS) prior sd of a slope of the bias [rad/s per K].
+    # Typical and largest (consumer MEMS) prior sd of the bias's slope over temperature [rad/s/K].
     return Candidates(1e-5 * kelvins, 5e-3 * kelvins, none[0], none)
 
 

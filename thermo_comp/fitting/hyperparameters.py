@@ -286,9 +286,9 @@ def with_slow_noise(
             step, best = (step**0.5, best) if better is None else (step, better)
         return best
 
-    # Residuals underestimate the noise, because the parameters absorb a part of it, but the log
-    # evidence does not. All accelerometers have flicker noise, so noise with one correlation time
-    # is chosen only if its log evidence exceeds that of flicker noise by `CLEAR_GAIN`.
+    # Residuals lack the noise that the parameters absorb; the log evidence accounts for it. All
+    # accelerometers have flicker noise, so a process with one correlation time is chosen only if
+    # its log evidence exceeds the log evidence of flicker noise by `CLEAR_GAIN`.
     single, best = likeliest(1), likeliest(whitener.n_flicker)
     if single.log_evidence > best.log_evidence + CLEAR_GAIN:
         best = single
@@ -326,7 +326,7 @@ def _pruned(regression: Regression, posterior: PosteriorMode, candidates: Candid
         places = layout.weights[part, :, column]
         gains = log_bayes_factors(mode, covariance, places, weight_sd[part, :, column])
         # A product t m of temperature and lag can replace the lag m at the rates of one chamber
-        # program, but not at others: a model with products keeps a lag (marginality, [3]_).
+        # program, but not at other rates: a model with products keeps a lag (marginality, [3]_).
         used = column_sd > 0.0
         is_last = (used & is_product).any(axis=1) & ((used & is_lag).sum(axis=1) == 1)
         gains[(used & is_lag & is_last[:, np.newaxis])[part, column]] = np.inf

@@ -76,7 +76,7 @@ def constant_calibration(
     starts = (np.where(half * 4.0 > np.max(half), scale, half / gravity) for scale in scales)
     tried = (_refine(means, gravity, bias, scale, misalignment_sd) for scale in starts)
     calibration, rms = min(tried, key=lambda fitted: fitted[1])
-    # Readings that lie on no ellipsoid may fit a large ellipsoid with a far centre: refuse this.
+    # Readings that lie on no ellipsoid may fit a large one with a far centre, which is refused.
     is_around = np.all(np.abs(calibration.bias - bias) < 2.0 * np.max(half))
     if not (is_around and rms < largest_rms):
         raise FitError(

@@ -68,9 +68,9 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     """
     Fit the windows, with or without a prior calibration.
 
-    Without a prior, if the positions are whole rests, and the temperature changes more from one
-    position to the next than within a position, there are two fits: one to the means of the
-    positions, one to all windows. The second fit is returned if it is better on left-out data.
+    Without a prior, whole rests whose temperature changes more from position to position than
+    within a position are fitted twice: first the means of the positions, then all windows. The
+    fit to all windows is returned if it has a smaller error on left-out data.
     """
     if problem.options.prior is not None:
         return _regress(windows, problem)
@@ -118,7 +118,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     state = initial_state(regression, start, problem.up)
     prior = _initial_prior(windows, problem)
     if n_directions >= POSITIONS_NEEDED and not data.has_turn_ons:
-        # M would explain turn-on offsets, which the fit lacks: reduce the prior sd of M.
+        # M would explain turn-on offsets, which are no unknowns here: reduce the prior sd of M.
         prior = _with_faces(prior, problem.up)
     steepness = _steepness(windows, problem, is_at_rest=is_at_rest)
     candidates = _candidates(windows, problem, steepness, is_bench=is_bench)
@@ -156,7 +156,7 @@ def _selected(
 ) -> Selected:
     """
     Select the model. If `_with_faces` reduced the prior sd of the misalignment, also select a
-    model with the larger sd, and choose between both by `better_start`.
+    model with the sd that was not reduced, and choose between both models by `better_start`.
     """
     selected = select(regression, state, prior, candidates, progress)
     if not prior.unseen_misalignment_sd:
@@ -299,7 +299,7 @@ def _mounting_scale(noise: float) -> float:
 def _candidates(
     windows: ThermalWindows, problem: Problem, steepness: float, *, is_bench: bool
 ) -> Candidates:
-    """Return the columns that the model may have, with the typical and largest sd of weights."""
+    """Return the columns that the model may have, and typical and largest prior sds of weights."""
     data, options = windows.data, problem.options
     groups = np.array(data.groups)
     allowed = {*data.groups} if options.groups is None else {*options.groups, *options.forced}
@@ -380,7 +380,7 @@ def sizes_of(windows: ThermalWindows, options: FitOptions) -> Floats:
 
 
 def initial_triad(windows: ThermalWindows, options: FitOptions) -> ConstantCalibration:
-    """Fit constant bias, scale, M; for few attitudes one scale of all axes (1: input in m/s^2)."""
+    """Fit constant bias, scale and M; for few attitudes only one scale, which is 1 for m/s^2."""
     means, gravity = position_means(windows.data), sizes_of(windows, options)
     norms = np.linalg.norm(means, axis=1)
     if not norms.all() or (len(means) > 1 and not means.any(axis=0).all()):

@@ -28,7 +28,7 @@ def joined(bags: Sequence[ReducedBag]) -> list[ReducedBag]:
     for bag in sorted(bags, key=lambda bag: bag.start_ns):
         before = [recording for recording in recordings if _continues(recording[-1], bag)]
         if before:
-            # If several (simulated) recordings end here, take that of the smallest `_step`.
+            # If several (simulated) recordings end here, take the one with the smallest `_step`.
             min(before, key=lambda recording: _step(recording[-1], bag)).append(bag)
         else:
             recordings.append([bag])
@@ -116,7 +116,7 @@ def _intervals(parts: Sequence[ReducedBag]) -> tuple[StillInterval, ...]:
         shift_s = 1e-9 * (part.start_ns - parts[0].start_ns)
         is_alike = abs(part.window_s - parts[0].window_s) < 0.01 * parts[0].window_s
         for number, rest in enumerate(part.intervals):
-            # Windows count as whole if their length is within 1 % of that in the first part.
+            # Windows count as whole if they are as long as those of the first part, within 1 %.
             n_whole = rest.n_whole if is_alike else 0
             begin_s, time = rest.begin_s + shift_s, rest.time + shift_s
             shifted = replace(rest, begin_s=begin_s, time=time, n_whole=n_whole)

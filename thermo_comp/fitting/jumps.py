@@ -12,8 +12,8 @@ A steep curve over temperature changes the reading more slowly than a jump.
 
 If a sensor has a low-pass filter, neighbouring samples have a correlation r, and the slow noise of
 the samples hides a step. The noise of the differences ``a_i - r a_(i-1)`` is white (generalised
-least squares for first-order noise), so a step within one sample is significant in them. A
-decaying shock is also significant in them, so the mean levels before and after a jump must differ.
+least squares for first-order noise), so these show a step within one sample. The differences also
+show a decaying shock, so the mean levels before and after a jump must differ as well.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def _examine(
         return None
     beside = before | after
     at, r = _place_and_correlation(time, accel, quiet_sd)
-    # The change of the mean level from before to after the gap, without the samples in the gap.
+    # Fit the change of the mean level to the samples before and after the gap, without the gap.
     lasting, relative_sd, residual = _step(time[beside], accel[beside], time[at])
     # The step is the difference of two mean levels, each with an error of rounding.
     by_rounding = 2.0**0.5 * rounding_sd
@@ -288,7 +288,7 @@ def _trend(time: Floats, r: float) -> Floats:
 
 
 def _turn(time: Floats, gyro: Floats, at: int) -> float:
-    """Return the angle turned within 1 s of a step [rad], by rates less their median per side."""
+    """Return the angle turned within 1 s of a step [rad], without the median rate of each side."""
     rates = [side - np.median(side, axis=0) for side in (gyro[:at], gyro[at:])]
     angles = np.concatenate(rates)[1:] * np.diff(time)[:, None]
     return float(np.linalg.norm(angles[np.abs(time[1:] - time[at]) <= 1.0].sum(axis=0)))

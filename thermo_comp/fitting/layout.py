@@ -185,8 +185,8 @@ class Normal(NamedTuple):
 
     local: for each position, the products of the derivatives w.r.t. the unknowns of the position
         and its bag with all derivatives and the residual, shape (n_positions, 3, n_local, k + 1)
-    unit: for all positions together, the products with each other of the derivatives w.r.t. the
-        unknowns of the unit and of the residual, shape (3, n, n)
+    unit: the products of all pairs of the derivatives w.r.t. the unit's unknowns and the residual,
+        summed over all positions, shape (3, n, n)
     """
 
     local: Floats
@@ -219,7 +219,7 @@ class Tangent:
     combined: weights of the base series in each combination, (n_positions, 3, n_base, n_combined)
     place: index of each unknown's series, a base series or one of `combined`, shape (k + 1,)
     factor: factor of this series in the unknown's derivative, shape (n_positions, 3, k + 1)
-    n_local: number of the unknowns of position and bag, which are the first of an axis
+    n_local: number of the unknowns of position and bag, which come first in the order above
     n_bias: number of unknowns after kappa that have the factor 1: the bias and its weights
     n_scale: number of weights in the scale, which follow the weights in the bias
     scale: the factor of the weights in the scale, shape (n_positions, 3)
@@ -280,7 +280,7 @@ class Tangent:
     def of(self, rows: Floats) -> Floats:
         """
         Return the derivatives of m linear functions of the readings, such as the mean, shape
-        (n_positions, 3, m, k + 1); `rows`: their values for base series, (n_positions, m, n_base).
+        (n_positions, 3, m, k + 1); `rows`: the functions of base series, (n_positions, m, n_base).
         """
         combined = rows[:, None] @ self.combined
         of_base = np.broadcast_to(rows[:, None], (*combined.shape[:3], rows.shape[2]))

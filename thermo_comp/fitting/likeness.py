@@ -25,9 +25,9 @@ from .selection import Fit
 from .windows import CURVE, PART
 
 # Largest variance inflation 1 / (1 - r^2) at which the bags count as separating two columns of
-# correlation r. The part of a column that the other does not describe is sqrt(1 - r^2) of its RMS:
-# a tenth at an inflation of 100. Errors of temperatures may be as large: a thermometer that lags
-# by 60 s changes a lag of 600 s by a tenth.
+# correlation r. The other column leaves sqrt(1 - r^2) of a column's RMS undescribed, which is a
+# tenth at an inflation of 100. Errors of temperatures may be as large: a thermometer that lags by
+# 60 s changes a lag of 600 s by a tenth.
 _LARGEST_INFLATION = 100.0
 
 
@@ -76,7 +76,7 @@ class Likeness:
 
 
 def likenesses(fit: Fit) -> tuple[Likeness, ...]:
-    """Return the correlation of each pair of terms of which the chosen model has at least one."""
+    """Return the correlation of each pair of terms if the chosen model has one or both of them."""
     trials = [trial for trial in fit.selected.trials if trial.is_chosen]
     if fit.typical is None or not trials:
         # With a prior calibration, or for Golovach's model, the fit selects no columns.
@@ -130,7 +130,7 @@ def _likeness(point: Point, groups: NDArray[np.str_], pair: _Pair) -> Likeness |
 
 
 def judge_likeness(pairs: Sequence[Likeness], n_directions: int) -> Iterator[Finding]:
-    """Advise a bag to separate the two most correlated terms, if their inflation is too large."""
+    """Advise a bag to separate the two most correlated terms if their inflation is too large."""
     alike = [pair for pair in pairs if pair.inflation > _LARGEST_INFLATION]
     if n_directions < POSITIONS_NEEDED:
         # The finding `positions` reports already that bias and scale are not separated.
@@ -142,6 +142,6 @@ def judge_likeness(pairs: Sequence[Likeness], n_directions: int) -> Iterator[Fin
     yield advice(
         'alike',
         f'on axis {worst.axis} the bags do not tell {texts.names[0]} from {texts.names[1]} '
-        f'(correlation {worst.correlation:.5f}; with both in the model the sd of each is '
-        f'{worst.inflation**0.5:.0f} times as large as with one): record a bag {texts.bag}',
+        f'(correlation {worst.correlation:.5f}; a model with both gives each weight an sd '
+        f'{worst.inflation**0.5:.0f} times that of a model with one): record a bag {texts.bag}',
     )

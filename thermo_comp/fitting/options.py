@@ -58,14 +58,14 @@ class FitOptions:
     model: 'response' selects from all columns; 'golovach' is the model of Golovach's paper: a
         linear static and a quadratic dynamic set, no response
     static_curve, dynamic_curve: families of static and dynamic curve; None: default of `model`
-    groups, forced: groups of columns that the model may have (None: all), and those it must have
+    groups, forced: groups of columns that the model may have (None: all), and that it must have
     prior: calibration of this unit or of its type, whose columns are used without a selection
     ageing_bias, ageing_scale: sd of the change of bias [m/s^2] and scale [1] since the prior
         calibration; if both are 0, these sds are estimated from the bags
     mounting_sd: sd of the bias offset of a mounting or turn-on [m/s^2], or None to estimate it
     gravity_sd: standard deviation of `gravity` [m/s^2]
-    k2_sd, k3_sd: prior sd of the nonlinear terms K2 [g/g^2] and K3 [g/g^3], from a data sheet; if
-        both are None: 100 ug/g^2 and 10 ug/g^3, or no such terms if all positions are at 1 g
+    k2_sd, k3_sd: prior sd of the nonlinear terms K2 [g/g^2] and K3 [g/g^3], from a data sheet;
+        None: 100 ug/g^2 and 10 ug/g^3; bags at 1 g alone have no such terms if both are None
     serial: serial of the unit, or None for the serial of the sources
     input: unit of the samples
     full_scale: magnitude of a saturated sample [input units], or None for 32767 counts or, in
@@ -172,7 +172,7 @@ def _family(name: str, lower: float, upper: float) -> TemperatureFunction:
     if name in _POLYNOMIALS:
         return Polynomial((0.0, *[1.0] * (1 + _POLYNOMIALS.index(name))))
     if name == 'exponential':
-        # Exponentials that grow e-fold in 15 K (leakage currents, which double in 10 K) and 30 K.
+        # Exponentials grow e-fold in 15 K (leakage currents, which double in 10 K) or in 30 K.
         return Exponential(-2.0, (1.0, 1.0), (15.0, 30.0))
     # The spline has a knot at the reference temperature, and those of five equidistant knots that
     # are farther from the reference temperature than 0.3 of their spacing.

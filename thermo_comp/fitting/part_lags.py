@@ -46,7 +46,7 @@ class _Shape(NamedTuple):
 
     n_nodes: largest number of nodes of the spline of the bias
     most_noise: largest ratio of the RMS residual to the noise at which noise explains the residual
-    has_stress: whether bias and scale have terms in the lag m and in m x by stress in the unit
+    has_stress: whether bias and scale have terms in m and in m x, due to stress, m being the lag
     has_gradient: whether the bias also has a term in the gradient T_case - T_board
     """
 
@@ -88,9 +88,9 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> list[Part
     Find the lag of each axis, and reduce the weights of windows that deviate from the model.
 
     Returns [] if the model with one lag per axis does not explain the drift of all axes, or if the
-    data determine no axis's time constant. If the residual exceeds the noise for all shapes of the
-    curves, a second stage may describe slow noise or a tilt of the support: lags of one stage then
-    come first in the result, if they more than halve the RMS residual of each axis.
+    data determine no axis's time constant. If no shape of the curves reduces the residual to the
+    noise, a second stage may describe slow noise or a tilt of the support. Lags of one stage that
+    more than halve the RMS residual of each axis then come first in the result.
     """
     data, columns = windows.data, windows.model.columns
     if not windows.has_temperature or not any(column.group == 'board' for column in columns):
@@ -234,8 +234,8 @@ class _PartCurves:
         time; or `lag` itself if the residual does not become significantly smaller.
 
         The residual is linearised w.r.t. the time constant and, second, the share of the gradient
-        or the lead. The linearised residual must have a sum of squares smaller by more than white
-        noise allows at p = 1e-5.
+        or the lead. The sum of squares of the linearised residual must decrease by more than white
+        noise explains with a probability of 1e-5.
         """
         tau = lag.tau_s
         if not tau:

@@ -106,7 +106,7 @@ def _scatter(deviations: Floats, layout: ParameterLayout, K: Floats) -> Floats:
     curves are set to 0: with chance correlations from few units, one position would determine all
     constants of a new unit. The correlations between curves are reduced by a ratio estimated from
     their scatter [1]_. A dynamic curve is first replaced by its difference from the static curve:
-    in most units both curves are equal, and reduced correlations would make them differ.
+    both curves are equal in most units, but reduced correlations would make both differ.
     """
     to_differences = np.eye(deviations.shape[1])
     for block in (*layout.bias, *layout.scale):

@@ -83,7 +83,7 @@ def offset_sd_of(calibration: Calibration) -> float:
 
 
 def with_calibration(calibration: Calibration, regression: Regression, state: State) -> State:
-    """Return a state with the bias and weights of a calibration with K = `nominal_scale`."""
+    """Return a state with bias and weights of a calibration with scale factors `nominal_scale`."""
     layout, values = parameter_layout(calibration), parameters_of(calibration)
     if len({(b - a, d - a) for a, b, _, d in (*layout.bias, *layout.scale)}) > 1:
         raise FitError(
@@ -116,7 +116,7 @@ def informative_priors(
             'calibration cannot be a prior'
         )
     # Pairs to try: `ageing`, the sd of the changes of bias [g] and scale factor (0: as the user
-    # states); `share`, the uncorrelated variance added to each parameter / its own variance.
+    # states); `share`, the uncorrelated variance added to a parameter / the parameter's variance.
     tried = [(0.0, share) for share in (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)]
     # The fit begins with the last, widest prior: in a first fit with a narrow prior, the
     # estimated noise would absorb changes of the unit.
@@ -126,11 +126,11 @@ def informative_priors(
         # The sds of bias [g] and relative scale are equal, as data sheets state similar numbers
         # for both, and few rests do not separate them.
         tried += [(ageing, 0.0) for ageing in (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)]
-        # Priors for a unit whose temperature effects have changed, besides bias and scale factor.
-        # A `share` of 1, 1e3 or 1e6 multiplies the prior sd of each parameter by up to 1.4, 30 or
-        # 1000, because an effect of temperature may be a thousand times its prior sd. `_root`
-        # limits the added sd to the size of the effect: with a larger sd, effects at temperatures
-        # without rests would be unknown.
+        # These priors are for a unit in which not only bias and scale have changed, but also the
+        # effects of temperature. A `share` of 1, 1e3 or 1e6 multiplies the prior sd of each
+        # parameter by up to 1.4, 30 or 1000, because an effect may be a thousand times its prior
+        # sd. `_root` limits the added sd to the size of the effect: with a larger sd, effects at
+        # temperatures without rests would be unknown.
         tried += [(ageing, share) for share in (1.0, 1e3, 1e6) for ageing in (3e-5, 3e-4, 3e-3)]
     K, places = constants_of(calibration).scale, parameter_layout(calibration)
     layout = regression.layout(regression.windows.parts)
@@ -170,8 +170,8 @@ def _root(covariance: Floats, share: float, sizes: Floats, to_file: Floats) -> F
     """
     Return the upper triangular root of the inverse covariance of the unit's unknowns.
 
-    `covariance`: of the file's parameters; each variance v is increased by ``min(share * v, max(v,
-    size^2))``, the size from `sizes`; `to_file`: derivatives of the parameters by the unknowns
+    `covariance`: covariance of the file's parameters; ``min(share * v, max(v, size^2))`` is added
+    to each variance v; `sizes`: size of each parameter; `to_file`: derivatives by the unknowns
     """
     diagonal = np.diag(covariance)
     floor = np.where(diagonal > 0.0, diagonal, np.min(diagonal[diagonal > 0.0], initial=1.0))

@@ -80,7 +80,7 @@ class ReducedBag:
     start_ns, end_ns: stamps of the first and last sample used
     n_dropped: number of samples that are not finite, or whose stamps are out of order
     n_saturated: number of samples at the full scale
-    n_cells, n_still_cells: number of cells (see the module's docstring) in the bag, in its rests
+    n_cells, n_still_cells: number of cells (about half a second each) in the bag, in its rests
     window_s: length of a window [s]; longer than requested if the sample rate is low
     cycle_s: typical interval between samples [s]
     is_integer: whether all samples are integers

@@ -212,7 +212,7 @@ class Point:
         """Return a step that is damped so that the nonlinear unknowns stay almost constant."""
         layout, local, unit = self.layout, self.normal.local.copy(), self.normal.unit.copy()
         # A factor 1e6 on the Hessian's diagonal divides the steps of nonlinear unknowns by about
-        # 1e6; a far larger one would cause rounding errors with an informative, correlated prior.
+        # 1e6; a far larger factor would cause rounding errors with a correlated prior.
         at = [*range(2 + layout.stretch.shape[1]), *range(layout.of_axis.shape[1], layout.n_local)]
         local[..., at, at] *= 1e6
         end = unit.shape[-1] - 1
@@ -231,7 +231,7 @@ class Point:
         If the step increases the energy, fractions of the step of the nonlinear unknowns (those
         that multiply other unknowns) are tried, each with a new step of the linear unknowns.
         """
-        # Take energy and step first: the next point's linearisation replaces this point's.
+        # Take energy and step first: only the last linearisation is kept (`linearised`).
         energy, (step, _) = self.energy, self.solution
         result = self.with_step(step)
         if result.energy <= energy:
@@ -279,7 +279,7 @@ class Regression(Equations):
     _linearised: tuple[State, Layout, Floats, Tangent, Normal] | None = None
 
     def at(self, state: State, prior: Prior, grams: Floats | None = None) -> Point:
-        """Linearise about `state` with inactive weights set to 0; `grams` None: of all windows."""
+        """Linearise about `state`, inactive weights set to 0; default `grams`: of all windows."""
         layout = self.layout(prior.column_sd > 0.0, prior.nonlinear_sd > 0.0)
         grams = self.products(layout.used).of_positions if grams is None else grams
         return Point(self, without_inactive(state, layout), prior, layout, grams)

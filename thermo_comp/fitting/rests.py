@@ -50,10 +50,10 @@ def is_bench(windows: ThermalWindows, up: Floats) -> bool:
 
 def _is_heated(windows: ThermalWindows) -> Bools:
     """
-    Return which positions were heated or cooled, shape (n_positions,), or all if none was. Such a
-    position has a change of temperature, or a difference of its mean temperature from the median
-    of all positions, above a tenth of the range of all temperatures: smaller drifts, as of short
-    rests in a room, hardly separate bias and scale.
+    Return which positions were heated or cooled, shape (n_positions,), or all if none was. In such
+    a position the temperature changes, or its mean differs from the median of all positions, by
+    more than a tenth of the range of all temperatures: smaller drifts, as of short rests in a
+    room, hardly separate bias and scale.
     """
     t, edges, weight = windows.temperature, windows.data.edges[:-1], windows.data.weight
     mean = block_means(t[:, None], weight, edges)[:, 0]

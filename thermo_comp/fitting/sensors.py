@@ -111,7 +111,7 @@ def quantum_of(values: Floats) -> float:
 
 
 def _noise_of(recorded: Sequence[Readings], quantum: float) -> float:
-    # Second differences contain no linear ramp; those of white noise of sd s have sd s sqrt(6).
+    # Second differences contain no linear ramp; for white noise of sd s their sd is s sqrt(6).
     second = np.concatenate([np.diff(readings.value, 2) for readings in recorded])
     if not quantum:
         return 1.4826 * float(np.median(np.abs(second))) / float(np.sqrt(6.0))
@@ -262,7 +262,7 @@ def averaged(
     Average readings over steps of `step_s` if they are at least two per step, as from IMU drivers.
 
     Return the bag with mean readings, and the settings with the noise of a mean reading.
-    `inputs`: the thermometers, first that of the board; the others have the settings of the case.
+    `inputs`: thermometers, first the board's; all but the first have the settings of the case.
     """
     temperatures = {**bag.temperatures}
     settings = [detector.board, detector.case]

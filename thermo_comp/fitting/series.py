@@ -221,7 +221,7 @@ class Products:
         return np.asarray(np.add.reduceat(self.cells, self.first, axis=0))
 
     def without(self, sections: Ints) -> Floats:
-        """Return the sums of products over each position, less those of the given sections."""
+        """Return the sums of products over each position without the given sections."""
         result: Floats = self.of_positions.copy()
         left_out = np.flatnonzero(np.isin(self.section, sections))
         position = np.searchsorted(self.first, left_out, side='right') - 1

@@ -69,7 +69,8 @@ class KnownForce:
     The known |f| of a bag over time; outside the sections |f| is gravity.
 
     stamp_ns, rate: readings of the rotation rate [rad/s], about a vertical axis
-    radius, radius_sd: distance of the unit from the axis and its sd [m]; sd 0: not estimated
+    radius, radius_sd: distance of the unit from the axis and its sd [m]; if the sd is 0, the
+        radius is not estimated
     """
 
     name: str
@@ -314,7 +315,7 @@ def _asked_sections(text: str, path: Path) -> tuple[Section, ...]:
     mine: list[str] = []
     for line in content.splitlines():
         first, _, rest = line.strip().replace(',', ' ').partition(' ')
-        # 01.mcap and run_* are names of bags; 10s, a number with its unit, is not.
+        # 01.mcap and run_* are names of bags; 10s is no name, but a number with its unit.
         if not first or first[0] == '#' or not re.search(r'[A-Za-z_*?]{2}|[*]', first):
             mine.append(line)
         elif fnmatch(path.name, first):

@@ -50,8 +50,8 @@ def valid_range(values: Floats, smallest_margin: float, order: int = 0) -> Range
 
 def temperature_range(windows: ThermalWindows) -> Range:
     """Return the valid range of board temperatures [degC]."""
-    # A calibration from one temperature is valid within 0.5 K of it; a calibration without
-    # thermometer within 50 K, as its covariance includes an unknown slope over temperature.
+    # A calibration from one temperature is valid within 0.5 K of this temperature; a calibration
+    # without thermometer within 50 K, as its covariance includes an unknown slope.
     return valid_range(windows.temperature, 0.5 if windows.was_measured else 50.0)
 
 
@@ -105,7 +105,7 @@ def _has_gradients(windows: ThermalWindows) -> bool:
 
 
 def usable_board_lag(windows: ThermalWindows) -> float:
-    """Return the lag of the board behind the case [s]; a usual lag if it is not in 1..1e5 s."""
+    """Return the board's lag behind the case [s]; a usual lag if the slope is not in 1..1e5 s."""
     lag = slope_of_gradient(windows.gradient, windows.rate)
     return lag if 1.0 <= lag <= 1e5 else USUAL_BOARD_LAG_S
 
@@ -116,8 +116,8 @@ def with_unseen_axes(
     """
     Add the error of extrapolated scale factors to the lack of fit of each regime, `lacks`.
 
-    `earlier`: calibration used as prior, or None. At temperatures at which no position of the
-    bags determines the scale of an axis, its lack of fit is at least that of `earlier`.
+    `earlier`: calibration used as prior, or None. At temperatures at which no position of the bags
+    determines the scale of an axis, `earlier` gives the least value of the axis' lack of fit.
     """
     (lower, upper), (new_lower, new_upper) = _determined_ranges(fit, earlier), _seen(fit, None)
     slope = _unknown_slope(fit) * fit.regression.gravity
@@ -180,7 +180,7 @@ def _determined_ranges(fit: Fit, earlier: Calibration | None) -> Floats:
 def _seen(fit: Fit, earlier: Calibration | None) -> Floats:
     """
     Return for each axis the lowest and the highest board temperature of the positions with gravity
-    along the axis, and of a prior calibration, shape (2, 3) [degC]; (inf, -inf) without both.
+    along the axis, and of a prior calibration, shape (2, 3) [degC]; (inf, -inf) if none has any.
     """
     temperature = fit.windows.temperature[:, np.newaxis]
     # At 0.5 g along an axis, |f| has a quarter of the relative error of the axis' scale factor.

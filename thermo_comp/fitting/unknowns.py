@@ -147,8 +147,8 @@ class Windows:
     @cached_property
     def has_turn_ons(self) -> bool:
         """
-        Whether turn-on offsets are unknowns of the fit. To separate them from mounting offsets
-        takes, on average, two or more mountings per turn-on. Without a prior calibration the
+        Whether turn-on offsets are unknowns of the fit. Turn-ons with, on average, two or more
+        mountings separate turn-on offsets from mounting offsets. Without a prior calibration the
         offset of a single turn-on is part of the bias.
         """
         fewest = 1 if self.has_prior else 2
@@ -182,7 +182,7 @@ class Noise(NamedTuple):
 
     @property
     def variance(self) -> float:
-        """Variance of the sum of the processes, divided by the white-noise variance of `ratio`."""
+        """Variance of the sum of the processes / white-noise variance of a window of weight 1."""
         return self.ratio * self.n_times
 
     @property

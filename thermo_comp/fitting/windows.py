@@ -91,7 +91,7 @@ class Model:
     name: name of the model in the provenance
     parts: the lag of the part of each axis, or None in a model without one lag per axis
     sensors: thermometers other than the board's; the first is that of the case
-    range_c: board temperatures [degC]; a rest's windows outside are left out if it has some inside
+    range_c: board temperatures of the windows in use [degC]; a rest wholly outside is used, too
     """
 
     name: str
@@ -172,7 +172,8 @@ class ThermalWindows:
     The windows of a regression with their thermal states.
 
     data: means of the samples, and columns, for the regression
-    temperature, rate: board temperature [degC], its rate [K/s]; weight: of the dynamic set; (n,)
+    temperature, rate, weight: board temperature [degC] and its rate [K/s]; weight of the dynamic
+        set; each of shape (n,)
     gradient: T_case - T_board [K], shape (n,)
     raw: values u of the response's columns, without limits and powers of temperature, (n, k)
     angular_rate: mean angular rate [rad/s], shape (n, 3), or (n, 0) if a bag has no angular rate
@@ -344,7 +345,8 @@ def _windows(
     sums, groups, columns = model.part_sums, model.sets.groups, model.columns
     n_curves, lags = len(groups), StateLayout(spec).lags
     t, gradient = rows.thermal[:, 0] - model.reference_temperature, rows.thermal[:, 4]
-    # A support's tilt is linear in board temperature, case temperature and its square.
+    # A support's tilt is linear in the board temperature, the case temperature and the square of
+    # the case temperature.
     tilt = np.column_stack((t, gradient, (t + gradient) ** 2))
     tilt_rms = np.sqrt(np.mean(tilt**2, axis=0))
     is_tilting = tilt_rms > 0.0
@@ -452,8 +454,8 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
     readings = iter(readings_in_order(bag, inputs))
     reading = next(readings, None)
     for stamp_ns in range(begin_ns, max(bag.end_ns, begin_ns) + step_ns, step_ns):
-        # As in the node, a state depends on all readings with a stamp up to that of the state. A
-        # mean has the mean stamp of its readings, some of which may be up to a step later.
+        # As in the node, a state depends on all readings stamped up to the state's stamp. A mean
+        # has the mean stamp of its readings; some readings may be a step later than the state.
         while reading is not None and reading[1] <= stamp_ns:
             tracker.read(*reading)
             reading = next(readings, None)
