@@ -26,17 +26,17 @@ Temperatures
     ``t = T_board - T_ref`` is the argument of every temperature function. The gradient is
     ``T_case - T_board``. In a ramp the case temperature leads and the board temperature lags.
 Regimes
-    The thermal regime is static (S = 0) or dynamic (S = 1), as a detector with memory decides, or
-    unknown while the detector has too few readings. The static set of coefficients applies while
-    the regime is unknown.
+    A detector with memory decides whether the thermal regime is static (S = 0) or dynamic (S = 1);
+    the regime is unknown while the detector has too few readings. The static set of coefficients
+    applies while the regime is unknown.
 Frames
     The output frame is fixed by the sensitivity axes: x along the x sensitivity axis, y in the
     plane of the x and y sensitivity axes (the misalignment matrix is lower triangular with a
     unit diagonal).
 Time
     Stamps are integers, ``stamp_ns`` [ns]. A time difference in seconds is always computed from
-    an integer difference, so that no result depends on the origin of time. A sample
-    corrected alone gives the same result, bit for bit, as in an array.
+    an integer difference, so that no result depends on the origin of time. The correction of a
+    single sample gives the same result, bit for bit, as the correction of this sample in an array.
 
 References
 ----------

@@ -103,7 +103,7 @@ def correct(
     **sensors: Temperature,
 ) -> Corrected:
     """
-    Correct arrays of samples; bit for bit as node and ``replay`` do at equal stamps.
+    Correct arrays of samples, bit for bit as node and ``replay`` correct samples of equal stamps.
 
     Parameters
     ----------
@@ -188,7 +188,7 @@ def read(path: str | Path, topics: Topics | None = None) -> Columns:
     first_ns = min((int(stamp.min()) for stamp in stamps if len(stamp)), default=0)
     start_ns = first_ns // _MINUTE_NS * _MINUTE_NS
     metadata = recording.info.metadata
-    # `Columns` lacks the bag's rotation rate: `fit` refuses this text, which is no number |f|.
+    # `Columns` cannot hold the bag's rotation rate: `fit` refuses this text, as it is no number.
     force = f'{ROTATION} {metadata[ROTATION]}' if ROTATION in metadata else ''
     return Columns(
         time_s=_seconds(block.accel_stamp_ns, start_ns),

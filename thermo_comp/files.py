@@ -6,7 +6,8 @@ Owns the reading of files of limited size, and the writing of all output files.
 An output never replaces an input of the same command. Without `overwrite` an output replaces no
 existing file, even if another process writes at the same time; with `overwrite` an output replaces
 only an empty file or a file of the same kind. An output gets its name once it is complete; if the
-file system lacks hard links, an empty file reserves the name. Writing to a link writes its target.
+file system lacks hard links, an empty file reserves the name. Writing to a link writes the file to
+which the link points.
 """
 
 import errno
@@ -66,7 +67,7 @@ BAG = Kind('rosbag2 directory', rb'\A(metadata\.yaml|.+\.(mcap|db3)(\.zstd)?)\Z'
 
 
 def bag_kind(path: str | Path, others: str = '') -> Kind:
-    """Return the kind of an output bag by its suffix; an error names *.mcap, then `others`."""
+    """Return the kind of an output bag by its suffix; an error names *.mcap and `others`."""
     suffix = Path(path).suffix
     if suffix == '.mcap':
         return MCAP
@@ -230,7 +231,7 @@ def sync(path: Path) -> None:
 
 @contextmanager
 def _output_errors(path: str | Path) -> Iterator[None]:
-    """Turn OSError into OutputError, with the name `path` instead of that of the hidden file."""
+    """Turn OSError into OutputError, with the name `path` instead of the hidden file's name."""
     try:
         yield
     except OSError as error:

@@ -90,7 +90,7 @@ def topics_for(calibration: Calibration, topics: Topics | None) -> Topics:
 
 
 def needed_roles(*calibrations: Calibration) -> tuple[Role, ...]:
-    """Return the needed inputs: samples; board temperature if a calibration depends on it."""
+    """Return the needed inputs: samples, and board temperature if a calibration depends on it."""
     needs_board = any(calibration.needs_temperature for calibration in calibrations)
     return ('accel', 'board') if needs_board else ('accel',)
 
@@ -246,7 +246,7 @@ def _rows_of(table: AbstractContextManager[WriteRows]) -> Iterator[WriteBlock]:
 
 
 def _imu_of(block: Block, corrected: CompensatedBlock) -> ImuColumns | None:
-    """Return all Imu fields but the force; an angular rate with covariance[0] -1 stays raw."""
+    """Return all Imu fields but the force; a rate marked absent (covariance[0] = -1) stays raw."""
     if block.imu is None:
         return None
     imu = block.imu.take(corrected.index)

@@ -22,8 +22,8 @@ N_NUMBERS = {VECTOR3_STAMPED: 3, IMU: 37, TEMPERATURE: 2}
 
 _ENCAPSULATION = b'\0\1\0\0'
 
-#: Serializes the regime, given the stamp [ns] of the reading that decided it, whether it is
-#: dynamic, and the serial of the unit.
+#: Serializes a regime, given the stamp [ns] of the reading that decided on the regime, whether the
+#: regime is dynamic, and the serial of the unit.
 PackFlag = Callable[[int, bool, str], bytes]
 
 
