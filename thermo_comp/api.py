@@ -83,7 +83,7 @@ class Corrected:
     dynamic : ndarray of bool, shape (n,)
         Whether the regime was dynamic; False while the regime is unknown.
     counters : Counters
-        Numbers of samples and readings used, and of those dropped for each reason.
+        Numbers of samples and readings used, and of samples and readings dropped for each reason.
 
     """
 

@@ -5,8 +5,8 @@ Owns the offline run of the node: the correction of a whole bag into another bag
 
 The correction is the node's code, applied to blocks of samples instead of single samples. A
 temperature reading applies from the first sample that follows the reading in the bag and whose
-stamp is equal or later. The output equals, bit for bit, that of a node that receives the messages
-in the bag's order. Only one block of the bag is in memory at a time.
+stamp is equal or later. The output equals, bit for bit, the output of a node that receives the
+messages in the bag's order. Only one block of the bag is in memory at a time.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -113,7 +113,7 @@ def replay(
     Correct a recording and write the output of the node, as a bag or (by suffix) a table.
 
     `keep_inputs` also copies the input messages, with their stamps as log times. `all_topics` also
-    copies all further topics, except those of the outputs, with the log times of the recording.
+    copies all further topics, except topics of outputs, with the log times of the recording.
     """
     compensator = Compensator(calibration, config)
     wanted = topics_for(calibration, topics)

@@ -125,17 +125,17 @@ def rough_centre(means: Floats) -> Floats:
     if np.std(np.linalg.norm(means, axis=1)) < 0.3 * spread:
         return zero
     values = np.linalg.eigvalsh(arms.T @ arms)
-    # Readings whose smallest principal variance is below 2 % of the largest do not determine a
-    # sphere, because they are almost in a plane.
+    # Readings whose smallest principal variance is below 2 % of the largest variance are almost in
+    # a plane, and do not determine a sphere.
     if values[0] < 0.02 * values[2]:
         return zero
-    # A reading m on a sphere about c, both less the mean reading, satisfies |m|^2 = 2 c m + const.
+    # A reading m on a sphere about c (m and c less the mean reading) has |m|^2 = 2 c m + const.
     columns = np.column_stack((2.0 * arms, np.ones(len(arms))))
     centre = np.linalg.lstsq(columns, np.sum(arms**2, axis=1), rcond=None)[0][:3]
     radii = np.linalg.norm(arms - centre, axis=1)
     # Accept the sphere if the sd of the distances from its centre is below 10 % of the radius, and
-    # the RMS distance of the readings from their mean exceeds half of the radius (it is 1 radius
-    # for six faces, and 0.1 radius for readings within 6 degrees of each other).
+    # the RMS distance of the readings from their mean exceeds half of the radius (for six faces
+    # it is 1 radius, for readings within 6 degrees of each other 0.1 radius).
     is_sphere = np.std(radii) < 0.1 * np.mean(radii) < 0.2 * spread
     # A sphere exists through any four readings. Accept it only if the coordinates of its centre
     # agree: the three zero-g outputs of an analog triad are within 20 % of their mean (ADXL335

@@ -110,7 +110,7 @@ def _judge_order(windows: ThermalWindows) -> Iterator[Finding]:
     of_bags = np.array([_correlation(windows, moving & (bag == number)) for number in numbers])
     if least > -0.3 and of_bags.max() >= 0.3 and of_bags.min() <= -0.3:
         # One bag of twelve with exchanged thermometers hardly changes the correlation of all bags,
-        # but the fit would give a part a temperature halfway between those of board and case.
+        # but the fit would give a part a temperature halfway between board and case temperature.
         bags = (windows.rests[k][0] for k in windows.data.position[first][of_bags <= -0.3])
         least = float(of_bags.min())
         where = f'{", ".join(bag.source.name for bag in bags)}, unlike in other bags: '

@@ -5,8 +5,8 @@ Owns the elimination of the unknowns of positions and bags from the normal equat
 
 Each position has unknowns (attitude, error of |f|, bias offset, tilts) that occur in no other
 position, and each bag has unknowns (initial lag states, turn-on offset) that occur in no other
-bag. The unknowns of the positions are eliminated first, then those of the bags (Schur complement).
-The normal equations of the unit's unknowns remain.
+bag. The unknowns of the positions are eliminated first, then the unknowns of the bags (Schur
+complement). The normal equations of the unit's unknowns remain.
 """
 
 from __future__ import annotations

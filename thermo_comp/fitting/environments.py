@@ -83,7 +83,7 @@ def contradiction(
 ) -> tuple[list[int], bool]:
     """
     Return the indices of the bags whose drift the calibration `earlier` of their unit does not
-    explain with any initial lag states; all indices if more than half of the bags are such bags.
+    explain with any initial lag states; if these bags are the majority, return all indices.
 
     Also return whether the bags can update `earlier`: either ``|f| - g`` far exceeds the drift and
     the published sd of |f|, which shows a change of bias or scale; or the bags have the six
@@ -117,7 +117,7 @@ def contradiction(
     may_update = bool(_is_far_above(float(np.mean(norm**2)), usual))
     is_far = _is_far_above(mean, 1.0)
     if np.mean(is_far) > 0.5:
-        # A change of environment hardly shows in some attitudes: if most bags deviate, return all.
+        # A change of environment hardly shows in some attitudes: if most bags deviate, return all bags.
         is_far[:] = True
     may_update |= len(distinct_directions(state.up)) >= POSITIONS_NEEDED
     return np.flatnonzero(is_far).tolist(), may_update

@@ -69,7 +69,7 @@ class ResidualRow:
     one_set: residuals with one curve for both regimes; empty if each regime has a separate curve
     two_sets: residuals with a curve for each regime
     fitted: residuals with the calibration, in sample
-    left_out: residuals by fits without the position; the drift if these do not determine |f|
+    left_out: residuals by fits without the position; the drift if these fits do not give |f|
     left_out_drift: drift of an axis by fits without the position or section (`Score.drift`)
     """
 
@@ -114,7 +114,7 @@ def _with_only(regression: Regression, chosen: PosteriorMode, groups: tuple[str,
     # offsets would absorb: this fit has white noise only and no offsets.
     prior = replace(
         chosen.prior,
-        column_sd=only * regression.windows.parts * [[0.05], [0.005]],  # [m/s^2], relative
+        column_sd=only * regression.windows.parts * [[0.05], [0.005]],  # bias [m/s^2], scale
         offset_sd=1e-7,
         offset_scale=0.0,
         noise=Noise(),
@@ -233,8 +233,8 @@ def _points(
     order = np.argsort(temperature, kind='stable')
     for part in np.array_split(order[rows[order]], n_bins):
         mean = excess[part].mean(axis=0)
-        # Errors of neighbouring windows are correlated: ten windows count as one observation. The
-        # mean excess of the squared drift is set to 0 if it is below two standard errors.
+        # Errors of neighbouring windows are correlated: ten windows count as one observation. A
+        # mean excess of the squared drift below two standard errors is set to 0.
         error = excess[part].std(axis=0) / np.sqrt(max(len(part) / 10.0, 1.0))
         mean = np.where(mean > 2.0 * error, mean, 0.0)
         x, y, z = np.sqrt(mean + model_error[part].mean(axis=0)).tolist()

@@ -114,7 +114,7 @@ def _checked(bag: ReducedBag) -> ReducedBag:
 def fit_bags(
     bags: Sequence[ReducedBag], options: FitOptions, progress: Progress = lambda _part: None
 ) -> FitResult:
-    """Fit a calibration to the statistics of bags; FitError if they do not allow a fit."""
+    """Fit a calibration to the statistics of bags; FitError if these do not allow a fit."""
     # One bag of a split recording may have no rest, so the bags are joined before the check.
     recordings = [_checked(bag) for bag in joined(bags)]
     # Threads would slow down the products of small matrices in the fit.
@@ -197,7 +197,7 @@ def without_code_offset(bag: ReducedBag, offset: Floats) -> ReducedBag:
 
 
 def with_code_offset(calibration: Calibration, offset: Floats) -> Calibration:
-    """Return a calibration for codes that exceed those of `calibration` by `offset`, (3,)."""
+    """Return a calibration for codes larger than the codes of `calibration` by `offset`, (3,)."""
     unit = calibration.unit
     full_scale = unit.full_scale
     if full_scale == COUNTS_FULL_SCALE and offset.max() > 0.0:
@@ -379,7 +379,7 @@ def _unusable(error: ValueError, up: Floats) -> FitError:
 
 
 def check_serial(sources: Sequence[FitSource], options: FitOptions) -> str:
-    """Return the serial of `options` or of the bags; FitError if it is ambiguous or invalid."""
+    """Return the serial of `options` or bags; FitError if the serial is ambiguous or invalid."""
     serials = {source.serial: source.name for source in sources if source.serial}
     if options.serial is None and len(serials) > 1:
         names = ', '.join(f'{name} of {serial}' for serial, name in sorted(serials.items()))

@@ -45,7 +45,7 @@ def constant_calibration(
     means: Floats, gravity: float | Floats, misalignment_sd: float
 ) -> ConstantCalibration:
     """
-    Fit the triad to position means, (n, 3); raises FitError if they do not lie on an ellipsoid.
+    Fit the triad to position means, (n, 3); FitError if the means do not lie on an ellipsoid.
 
     `gravity`: |f| of all positions, or of each position, shape (n,) [m/s^2];
     `misalignment_sd`: prior sd of the elements of M [rad]; 0 for axes at right angles
@@ -160,7 +160,7 @@ def thermometer_error_of(windows: Windows, scale: Floats, *, beyond_noise: bool 
     Return the sd of a window's error on each axis due to errors of the board temperature [m/s^2],
     shape (3,): sd of these errors times slope of the samples over temperature in a position.
 
-    `beyond_noise`: subtract the variance of a reading's noise from that of these errors; the
+    `beyond_noise`: subtract the noise variance of a reading from the variance of these errors; the
     remaining error is due to coarse steps of the readings, or to long intervals between readings
     """
     if windows.board is None:

@@ -7,7 +7,7 @@ The reading of a sensor can step within one sample, if stress in its die relaxes
 The temperature does not step, so no function of temperature describes a jump, and a fit to data
 across a jump gives a wrong curve. A jump differs from a rotation of the unit in two ways: the
 samples before and after a jump scatter no more than at rest; and either the norm of the reading
-changes (in a rotation it is almost constant), or a gyroscope measures no rotation during the jump.
+changes (a rotation hardly changes the norm), or a gyroscope measures no rotation during the jump.
 A steep curve over temperature changes the reading more slowly than a jump.
 
 If a sensor has a low-pass filter, neighbouring samples have a correlation r, and the slow noise of

@@ -260,7 +260,7 @@ def of_file(
 
 
 def with_terms(state: State, calibration: Calibration) -> State:
-    """Set the nonlinear coefficients of a state to those of a calibration."""
+    """Set the nonlinear coefficients of a state to the values in a calibration."""
     if calibration.nonlinearity is None:
         return state
     terms = calibration.nonlinearity.terms

@@ -174,8 +174,8 @@ def _family(name: str, lower: float, upper: float) -> TemperatureFunction:
     if name == 'exponential':
         # Exponentials grow e-fold in 15 K (leakage currents, which double in 10 K) or in 30 K.
         return Exponential(-2.0, (1.0, 1.0), (15.0, 30.0))
-    # The spline has a knot at the reference temperature, and those of five equidistant knots that
-    # are farther from the reference temperature than 0.3 of their spacing.
+    # The spline has a knot at the reference temperature. Of five equidistant knots, it has those
+    # that differ from the reference temperature by more than 0.3 of the spacing of the knots.
     knots = np.linspace(lower, upper, 5)
     step = max((upper - lower) / 4, 1.0)
     kept = sorted([0.0, *(float(k) for k in knots if abs(k) > 0.3 * step)])

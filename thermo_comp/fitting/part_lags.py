@@ -150,7 +150,7 @@ class _PartCurves:
         self._share = weight / np.add.reduceat(weight, self._first)[self._position]
         self._case = windows.gradient[rows]
         self._t = windows.temperature[rows] - windows.model.reference_temperature
-        #: Time constants tried [s]: four short ones, and those of the columns of group `board`.
+        #: Time constants to try [s]: four short times, then the time constants of group `board`.
         self._tried = np.array([15.0, 21.0, 30.0, 42.0, *taus])
         # The lag m is interpolated between the time constants tau of the columns: m / tau is a
         # smooth function of tau, whose limit at tau = 0 is the rate of the temperature.

@@ -107,7 +107,7 @@ def informative_priors(
 ) -> Iterator[InformativePrior]:
     """
     Yield priors from a calibration for several amounts of ageing, the widest last. A fit compares
-    them by log evidence plus log density of the ageing: half-Student of scale `usual_ageing`
+    these by log evidence plus log density of the ageing: half-Student of scale `usual_ageing`
     [m/s^2]. A calibration without covariance raises FitError.
     """
     if calibration.posterior is None:

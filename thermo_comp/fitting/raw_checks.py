@@ -44,7 +44,7 @@ def full_scale_of(bags: Sequence[ReducedBag], options: FitOptions) -> float:
         return widened(full_scale, np.array([[largest]]))
     if full_scale is None:
         # Take the smallest usual full scale 10 % above all samples, else twice the largest sample.
-        # The user may have stated the full scale of the prior, so the result is not smaller.
+        # The user may have stated the prior's full scale, so the result is at least this value.
         ranges = (STANDARD_GRAVITY * g for g in (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0))
         full_scale = next((top for top in ranges if top > 1.1 * largest), 2.0 * largest)
         full_scale = max(full_scale, options.prior.unit.full_scale if options.prior else 0.0)
@@ -140,7 +140,7 @@ def in_kelvins(bag: ReducedBag) -> str:
 
 
 def _judge_thermometers(bags: Sequence[ReducedBag]) -> Iterator[Finding]:
-    """Check the readings of the thermometers; FitError if those of a bag are in kelvins."""
+    """Check the readings of thermometers; FitError if the readings of a bag are in kelvins."""
     names = sorted({name for bag in bags for name in bag.temperatures})
     for name in names:
         if n := sum(bag.n_spikes.get(name, 0) for bag in bags):
@@ -290,8 +290,8 @@ def judge_missing(bags: Sequence[ReducedBag], windows: ThermalWindows) -> Iterat
 
 def _missing(bag: ReducedBag, track: Track) -> tuple[float, float, float]:
     """
-    Return the numbers of all samples at rest, of those before the board temperature is accurate,
-    and of later samples at rest without a known temperature while all thermometers are recorded.
+    Return three numbers of samples at rest: all samples; the samples before the board temperature
+    is accurate; later samples without a temperature while all thermometers are recorded.
     """
     read = [readings.stamp_ns for readings in bag.temperatures.values() if len(readings.stamp_ns)]
     begin_s = 1e-9 * (max(stamp_ns[0] for stamp_ns in read) - bag.start_ns)

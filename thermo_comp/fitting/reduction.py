@@ -287,8 +287,8 @@ def _cycle_s(cells: Cells) -> float:
     """Return the typical interval between samples [s]; NaN without samples."""
     if not len(cells.count):
         return np.nan
-    # A cell is complete if its number of samples is within 1 of the median. If most cells are not
-    # complete, as with bursts, cells with over half of the median number of samples are used.
+    # A cell is complete if its number of samples differs from the median number by at most 1. If
+    # most cells are incomplete, as with bursts, cells with over half the median number are used.
     median = float(np.median(cells.count))
     use = np.abs(cells.count - median) <= 1.0
     if np.mean(use) < 0.5:

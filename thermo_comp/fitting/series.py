@@ -170,7 +170,7 @@ class Base:
     three axes less their mean in the position.
 
     columns: indices of the active columns among all columns
-    lagged: places in `columns` of the columns with a lag; lag: index of the lag of each of these
+    lagged: places in `columns` of the columns with a lag; lag: index of each of these lags
     at_start, t, tilts, measured: places, among the base series, of the derivatives w.r.t. initial
         lag states, of t (shape (1,) or (0,)), of the functions `Windows.tilt`, and of the readings
     """

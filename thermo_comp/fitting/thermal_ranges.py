@@ -58,7 +58,7 @@ def temperature_range(windows: ThermalWindows) -> Range:
 def soak_gradient(windows: ThermalWindows, earlier: Calibration | None) -> Range | None:
     """
     Return the gradient of the first sensor in soaks and its robust scatter [K], from the prior
-    calibration `earlier` if it has both, else from the windows; None without sensor or soak.
+    calibration `earlier` if it states them, else from the windows; None without sensor or soak.
     """
     if earlier is not None and earlier.soak_gradient_k is not None:
         return earlier.soak_gradient_k
@@ -123,7 +123,7 @@ def with_unseen_axes(
     slope = _unknown_slope(fit) * fit.regression.gravity
     ends = _ends(fit, earlier)
     # The variance of an extrapolated scale factor is quadratic in temperature, but is interpolated
-    # linearly between stated temperatures, so it is stated at five temperatures.
+    # linearly between stated temperatures, so five temperatures are stated.
     between = [
         np.linspace(edge, end, 5)
         for edge, end in zip((lower.max(), upper.min()), ends, strict=True)

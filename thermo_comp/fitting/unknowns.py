@@ -200,7 +200,7 @@ class InformativePrior:
     root: upper triangular R with ``R.T @ R`` the inverse covariance, shape (n_unit, n_unit)
     log_density: log prior density of the ageing, since the prior calibration, that this prior
         assumes
-    is_changed: whether this prior's covariance is far larger than that of the prior calibration
+    is_changed: whether the covariance is far larger than the prior calibration's covariance
     """
 
     mean: Floats

@@ -52,7 +52,7 @@ class Sets:
     """
     Families of the curves of the static and the dynamic set; their coefficients are not used.
 
-    is_shared: whether the dynamic curve is the static curve plus a difference; else it is separate
+    is_shared: whether the dynamic curve is the static curve plus a difference, no separate curve
     """
 
     static: TemperatureFunction
@@ -90,7 +90,7 @@ class Model:
 
     name: name of the model in the provenance
     parts: the lag of the part of each axis, or None in a model without one lag per axis
-    sensors: thermometers other than the board's; the first is that of the case
+    sensors: thermometers other than the board's; the first is the case thermometer
     range_c: board temperatures of the windows in use [degC]; a rest wholly outside is used, too
     """
 
