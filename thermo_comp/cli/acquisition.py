@@ -3,8 +3,8 @@
 """
 Owns the state of a test during recording: its positions, the expected accuracy, missing data.
 
-Blocks of samples are added in the order of arrival. A rest whose force direction differs from that
-of the present position begins the next position, to which no earlier sample belongs.
+Blocks of samples are added in the order of arrival. A rest whose force direction differs from the
+direction of the present position begins the next position; earlier samples are not part of it.
 """
 
 import math
@@ -265,7 +265,7 @@ class Acquisition:
         )
 
     def _reason(self, rest: _Rest, up: Floats, ratio: float, before: Sequence[Position]) -> str:
-        """Return why a position is not good, else ''; `ratio`: its noise / median noise."""
+        """Return why a position is not good, '' if good; `ratio`: noise / median of positions."""
         if not rest.n_rests:
             return 'not at rest yet'
         if np.isnan(up).any():

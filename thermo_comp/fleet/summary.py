@@ -152,7 +152,7 @@ def spread_of(quantity: TableColumn, rows: Sequence[Row]) -> Spread | None:
 def _determined(quantity: TableColumn, values: Floats, own_sd: Floats) -> Bools:
     """
     Choose the units whose data determine a quantity: units are added in the order of their sd by
-    the fit, until a unit's sd exceeds five times the spread of this and all units added before.
+    the fit, until the sd of the next unit exceeds five times the spread of the units up to it.
     """
     order = np.argsort(own_sd, kind='stable')
     n = len(values)

@@ -43,7 +43,7 @@ _MAX_HELD_BYTES = 1 << 26  # largest memory for messages of overlapping chunks [
 #: Texts for a file that ends inside a record, by the record's opcode; -1: any other opcode.
 _CUTS = {
     0: 'it is unreadable from byte {at} on',
-    int(Opcode.CHUNK): 'it ends inside a chunk; the first {} messages of this chunk are read',
+    int(Opcode.CHUNK): 'it ends inside a chunk: of this chunk, the first {} messages are read',
     int(Opcode.MESSAGE_INDEX): 'it ends inside the index of its last chunk; the chunk is complete',
     -1: 'it ends inside a record; all records before it are read',
 }
