@@ -31,8 +31,8 @@ _LOOKED_BACK = 200
 # Sd of a position's mean force due to hysteresis, mounting and drift, even in a long rest [g].
 _FLOOR_SD = 2e-5
 # A position is 'restless' if its noise is above `_RESTLESS` times the median of all positions.
-# A still interval after the known rests is a rest if its noise is below `_NOISIEST` times that of
-# these rests.
+# A still interval after the known rests is a rest if its noise is below `_NOISIEST` times their
+# noise.
 _RESTLESS, _NOISIEST = 3.0, 10.0
 # Smallest backward step of the stamps that shows a restart of the driver [ns].
 _STEP_BACK_NS = 10**9
@@ -46,7 +46,7 @@ Surveys = Mapping[str, ThermometerSurvey]
 class Position:
     """
     A position: direction of the specific force (NaN before the first rest), total time at rest,
-    number of rests, sd of the mean force [g], thermometers, and why it does not count ('': good).
+    number of rests, sd of the mean force [g], thermometers, reason why it is not good ('': good).
     """
 
     up: Floats

@@ -43,7 +43,7 @@ def convert(
     rate_hz: float | None = options.TABLE_RATE,
     imu: int | None = option('Number of the IMU in an autopilot log, counted from 0.'),
     baro: int | None = option(
-        'Number of a barometer in an autopilot log; its temperature becomes that of the case.'
+        'Number of a barometer in an autopilot log, which gives the case temperature.'
     ),
     allow_compensated: bool = option(
         'Accept samples that the autopilot has corrected by INS_TCAL or TC_A parameters.', False

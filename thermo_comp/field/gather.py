@@ -6,7 +6,7 @@ Owns the detection of rests in a stream of samples: windows of 10 s without moti
 Samples are summed by whole seconds of their stamps. A cell is the smallest number of seconds with
 at least five samples, which is one second at 5 Hz or more. A cell is still if the sd of its
 samples is above 0 and at most `SCATTER_FACTOR` times the sd of the noise, and their mean agrees
-with those of the preceding cell and of the window's first cell. Successive still cells that span
+with the means of the preceding cell and of the window's first cell. Still cells in a row that span
 10 s form a window. In a long rest all windows of the first ten minutes are kept, then one window
 per minute up to an hour, then one per five minutes.
 """

@@ -30,7 +30,7 @@ from .series import RestSeries, last_rest, valid_since
 
 #: Names of conclusions that `--allow` excludes: gravity is not as stated; another unit's rests.
 OVERRIDES = ('gravity', 'unit')
-# The rests of a node start are taken for those of another unit if the RMS of |f| - g exceeds both
+# The rests of a node start are taken for another unit's rests if the RMS of |f| - g exceeds both
 # limits.
 _LARGEST_PART = 1e-3  # relative to gravity: 1 mg, as after a shock
 _LARGEST_SIGMAS = 30.0  # relative to the claimed sd: some milli-g for a poor sensor

@@ -272,7 +272,7 @@ def passage(
         size = np.sqrt(np.einsum('ij,ij->i', error, error))
         # A Brownian bridge with the distances a and b from the bound at two times crosses the
         # bound between the times with the probability exp(-2 a b / variance), `variance` being
-        # that of the walk's change between the times along the error vector.
+        # the variance of the walk's change between the times along the error vector.
         onto_walk = error @ walk
         along = np.einsum('ij,ij->i', onto_walk, onto_walk) * speed**2 * step
         product = left * np.maximum(bound - size, 0.0) * size**2

@@ -138,7 +138,7 @@ def evaluate(
     """
     Judge calibrations of a unit, given with their names, on recordings of the unit.
 
-    Gravity [m/s^2] and topics default to those of the first calibration; `tolerance`: largest
+    Gravity [m/s^2] and topics default to the first calibration's; `tolerance`: largest
     accepted RMS of ``|f| - g`` [m/s^2]; `serial`: serial of the unit, None: as in the recordings,
     '': any serial; `force`: the user's options about rests at which |f| is not g.
 

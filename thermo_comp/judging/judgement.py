@@ -167,7 +167,7 @@ def judge(
 def _expectations(
     windows: JudgedWindows, full: Section, provenance: Provenance
 ) -> dict[str, Expectation]:
-    """Compare |f| - g and the axes' drift with the errors of the fit on data left out of it."""
+    """Compare |f| - g and the axes' drift with their errors on data left out of the fit."""
     inside = windows.select(windows.is_inside)
     drift = within_positions(inside.force, inside.position)
     found = float(np.sqrt(np.mean(drift**2))) if len(inside) else np.nan
@@ -261,7 +261,7 @@ def axis_shifts(
     if distinct_positions(windows) < POSITIONS_NEEDED:
         return ()
     gravity = windows.gravity
-    # Windows with a large claimed sd, such as the first ones of a bag, have a small weight.
+    # Windows with a large claimed sd, such as the first windows of a bag, have a small weight.
     weight = 1.0 / np.maximum(windows.claimed_sd, _SMALLEST_NORM_SD) ** 2
     precision = means_by(windows.position, weight)
     force = (

@@ -30,10 +30,10 @@ from ..unit.nonlinearity import AT_REST
 
 #: Default duration of a window of a judgement [s].
 WINDOW_S = 60.0
-# A window counts as inside the calibrated ranges up to this sum of its distances from the ranges
-# of temperature, rate and the farthest column [half ranges], because thermometers have noise.
+# Largest sum of the distances of a window from the ranges of temperature, rate and the farthest
+# column [half ranges] at which the window counts as inside, because thermometers have noise.
 _RANGE_TOLERANCE = 0.02
-# A partial sum is used if it has at least this share of the median number of samples.
+# Smallest number of samples of a usable partial sum / median number of samples of partial sums.
 _LEAST_FILLED = 0.9
 
 

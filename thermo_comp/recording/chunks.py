@@ -183,7 +183,7 @@ def _indexed(data: Bytes, index: memoryview) -> Messages | None:
 
 def scan_records(data: Bytes, on_record: OnRecord) -> tuple[Messages, str]:
     """
-    Read complete records one by one; return the messages, and why reading stopped early ('': not).
+    Read complete records one by one; return the messages, and why reading stopped early, else ''.
     The last message before zeros is dropped: the zeros may have replaced bytes of this message.
     """
     view = data.data

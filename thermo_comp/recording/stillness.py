@@ -24,7 +24,7 @@ from .noise import is_glitch, roughest_at_rest, spread_of_variances
 #: Largest variance of a cell at rest (30 samples or more) / the bag's noise variance: white noise
 #: exceeds 4 with a probability below 1e-11, and vibration that must be cut out is far above 4.
 VARIANCE_RATIO = 4.0
-#: Largest sd of samples at rest [g]: above the noise of any sensor, below that of most flights.
+#: Largest sd of samples at rest [g]: above any sensor's noise, below the sd of most flights.
 STILL_SD = 0.05
 _STILL_RATE_SD = np.radians(2.0)  # largest sd of the angular rate in a cell at rest [rad/s]
 _STILL_RATE = np.radians(1.0)  # largest mean angular rate of a cell less the rate's bias [rad/s]
@@ -93,7 +93,7 @@ class CellAccumulator:
         self._last_ns: int | None = None
         self._last = np.zeros((0, 3))  # last sample of the previous block
         self._shift = np.zeros(3)
-        # Columns of a cell's row: its number; number of samples; sums of the times, of samples
+        # Columns of a cell's row: number of the cell; number of samples; sums of times, of samples
         # (and rates) and of their squares; change of the samples from the cell before; sums of
         # squared changes from sample to sample. The last row changes while samples are added.
         self._sums: list[Floats] = [np.empty((0, 15))]

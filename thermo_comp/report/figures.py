@@ -353,8 +353,8 @@ def _draw_less_line(
 def soak_measurements(evidence: Evidence) -> tuple[Floats, Floats]:
     """
     Average the residual in each soak of each position. Return temperatures (n,), and the residual
-    taken as an error of the bias [micro-g], and as one of the scale [ppm], (n, 6); the latter is
-    NaN if the force along the axis is below half of gravity.
+    as an error of the bias [micro-g] and as an error of the scale [ppm], (n, 6). The error of the
+    scale is NaN if the force along the axis is below half of gravity.
     """
     windows, residual = evidence.windows, evidence.axis_residuals().get(CHOSEN)
     if windows is None or residual is None:

@@ -120,7 +120,7 @@ class FlowEffect(Effect):
 
 @dataclass(frozen=True)
 class CreepEffect(Effect):
-    """Creep in a part: its temperature less that temperature lagged by `time_constant` [s]."""
+    """Creep in a part: its temperature less its temperature lagged by `time_constant` [s]."""
 
     part: str
     time_constant: float

@@ -31,8 +31,8 @@ _ROWS = 1 << 20
 class Stream(IntEnum):
     """
     Sources of random numbers, such as the noise of the accelerometer. Each source has a separate
-    stream, so that numbers drawn from a source do not change the numbers of others. The value of a
-    source must never change or be reused, because it determines the random numbers of a seed.
+    stream: numbers drawn from one source do not change the numbers of other sources. The value of
+    a source must never change or be reused: it determines the random numbers of a seed.
     """
 
     ACCEL_NOISE = 0
