@@ -46,7 +46,7 @@ Surveys = Mapping[str, ThermometerSurvey]
 class Position:
     """
     A position: direction of the specific force (NaN before the first rest), total time at rest,
-    number of rests, sd of the mean force [g], thermometers, reason why it is not good ('': good).
+    number of rests, sd of the mean force [g], thermometers, reason for not counting ('': none).
     """
 
     up: Floats

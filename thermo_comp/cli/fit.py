@@ -243,7 +243,7 @@ def _print_fit(
 
 
 def _behind_s(parts: Sequence['Part']) -> list[float]:
-    """Return the time by which each part lags the temperature that heats it, in a ramp [s]."""
+    """Return the time by which each part's temperature lags its surroundings in a ramp [s]."""
     return [part.tau_s + part.second_tau_s for part in parts]
 
 

@@ -74,7 +74,7 @@ def read_autopilot(
     """Read an IMU and a barometer by their numbers from 0; default: the lowest number in a log."""
     read = _ulog if path.suffix.lower() == '.ulg' else _dataflash
     try:
-        # Overflows of integer conversions need no warning: `_stamps` finds impossible times.
+        # Integer conversions may overflow without a warning: `_stamps` finds impossible times.
         with np.errstate(invalid='ignore', over='ignore'):
             imus, baros = read(path)
     except OSError as failure:

@@ -140,7 +140,7 @@ def _quantity(cls: type[Any], values: Sequence[Any]) -> Any:
 
 
 def _number(value: float) -> float:
-    if not abs(value) < 1e12:  # also refuses NaN; all quantities of a rest are far smaller
+    if not abs(value) < 1e12:  # refuses NaN, and numbers far above any quantity of a rest
         raise ValueError(value)
     return float(value)
 

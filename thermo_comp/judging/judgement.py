@@ -84,7 +84,7 @@ class Judgement:
 
     @property
     def exit_code(self) -> int:
-        """0 if valid, unless a gyroscope's verdict is `RECALIBRATE` or `NO_BETTER`; else 1."""
+        """0 for a valid calibration unless a gyroscope is `RECALIBRATE` or `NO_BETTER`, else 1."""
         is_wrong = self.rate and self.rate.kind in (Verdict.RECALIBRATE, Verdict.NO_BETTER)
         return 0 if self.is_valid and not is_wrong else 1
 

@@ -90,8 +90,8 @@ def leftovers(folder: Path) -> dict[Path, int]:
 
 def finish(path: Path, number: int) -> Path | None:
     """
-    Copy an unfinished bag to the bag `number` or, if that bag exists, to the largest number + 1,
-    and delete it. Return the new bag, None without messages. Raises RecordingError if damaged.
+    Move the messages of an unfinished bag to the bag `number` or, if that bag exists, to the
+    largest number + 1. Return the new bag, None without messages; RecordingError for damage.
     """
     with open_recording(path, require=()) as reader:
         numbers = {int(bag.stem) for bag in numbered_bags(path.parent)}

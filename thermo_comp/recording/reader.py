@@ -276,7 +276,7 @@ def _described(path: Path) -> _Description:
 
 
 def _read_metadata(directory: Path) -> _Description | None:
-    """Read a bag's metadata.yaml; None if it is missing or empty, as after a killed recorder."""
+    """Read a bag's metadata.yaml; None for a missing or empty file, as after a recorder's kill."""
     path = directory / 'metadata.yaml'
     try:
         text = read_bounded(path, _MAX_BYTES)

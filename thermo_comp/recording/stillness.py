@@ -76,7 +76,7 @@ class Cells:
 class CellAccumulator:
     """
     Reduces streamed samples to cells that last `cell_s`, or as long as `least` samples if longer.
-    A whole number of cells fills `window_s`, or 2 to 60 times `window_s` if a cell exceeds it.
+    Whole cells fill `window_s`, or 2 to 60 times `window_s` if a cell is longer than `window_s`.
     Samples of `full_scale` or more are saturated and dropped.
     """
 

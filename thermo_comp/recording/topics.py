@@ -178,7 +178,7 @@ def shown(name: str) -> str:
 
 
 def choice_note(name: str, key: str, wanted: str, among: str) -> str:
-    """Return the note that a topic was chosen by its type; '' if it has the wanted name."""
+    """Return the note that a topic was chosen by its type; '' for a topic of the wanted name."""
     if is_called(name, split_field(wanted)[0]):
         return ''
     kind = _TYPES[key].rpartition('/')[2]
