@@ -127,7 +127,7 @@ def test_statements_of_a_laboratory_are_printed_and_missing_statements_are_blank
         ('gravity: {standard_uncertainty_m_s2: -1.0}', 'must be at least 0'),
         ('instruments: [{model: CX}]', 'instruments[0].name: this key is missing'),
         ('dates: {due: tomorrow}', 'dates.due: must be a date like 2026-03-31'),
-        ('unit: {serial: other}', 'serial: must be that of the calibration, unit-1, got other'),
+        ('unit: {serial: other}', 'serial: must be unit-1, as in the calibration, got other'),
         ('- number', 'must be a mapping of keys'),
         ('a: *b', 'YAML aliases are not accepted'),
         ('operator: ' + 'x' * 70_000, 'bytes, at most'),

@@ -3,8 +3,8 @@
 """
 Owns the state of a test during recording: its positions, the expected accuracy, missing data.
 
-Blocks of samples are added in the order of arrival. A rest whose force direction differs from that
-of the present position begins the next position, to which no earlier sample belongs.
+Blocks of samples are added in the order of arrival. A rest whose force direction differs from the
+direction of the present position begins the next position; earlier samples are not part of it.
 """
 
 import math
@@ -31,8 +31,8 @@ _LOOKED_BACK = 200
 # Sd of a position's mean force due to hysteresis, mounting and drift, even in a long rest [g].
 _FLOOR_SD = 2e-5
 # A position is 'restless' if its noise is above `_RESTLESS` times the median of all positions.
-# A still interval after the known rests is a rest if its noise is below `_NOISIEST` times that of
-# these rests.
+# A still interval after the known rests is a rest if its noise is below `_NOISIEST` times their
+# noise.
 _RESTLESS, _NOISIEST = 3.0, 10.0
 # Smallest backward step of the stamps that shows a restart of the driver [ns].
 _STEP_BACK_NS = 10**9
@@ -46,7 +46,7 @@ Surveys = Mapping[str, ThermometerSurvey]
 class Position:
     """
     A position: direction of the specific force (NaN before the first rest), total time at rest,
-    number of rests, sd of the mean force [g], thermometers, and why it does not count ('': good).
+    number of rests, sd of the mean force [g], thermometers, reason for not counting ('': none).
     """
 
     up: Floats
@@ -265,7 +265,7 @@ class Acquisition:
         )
 
     def _reason(self, rest: _Rest, up: Floats, ratio: float, before: Sequence[Position]) -> str:
-        """Return why a position is not good, else ''; `ratio`: its noise / median noise."""
+        """Return why a position is not good, '' if good; `ratio`: noise / median of positions."""
         if not rest.n_rests:
             return 'not at rest yet'
         if np.isnan(up).any():

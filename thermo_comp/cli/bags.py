@@ -148,7 +148,7 @@ def _print_calibration(out: Output, path: Path) -> None:
                 )
                 for n in provenance.residuals
             ],
-            title='|f| - g in the fit and on data left out, and drift of an axis on these, in ug',
+            title='|f| - g in the fit and on left-out data; drift of an axis on left-out data; ug',
         )
     print_nonlinearity(out, calibration)
     out.points(provenance.notes)
@@ -208,7 +208,7 @@ def replay(
     out: Output = options.out,
 ) -> None:
     """
-    Correct a whole bag offline; the output equals that of the node for this bag.
+    Correct a whole bag offline; the output equals the node's output for this bag.
 
     Writes imu/data_raw (sensor_msgs/Imu), regime/dynamic (std_msgs/Bool)
     and regime/stamped (the regime with its stamp); the log time of each
@@ -274,8 +274,8 @@ def play(
     context: typer.Context,
     bag: Path = _BAG,
     rate: float = option(
-        'Speed relative to real time; 0: as fast as reliable subscribers receive. A subscriber '
-        'that processes messages more slowly than they arrive loses some of them.',
+        'Speed relative to real time; 0: as fast as reliable subscribers receive messages. A '
+        'subscriber loses messages if it processes them more slowly than they arrive.',
         1.0,
         min=0.0,
     ),

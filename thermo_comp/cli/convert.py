@@ -43,7 +43,7 @@ def convert(
     rate_hz: float | None = options.TABLE_RATE,
     imu: int | None = option('Number of the IMU in an autopilot log, counted from 0.'),
     baro: int | None = option(
-        'Number of the barometer of an autopilot log whose temperature is that of the case.'
+        'Number of a barometer in an autopilot log, which gives the case temperature.'
     ),
     allow_compensated: bool = option(
         'Accept samples that the autopilot has corrected by INS_TCAL or TC_A parameters.', False
@@ -60,10 +60,11 @@ def convert(
     at rest must be gravity in the stated unit. config/columns has examples.
     Without a map, convert guesses a map from the headings and prints the map; a
     table with the columns t ax ay az wx wy wz, in this order, or without t or
-    wx wy wz, needs no headings. The board temperature of a PX4 or ArduPilot log
-    is the IMU's (if missing, the barometer's), the case temperature the
-    barometer's. In a bag, the thermometer whose topic has most namespaces in
-    common with the Imu is that of the board.
+    wx wy wz, needs no headings. In a PX4 or ArduPilot log, the thermometer of
+    the IMU gives the board temperature, the thermometer of the barometer the
+    case temperature (without an IMU thermometer, the board temperature). In a
+    bag, the thermometer whose topic has most namespaces in common with the Imu
+    is the board thermometer.
 
     Example:
       thermo_comp convert log.csv --columns map.yaml -o unit42
@@ -138,7 +139,7 @@ def _print_conversion(out: Output, report: 'ConversionReport', output: Path) -> 
 def print_guess(out: Output, log: 'ForeignLog', printed: dict[str, str]) -> None:
     """
     Print the guessed column map and the unused columns of a table. `printed`: for each text
-    printed so far, its table; a repeated map is replaced by the name of the first such table.
+    printed so far, its table; instead of a map printed before, the name of its table is printed.
     """
     from ..convert.column_map import column_map_text
     from ..convert.headings import map_lines

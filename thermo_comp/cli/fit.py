@@ -44,9 +44,9 @@ def fit(
         metavar='CURVE',
     ),
     dynamic_curve: Curve | None = option(
-        'Curve of bias and scale over temperature in ramps; default: the curve in a soak plus a '
-        'quadratic, or a separate spline or exponential if the curve in a soak is one; quadratic '
-        'for --model golovach.',
+        'Curve of bias and scale over temperature in ramps; default: quadratic for --model '
+        'golovach, else the curve in a soak plus a quadratic; if the curve in a soak is a spline '
+        'or exponential, a separate curve of this kind.',
         metavar='CURVE',
     ),
     groups: str | None = option(
@@ -243,7 +243,7 @@ def _print_fit(
 
 
 def _behind_s(parts: Sequence['Part']) -> list[float]:
-    """Return the time by which the temperature of each part lags its source in a ramp [s]."""
+    """Return the time by which each part's temperature lags its surroundings in a ramp [s]."""
     return [part.tau_s + part.second_tau_s for part in parts]
 
 

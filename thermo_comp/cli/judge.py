@@ -227,7 +227,7 @@ def report(
 
     The page shows temperatures, regime, |f| before and after the correction, the
     functions of temperature with their uncertainty, and the verdict. The exit
-    code is that of `evaluate`. `fit --report` writes the certificate of a fit.
+    code is as for `evaluate`. `fit --report` writes the certificate of a fit.
 
     Example:
       thermo_comp report held_out.mcap -c unit42.yaml -o unit42.html
@@ -281,7 +281,10 @@ def update(
     output: Path = options.NEW_CALIBRATION,
     where: tuple[float | None, float] = options.place,
     ahead: float = option(
-        'Days after the last rest whose ageing the claimed sd covers.', 1.0, min=0.0, max=3650.0
+        'Days after the last rest for which the claimed sd includes ageing.',
+        1.0,
+        min=0.0,
+        max=3650.0,
     ),
     allow: list[str] | None = option(
         'gravity: take local gravity as exact; unit: accept a |f| that suggests another unit.'

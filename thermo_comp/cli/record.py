@@ -246,7 +246,11 @@ def _now(account: 'Account') -> str:
 def _next(account: 'Account') -> str:
     from ..fitting.coverage import direction_text
 
-    angle = '' if isnan(account.next_deg) else f', {account.next_deg:.0f} deg from the present one'
+    angle = (
+        ''
+        if isnan(account.next_deg)
+        else f', {account.next_deg:.0f} deg from the present direction'
+    )
     return f'next position: {direction_text(account.next_up)}{angle}'
 
 

@@ -284,7 +284,7 @@ def force(
         'Standard deviation of --radius, in m; if above 0, the fit estimates the radius.', min=0.0
     ),
 ) -> Any:
-    """Build `ForceOptions`: |f| as the user knows it in rests that are not at 1 g."""
+    """Build `ForceOptions`: the |f| that the user states for rests that are not at 1 g."""
     from ..fitting.sources import ForceOptions
 
     with usage_of():
@@ -308,7 +308,7 @@ def fitting(
         'Temperature at which bias and scale are stated, in degC.', 20.0, metavar='DEGC'
     ),
     min_rest_s: float | None = option(
-        'Shortest rest used, in s; default: 3, or 1 or 2 if they determine bias and scale better.',
+        'Shortest rest used, in s; default: 3 (1 or 2 if this determines bias and scale better).',
         metavar='S',
         show_default=False,
     ),

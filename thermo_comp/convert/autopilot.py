@@ -71,10 +71,10 @@ _VECTORS = ('AccX', 'AccY', 'AccZ', 'GyrX', 'GyrY', 'GyrZ')
 def read_autopilot(
     path: Path, imu: int | None = None, baro: int | None = None, allow_compensated: bool = False
 ) -> ForeignLog:
-    """Read an IMU and a barometer, by default those with the lowest numbers, counted from 0."""
+    """Read an IMU and a barometer by their numbers from 0; default: the lowest number in a log."""
     read = _ulog if path.suffix.lower() == '.ulg' else _dataflash
     try:
-        # Overflows of integer conversions need no warning: `_stamps` finds impossible times.
+        # Integer conversions may overflow without a warning: `_stamps` finds impossible times.
         with np.errstate(invalid='ignore', over='ignore'):
             imus, baros = read(path)
     except OSError as failure:
@@ -141,7 +141,7 @@ def _ulog(path: Path) -> _Content:
         for number, columns in by_topic['sensor_combined'].items():
             accels[number], gyros[number] = _combined(columns)
         hint = (
-            'the log has no sensor_accel: the samples are those of sensor_combined, which PX4 has '
+            'the log has no sensor_accel: the samples come from sensor_combined, which PX4 has '
             f'corrected by CAL_ACC*; to record raw samples, {_PROFILE}'
         )
         name = 'TC_A_ENABLE'
@@ -200,7 +200,7 @@ def _vectors(columns: _Columns, names: Sequence[str]) -> Floats:
 
 
 def _matched(stamp_ns: Ints, columns: _Columns | None) -> Floats | None:
-    """Interpolate angular rates to n stamps; None if fewer than n / 2 or not all are finite."""
+    """Interpolate angular rates to n stamps; None for fewer than n / 2 rates, or NaN in a rate."""
     if columns is None:
         return None
     gyro_ns, gyro = _stamps(columns), _vectors(columns, _AXES)

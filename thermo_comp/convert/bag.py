@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the reading of bags of ROS 1 and 2 whose topics or units differ from those of the node.
+Owns the reading of bags of ROS 1 and 2 with other topics or units than the node's.
 
 Drivers choose their topic names, and some do not publish m/s^2. A topic that the caller does not
-name is found by its message type. The board's temperature topic is the one that shares the most
-leading namespaces with the Imu topic. The case's temperature topic shares more namespaces with a
+name is found by its message type. The temperature topic that shares the most leading namespaces
+with the Imu topic is the board's. The case's temperature topic shares more namespaces with a
 barometer's topic than with the Imu topic, or is the only temperature topic besides the board's.
 """
 

@@ -40,11 +40,11 @@ _FASTEST_RAD_S = 20.0  # largest angular rate of a unit that is turned by hand [
 #: power-up in us, taken for seconds, may lie in this range, but have intervals above 60 s.
 _SINCE_1970_S, _SINCE_1970_STEP_S = (946_684_800.0, 2_147_483_648.0), 60.0
 _FASTEST_K_S = 0.5  # largest change of temperature / duration of a log; a hair dryer: 0.1 K/s
-# Largest share of rows in which a temperature in whole degrees changes. A column of the numbers of
-# boards or sensors alternates from row to row, so it changes in nearly all rows.
+# Largest share of rows in which a temperature in whole degrees changes. A column with the numbers
+# of boards or sensors alternates from row to row, so the number changes in nearly all rows.
 _FEW_CHANGES = 0.1
 _RISING = 0.7  # smallest share of rows whose time is later than the time of the row before
-_WRAP_EDGE = 0.1  # a step from the last to the first tenth of the 32-bit range is an overflow
+_WRAP_EDGE = 0.1  # a time step from the last to the first tenth of 32 bits counts as an overflow
 _A_MAP = 'a column map: --columns MAP'
 
 

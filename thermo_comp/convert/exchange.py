@@ -5,8 +5,8 @@ Owns the export of calibrations to the files of other tools, and the import of s
 
 All tools correct a reading N to a specific force ``a = A (N - b)``. In autopilots the bias b
 depends on temperature and the matrix A is the identity; in tools for tumble tests b and A are
-constant. The notes of an export list the parts of the calibration that the file cannot hold, most
-of them with the resulting error.
+constant. The notes of an export list the parts of the calibration that the file cannot hold, and
+for most parts the resulting error.
 """
 
 from dataclasses import replace
@@ -184,7 +184,7 @@ def _losses(calibration: Calibration) -> list[str]:
         for regime in calibration.regime_sets()
     )
     if static != dynamic:
-        notes.append('the dynamic coefficients are lost: the static ones are used in ramps, too')
+        notes.append('the dynamic coefficients are lost: ramps get the static coefficients, too')
     if calibration.nonlinearity is not None and calibration.nonlinearity.terms:
         notes.append('the terms nonlinear in specific force are lost')
     return notes
@@ -203,8 +203,8 @@ def import_calibration(
     """
     Read the file of one of `TOOLS`, recognised by its content; both regimes get the same curves.
     `number` chooses a parameter set or IMU (None: the only one in use); `full_scale` is in m/s^2.
-    `cycle_time_s` [s] and `noise_density` [m/s^2/sqrt(Hz)] default to those of the file; if the
-    file does not state them, to 5 ms and 200 ug/sqrt(Hz).
+    `cycle_time_s` [s] and `noise_density` [m/s^2/sqrt(Hz)] default to the values in the file; if
+    the file has no such values, to 5 ms and 200 ug/sqrt(Hz).
     """
     readings = (tool.read(text, number) for tool in TOOLS.values())
     content = next((reading for reading in readings if reading is not None), None)

@@ -44,7 +44,7 @@ _OUTSIDE = re.compile('case|air|amb|baro|bmp|aht|room|hous|env')  # thermometers
 # Unit of a temperature at the end of a heading; words of headings that name no temperature.
 _DEGREES_END = re.compile('(^|_)(deg_?[cfk]|kelvin|fahrenheit)$')
 _NO_READING = re.compile('(^|_)(raw|adc|counts?|lsb|id|rev|status|valid|voltage|volts?|mv)(_|$)')
-# A heading like `magnet_c` (ends in the unit's letter) or `board` (a place alone) is that of a
+# A heading like `magnet_c` (ends in the unit's letter) or `board` (a place alone) names a
 # thermometer only if the values in its column can be temperatures.
 _LETTER = re.compile('_[ck]$|^(board|case|imu|die|chip)_f$')
 _PLACE = re.compile('board|case|imu|die|chip')
@@ -143,7 +143,7 @@ def map_lines(columns: Any) -> list[str]:
 
 
 def _given(value: Any) -> Any:
-    """Turn a dataclass into a mapping; leave out default values, except that of `unit`."""
+    """Turn a dataclass into a mapping; leave out default values of all fields except `unit`."""
     if is_dataclass(value):
         pairs = ((field, getattr(value, field.name)) for field in fields(value))
         return {f.name: _given(x) for f, x in pairs if x != f.default or f.name == 'unit'}
@@ -174,7 +174,7 @@ def _stated(heading: str, units: dict[str, str]) -> str:
 
 
 def _triads(names: dict[str, str]) -> Iterator[tuple[str, tuple[str, str, str]]]:
-    """Yield, of three headings that differ only in x, y, z, the common part and the headings."""
+    """For three headings that differ only in x, y, z, yield their common part and the headings."""
     for name in reversed(names):
         for at in (match.start() for match in re.finditer('x', name)):
             three = [f'{name[:at]}{axis}{name[at + 1 :]}' for axis in 'xyz']

@@ -128,8 +128,8 @@ def layout(head: str, delimiter: str | None = None) -> tuple[str, int]:
     for sign in (';', '\t', '|', ',', ' ') if delimiter is None else (delimiter,):
         rows = [row for _, row in _rows(lines, sign)]
         width, n_rows = _most_frequent([_n_cells(row) for row in rows[-_LAYOUT_ROWS:]])
-        # If a slow thermometer is in the last column, most rows end in an empty cell: the width
-        # is then that of the rows without an empty cell.
+        # If a slow thermometer is in the last column, most rows end in an empty cell: rows without
+        # an empty cell then determine the width.
         whole, _ = _most_frequent([len(row) for row in rows[-_LAYOUT_ROWS:]])
         is_whole = any(len(row) == whole and row[-1].strip() for row in rows)
         candidates.append((n_rows if width > 1 else 0, sign, whole if is_whole else width))
@@ -166,7 +166,7 @@ def _rows(file: Iterable[str], delimiter: str) -> _Rows:
 def _begin(rows: _Rows, width: int, has_header: bool | None) -> tuple[list[str], _Rows]:
     """
     Skip the preamble; return the headings, if any, and the rows of a table. A row has `width`
-    cells, of which the last may be blank. Rows of `width` cells directly before the first row of
+    cells; its last cell may be blank. Rows of `width` cells directly before the first row of
     numbers belong to the table, and the first of these rows has the headings.
     """
     first = list(islice(rows, _PREAMBLE_ROWS))

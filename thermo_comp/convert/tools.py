@@ -32,7 +32,7 @@ from ..plain_yaml import load_plain_yaml
 from ..typing import Floats
 
 _ARDUPILOT_REFERENCE_C = 35.0  # temperature at which d of ArduPilot's cubic is 0 [degC]
-_ARDUPILOT_SCALE = 1e6  # ArduPilot's coefficient / that in m/s^2 or rad/s per power of kelvin
+_ARDUPILOT_SCALE = 1e6  # ArduPilot's coefficient / coefficient in m/s^2 or rad/s per power of K
 _NO_TEMPERATURE = -273.0  # ArduPilot's value for an unknown calibration temperature [degC]
 _AXES = ('X', 'Y', 'Z')
 _THERMAL_NOTE = (
@@ -41,7 +41,7 @@ _THERMAL_NOTE = (
 )
 _NAME = re.compile(r'\b(TC_[AG]\d_\w+|TC_[AG]_ENABLE|INS_TCAL\d_\w+|INS_(?:ACC|GYR)\d_CALTEMP)\b')
 _NUMBER = re.compile(r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?')
-#: Reference temperature and range [degC] for files of imu_tk, imu_calib, Kalibr, which lack both.
+#: Reference temperature and range [degC] for files of imu_tk, imu_calib, Kalibr: these have none.
 _REFERENCE_C, _RANGE_C = 20.0, (-60.0, 120.0)
 _TRIAD_NOTE = 'imported: constants of one temperature, used at all temperatures; no uncertainty'
 _HEADING = re.compile(r'\s*(#|Misalignment Matrix|Scale Matrix|Bias Vector)')

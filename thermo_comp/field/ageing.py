@@ -41,7 +41,7 @@ _JUMPS = (50.0 * MICRO_G, 500.0 * MICRO_G, 5000.0 * MICRO_G)
 #: shock changes a scale times g less than a bias.
 _JUMP_SHARES = np.repeat([1.0, 0.1], 3)
 _LEAST_GAIN = 5.0  # smallest log Bayes factor of a change that is added (odds 150:1)
-_LEAST_LEAD = 3.0  # smallest log Bayes factor of a gravity jump over other changes (odds 20:1)
+_LEAST_LEAD = 3.0  # smallest log Bayes factor of a gravity jump against other changes (odds 20:1)
 _BENDS = (1.0 * MICRO_G, 10.0 * MICRO_G)  # prior sds of a change of the bias slopes [m/s^2 per K]
 #: Sd of the random walk of the slopes of the bias curves [m/s^2 per K per root day]: after one
 #: year, the sd is the smallest of `_BENDS`.
@@ -79,7 +79,7 @@ class Change:
 
     time: time of a jump; None for a change of the slopes, which holds for all rests
     sd: prior sd of the change of a level or of gravity [m/s^2], or of a slope [m/s^2 per K]
-    may_be_gravity: whether a gravity jump explains the rests about as well as this jump of levels
+    may_be_gravity: whether a gravity jump is about as probable as this jump of levels
     """
 
     kind: _Kind
@@ -102,7 +102,7 @@ class Rows:
     Up to `_ROWS` equations per start of the node, in the order of starts: orthogonal combinations
     of the rests of a start, with all information of the rests about bias and scale.
 
-    y, `by_...`, lack: combinations of ``|f| - g`` [m/s^2], its derivatives, `RestSeries.lack`
+    y, `by_...`, lack: combined ``|f| - g`` [m/s^2], its derivatives, and `RestSeries.lack`
     noise: variance of a row due to noise
     scatter: variance of a row due to the scatter of rests / scatter variance of one rest
     rank: number of the row among the rows of its start, from 0
@@ -286,7 +286,7 @@ def learn(
             changes += (best,)
         model = Model(rows, calibration, since, changes)
         inverse = model.inverse(ageing)
-        deviation = (inverse @ rows.y) / np.sqrt(np.diag(inverse))  # from the prediction, in sd
+        deviation = (inverse @ rows.y) / np.sqrt(np.diag(inverse))  # of row from prediction [sds]
         is_outlier = np.isin(used.start, rows.start[np.abs(deviation) > 5.0])
         # If more than 10 % of the rests would be left out, the model is wrong: keep all rests.
         if not 0 < is_outlier.sum() <= 0.1 * len(used):
@@ -298,8 +298,8 @@ def learn(
 def _best(candidates: Iterable[Change], is_gravity_certain: bool) -> Change | None:
     """
     Return the most probable `Change`, or None if no log Bayes factor reaches `_LEAST_GAIN`. A
-    gravity jump is returned only if its log Bayes factor exceeds those of all other changes, and
-    0, by `_LEAST_LEAD` or more.
+    gravity jump is returned only if its log Bayes factor exceeds 0, and the log Bayes factor of
+    any other change, by `_LEAST_LEAD` or more.
     """
     gravity = other = Change('levels', None, 0.0, log_bayes_factor=-np.inf)
     for change in candidates:

@@ -6,7 +6,7 @@ Owns the detection of rests in a stream of samples: windows of 10 s without moti
 Samples are summed by whole seconds of their stamps. A cell is the smallest number of seconds with
 at least five samples, which is one second at 5 Hz or more. A cell is still if the sd of its
 samples is above 0 and at most `SCATTER_FACTOR` times the sd of the noise, and their mean agrees
-with those of the preceding cell and of the window's first cell. Successive still cells that span
+with the means of the preceding cell and of the window's first cell. Still cells in a row that span
 10 s form a window. In a long rest all windows of the first ten minutes are kept, then one window
 per minute up to an hour, then one per five minutes.
 """
@@ -25,7 +25,7 @@ SECONDS = 10  # shortest length of a window of a rest [s]
 #: the stamps leaves some seconds without a sample.
 _LARGEST_STEP = 2
 _SECOND_NS = 1_000_000_000
-#: Pairs (k, n): from the window number k of a rest on, every n-th window is kept.
+#: Pairs (k, n): every n-th window of a rest is kept, from its window number k on.
 _SPACING = ((360, 30), (60, 6), (0, 1))
 
 #: Thermal state, and the fraction of each lag's unknown initial state that has not yet decayed.
@@ -57,8 +57,8 @@ class RestFinder:
     def __init__(
         self, scale: Floats, noise: Floats, full_scale: float, state_now: StateNow, cycle_s: float
     ) -> None:
-        # `scale`: scale factors [input units per m/s^2]; `noise`: variance of one sample
-        # [m^2/s^4] of each axis, at one sample per `cycle_s`, larger at a higher rate.
+        # `scale`: scale factors [input units per m/s^2]; `noise`: variance of one sample of each
+        # axis [m^2/s^4] at one sample per `cycle_s`; at a higher rate the variance is larger.
         self._scale, self._noise, self._full_scale = scale, float(noise.sum()), full_scale
         self._state_now, self._cycle_s = state_now, cycle_s
         self._cell: _Cell | None = None

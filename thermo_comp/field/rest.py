@@ -43,10 +43,10 @@ class Start:
 @dataclass(frozen=True)
 class Rest:
     """
-    A window of samples at rest. `stamp_ns`: stamp of the window's middle; `n`: number of samples;
-    `mean`, `sd`: of the samples [input units]; `state`: mean thermal state, in the order of the
-    `StateLayout` of `Start.memory`; `shares`: fraction of the unknown initial state of each lag
-    that has not yet decayed; `rate`: mean angular rate [rad/s], empty if unknown.
+    A window at rest. `stamp_ns`: stamp of its middle; `n`, `mean`, `sd`: number, mean and sd of
+    its samples [input units]; `state`: mean thermal state, in the order of the `StateLayout` of
+    `Start.memory`; `shares`: fraction of the unknown initial state of each lag that has not yet
+    decayed; `rate`: mean angular rate [rad/s], empty if unknown.
     """
 
     stamp_ns: int
@@ -140,7 +140,7 @@ def _quantity(cls: type[Any], values: Sequence[Any]) -> Any:
 
 
 def _number(value: float) -> float:
-    if not abs(value) < 1e12:  # a larger number is invalid: it is far above any sample
+    if not abs(value) < 1e12:  # refuses NaN, and numbers far above any quantity of a rest
         raise ValueError(value)
     return float(value)
 

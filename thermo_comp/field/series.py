@@ -4,11 +4,11 @@
 Owns rests as measurements of the error of a calibration: ``|f| - g`` and its derivatives.
 
 A rest at an unknown attitude measures one number, |f|. Let x be the forces along the axes, f = M
-x, u = f / |f| and v = M^T u. If the bias of axis i is too large by d_bias [input units], and
-the scale by the part d_scale of K_i, |f| changes by ``-v_i (d_bias + K_i x_i d_scale) / scale_i``;
-K_i, scale_i: scale factors at the reference temperature, and at the rest. To first order
-``|f| - g`` is noise plus H times the errors of all parameters (true less calibrated); H:
-derivatives of |f| by these errors.
+x, u = f / |f| and v = M^T u. If the bias of axis i is d_bias [input units] too large, and its
+scale K_i d_scale too large, |f| changes by ``-v_i (d_bias + K_i x_i d_scale) / scale_i``; K_i is
+the scale factor at the reference temperature, scale_i at the rest. To first order ``|f| - g`` is
+noise plus H times the errors of all parameters (true less calibrated); H has the derivatives of
+|f| by these errors.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class RestSeries:
     start: number of the node's start, from 0
     temperature, state: board temperature [degC]; mean thermal state, in the order of `StateLayout`
     direction, force, by_parameter: v, x and H of this module's docstring
-    gravity, residual: stated g; ``|f| - g``
+    gravity, residual: the stated g, and ``|f| - g``
     by_level: derivatives of |f| by the bias, and by the scale times g, of each axis, (n, 6)
     noise: variance of |f| due to noise of samples, errors of thermometers and of the regime
     by_start: derivatives of |f| by the unknown lag states at the start, in units of their sds
@@ -188,11 +188,11 @@ def last_rest(source: Source) -> str:
 
 def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
     """
-    Return the time at which a calibration was determined, the time up to which its covariance
-    includes ageing [both in days since 1970], and whether it is an update.
+    Return the time of a calibration, the time up to which its covariance includes ageing [both in
+    days since 1970], and whether the calibration is an update.
 
-    An update was determined at its last rest, another calibration at the date of the test or file;
-    without a date, both returned times are -inf.
+    The time of an update is its last rest, the time of another calibration the date of its test
+    or file; without a date, both returned times are -inf.
     """
     every = (source.name for source in calibration.provenance.sources)
     names = [name for name in every if name.startswith(_UNTIL)]

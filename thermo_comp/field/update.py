@@ -28,9 +28,9 @@ from ..unit.provenance import Provenance, ResidualSummary, Source
 from .ageing import Ageing, Change, Model, Solution, learn, solve
 from .series import RestSeries, last_rest, valid_since
 
-#: Conclusions that `--allow` excludes: gravity is not as stated; the rests are of another unit.
+#: Names of conclusions that `--allow` excludes: gravity is not as stated; another unit's rests.
 OVERRIDES = ('gravity', 'unit')
-# The rests of a node start are taken for those of another unit if the RMS of |f| - g exceeds both
+# The rests of a node start are taken for another unit's rests if the RMS of |f| - g exceeds both
 # limits.
 _LARGEST_PART = 1e-3  # relative to gravity: 1 mg, as after a shock
 _LARGEST_SIGMAS = 30.0  # relative to the claimed sd: some milli-g for a poor sensor
@@ -140,15 +140,15 @@ def update(
         )
     _, aged, is_update = valid_since(calibration)
     first, last = float(series.time.min()), float(series.time.max())
-    # The covariance includes ageing up to the time `aged`. The random walks begin at `aged` if it
-    # is before the first rest (before the last rest for an updated file), else at the first rest.
+    # The covariance includes ageing up to the time `aged`. The random walks begin at `aged` if
+    # this is before the first rest (updated file: before the last rest), else at the first rest.
     since = aged if -np.inf < aged < (last if is_update else first) else first
     ageing, model, used = learn(series, calibration, since, is_gravity_certain=is_gravity_certain)
     solution = solve(model, ageing, *_derivatives(calibration), ahead)
     determined, by_axis = _axis_changes(used, calibration, model, solution, ageing)
     judged = _judged(used, model, solution, determined)
     shift, kept = solution.shift * determined, solution.shift * ~determined
-    # The shift of a parameter that is not updated remains as an error: add its square.
+    # The shift of a parameter that is not updated remains an error: add the square of this shift.
     covariance = solution.posterior + solution.future + np.outer(kept, kept)
     scatter = float(np.hypot(ageing.turn_on, ageing.rest))
     new = _shifted(calibration, shift, covariance)
@@ -244,7 +244,7 @@ def _axis_changes(
 
 
 def _judged(series: RestSeries, model: Model, solution: Solution, determined: Bools) -> Judged:
-    """Score updates from earlier rests on the rests of a day or, below 5 days, of a node start."""
+    """Score updates by earlier rests on each day's rests (below 5 days: on each start's rests)."""
     over, labels = 'days', series.day
     if len(np.unique(labels)) < 5:
         over, labels = 'starts', series.start

@@ -60,13 +60,13 @@ class Watch:
     days, periods, temperatures: rows by day, by period (at most 30), by class of temperature
     last: the last day with rests
     week: rows of the days with rests in the last week
-    recent: RMS of |f| - g over the last week / the limit, robust against one disturbed day
+    recent: RMS of |f| - g over the last week / limit; one disturbed day hardly changes it
     outside_since: day since which the unit is outside its claim; None if it is within its claim
     inside_since: day on which the unit was again within its claim; None if it was never outside,
         or is outside
     forecast: quantiles (10, 50, 90 %) of the time from the last rest until the unit's error
         exceeds its claim [days]; infinite if later than ten years; () if unknown or exceeded
-    interval: the same quantiles if the calibration is updated at the last rest
+    interval: the quantiles of `forecast` for a calibration that is updated at the last rest
     """
 
     days: tuple[Row, ...]
@@ -141,9 +141,9 @@ def watch(series: RestSeries, calibration: Calibration, tolerance: float | None 
         ageing = updated.ageing
         forecast, interval = _forecasts(updated, tolerance)
     is_out, is_row_out = recent > 1.0, np.array([not row.is_within for row in days])
-    # The RMS of |f| - g over a week responds late to a change. If the error by the ageing model is
-    # above the limit, the unit is outside its claim if the last day is above the limit; if that
-    # error is within the limit, the unit is within its claim if the last two days are.
+    # The RMS of |f| - g over a week responds late to a change. While the error by the ageing model
+    # is above the limit, one last day above the limit puts the unit outside its claim. While that
+    # error is within the limit, two last days within the limit put the unit within its claim.
     is_error_out = bool(forecast) and forecast[1] == 0.0
     is_out[-1] &= is_error_out or is_row_out[-2:].any()
     is_out[-1] |= is_error_out and is_row_out[-1]
@@ -210,7 +210,7 @@ def _forecasts(
     scatter = min(scatter, float(share @ left**2))
     limit = tolerance or LIMIT * float(np.sqrt(share @ recent.claim**2))
     bound = float(np.sqrt(max(limit**2 - scatter, 0.0)))
-    # Sd (by the delta method) of the logarithm of the daily growth of the error's variance.
+    # Sd of the logarithm of the daily growth of the error's variance, by the delta method.
     slope = 2.0 * np.array([bias, scale]) / (bias + scale)
     of_walks = updated.model.log_covariance(ageing)[:2, :2]
     rate_sd = float(np.sqrt(slope @ of_walks @ slope))
@@ -272,7 +272,7 @@ def passage(
         size = np.sqrt(np.einsum('ij,ij->i', error, error))
         # A Brownian bridge with the distances a and b from the bound at two times crosses the
         # bound between the times with the probability exp(-2 a b / variance), `variance` being
-        # that of the walk's change between the times along the error vector.
+        # the variance of the walk's change between the times along the error vector.
         onto_walk = error @ walk
         along = np.einsum('ij,ij->i', onto_walk, onto_walk) * speed**2 * step
         product = left * np.maximum(bound - size, 0.0) * size**2

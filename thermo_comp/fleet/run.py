@@ -141,7 +141,7 @@ def lacks_data(row: Row) -> bool:
 def _common(rows: Sequence[Row], results: Results) -> tuple[Calibration | None, str]:
     """
     Build and save the prior, from the last test of each serial with complete data and a valid
-    calibration; or return None and the reason.
+    calibration. If there is no prior, return None and the reason.
     """
     usable = (row for row in rows if is_valid(row) and row['is_whole'] == 1)
     tests = sorted(usable, key=lambda row: str(row['start']))
@@ -207,7 +207,7 @@ class Results:
             raise ThermoCompError(f'{folder}: cannot be created: {error.strerror}') from error
 
     def folder_of(self, name: str, with_prior: object = False) -> Path:
-        """Return the folder of a unit's files; for any name it is inside the folder of results."""
+        """Return the folder of a unit's files, which is in the folder of results for any name."""
         kind = 'with_prior' if with_prior else 'units'
         return self.folder.joinpath(kind, *map(_safe, name.split('/')))
 

@@ -22,10 +22,10 @@ _FALSE_ALARMS = 0.05
 _UNITS_NEEDED = 8  # smallest number of units of a fleet that is searched for outliers
 # Efficiency of the median absolute deviation relative to the sample sd, for a normal distribution.
 _MAD_EFFICIENCY = 0.37
-# The data determine a unit's value if its sd by the fit is at most this multiple of the spread
-# over the units; a value of larger sd is about the prior mean of the fit.
+# Largest sd by the fit of a value that a unit's data determine / spread over the units; a value
+# with a larger sd is about the prior mean of the fit.
 _LARGEST_SD = 5.0
-# Residuals [ug] and noises [ug/sqrt(Hz)] below this limit are raised to it before logarithms.
+# Residuals [ug] and noises [ug/sqrt(Hz)] are raised to this value before their logarithm is taken.
 _LEAST = 1e-12
 #: Columns of the table in which units are compared.
 QUANTITIES = tuple(column for column in COLUMNS if column.label)
@@ -152,7 +152,7 @@ def spread_of(quantity: TableColumn, rows: Sequence[Row]) -> Spread | None:
 def _determined(quantity: TableColumn, values: Floats, own_sd: Floats) -> Bools:
     """
     Choose the units whose data determine a quantity: units are added in the order of their sd by
-    the fit, until a unit's sd exceeds five times the spread of this and all units added before.
+    the fit, until the sd of the next unit exceeds five times the spread of the units up to it.
     """
     order = np.argsort(own_sd, kind='stable')
     n = len(values)

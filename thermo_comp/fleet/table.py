@@ -43,7 +43,7 @@ class TableColumn(NamedTuple):
     name: str
     kind: str  # text, whole, number
     meaning: str
-    # The next fields are those of a quantity that is compared between units; see `_COMPARED`.
+    # The next fields describe a quantity that is compared between units; see `_COMPARED`.
     label: str = ''
     unit: str = ''
     by: str = 'value'  # comparison by values, by deviations in ppm, or by logarithms
@@ -63,7 +63,7 @@ _TABLE = (
     ('chosen', 'text', 'topics chosen by their type, because the usual name is missing'),
     ('n_bags', 'whole', 'number of bags of the unit'),
     ('n_left_out', 'whole', 'number of bags that the fit did not use'),
-    ('n_torn', 'whole', 'number of incomplete bags, of which the readable part was used'),
+    ('n_torn', 'whole', 'number of incomplete bags; their readable part was used'),
     ('n_positions', 'whole', 'number of positions at rest'),
     ('n_samples', 'whole', 'number of accelerometer samples'),
     ('n_bytes', 'whole', 'size of the bags in bytes'),
@@ -100,7 +100,7 @@ _TABLE = (
     ('dynamic_ug', 'number', 'RMS of |f| - g at rest in the dynamic regime, corrected'),
     ('all_ug', 'number', 'RMS of |f| - g at rest in both regimes together, corrected'),
     ('peak_ug', 'number', 'largest magnitude of |f| - g of a window at rest, corrected'),
-    ('unseen_ug', 'number', 'RMS of |f| - g, or of the drift, of positions left out in turn'),
+    ('unseen_ug', 'number', 'RMS of |f| - g, or of the drift, in positions left out of the fit'),
     ('claimed_ug', 'number', 'RMS over the windows of the claimed standard deviation of |f|'),
     ('cpu_s', 'number', 'processor time of reading and fit'),
     ('tool_version', 'text', 'version of thermo_comp that fitted the unit'),

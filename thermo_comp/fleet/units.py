@@ -174,7 +174,7 @@ def group_files(files: Sequence[StoredFile]) -> Bags:
 
 
 def _is_bag(folder: str, inside: list[StoredFile], stored: list[StoredFile]) -> bool:
-    """Whether a folder is a rosbag2 bag: it has metadata.yaml, or only bag files FOLDER_<n>."""
+    """Whether a folder is a rosbag2 bag: has metadata.yaml, or all bag files are FOLDER_<n>."""
     stems = [file.name.rpartition('.')[0].rpartition('_') for file in stored]
     usual = f'{folder}/{folder.rpartition("/")[2]}'
     return any(file.name == f'{folder}/metadata.yaml' for file in inside) or all(

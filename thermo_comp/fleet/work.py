@@ -46,7 +46,7 @@ class FleetOptions:
         return '' if self.fit.prior is None else sha256(dump_calibration(self.fit.prior))
 
     def digest(self) -> str:
-        """Return the SHA-256 of version, prior and options, on which a unit's result depends."""
+        """Return the SHA-256 of version, prior and options; a unit's result depends on these."""
         plain = replace(self, fit=replace(self.fit, prior=None))
         content = {'version': __version__, 'prior': self.prior_sha256, **asdict(plain)}
         return sha256(json.dumps(content, sort_keys=True, default=repr))
@@ -93,7 +93,7 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
                 how = replace(options.fit, input=_UNIT_OF[info.input])
                 bags[name] = reduce_bag(replace(source, sha256=hashes[name]), how)
         except RecordingError as error:  # noqa: PERF203 - the other bags are still read
-            # Name the bag by its path in the fleet: its own path may be that of a temporary copy.
+            # Name the bag by its path in the fleet: the file read may be a temporary copy.
             problems.append(': '.join(part for part in (name, error.key, error.message) if part))
             is_final = is_final and not isinstance(error.__cause__, OSError)
         except OSError as error:
@@ -166,7 +166,7 @@ def dask_setup(_worker: object) -> None:
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Let workers started in the `with` block ignore Ctrl-C, which is raised after the block."""
+    """Let workers started in the `with` block ignore Ctrl-C; raise Ctrl-C after the block."""
     received: list[int] = []
     # Workers inherit the ignored SIGINT (Ctrl-C) from the fork server.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)

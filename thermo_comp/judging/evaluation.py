@@ -37,7 +37,7 @@ _DEAD_NOISE = 0.5
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Judgements by the name of the calibration; `notes`: recordings that were not judged."""
+    """Bags, judgement of each calibration by its name, and notes on bags that were not judged."""
 
     bags: tuple[ReducedBag, ...]
     judgements: dict[str, Judgement]
@@ -138,9 +138,9 @@ def evaluate(
     """
     Judge calibrations of a unit, given with their names, on recordings of the unit.
 
-    Gravity [m/s^2] and topics default to those of the first calibration; `tolerance`: largest
-    accepted RMS of ``|f| - g`` [m/s^2]; `serial`: serial of the unit, None for that of the
-    recordings, '' for any; `force`: the user's options about rests at which |f| is not g.
+    Gravity [m/s^2] and topics default to the first calibration's; `tolerance`: largest
+    accepted RMS of ``|f| - g`` [m/s^2]; `serial`: serial of the unit, None: as in the recordings,
+    '': any serial; `force`: the user's options about rests at which |f| is not g.
 
     Raises RecordingError if a recording cannot be read, or no window at rest is corrected, and
     CalibrationError if a calibration is for another unit.
@@ -206,8 +206,8 @@ class Drift:
 
 def history_of(calibrations: Sequence[Calibration]) -> tuple[Epoch, ...]:
     """
-    Sort by date the calibrations with the serial number of the first given calibration. Only the
-    first of several calibrations from the same bags is kept: they show no change in time.
+    Sort by date the calibrations with the serial number of the first given calibration. Of several
+    calibrations from the same bags only the first is kept: the others show no change in time.
     """
     seen: set[tuple[Source, ...]] = set()
     ordered: list[Calibration] = []
@@ -230,7 +230,7 @@ def history_of(calibrations: Sequence[Calibration]) -> tuple[Epoch, ...]:
 
 
 def drifts_of(history: Sequence[Epoch]) -> list[Drift]:
-    """List the changes from each calibration to the next, with errors taken as independent."""
+    """List the changes from each calibration to the next; errors are taken as independent."""
     return [
         Drift(
             earlier=before.date,

@@ -25,8 +25,8 @@ from .windows import JudgedWindows
 _WIDE_CLAIM = 1e3 * MICRO_G
 #: Smallest significant shift or change of a constant, in standard deviations.
 SIGNIFICANT_SDS = 3.0
-# Smallest sd, to avoid a division by 0: of a misalignment [rad]; of the mean |f| / g of a
-# position, and of the |f| of a window [m/s^2].
+# Smallest sds, to avoid a division by 0: sd of a misalignment [rad]; sd of the mean |f| / g of a
+# position, also used for the |f| of a window [m/s^2].
 _SMALLEST_MISALIGNMENT_SD, _SMALLEST_NORM_SD = 1e-5, 1e-8
 # Number of consecutive windows that count as one observation: thermal residuals are correlated.
 _CORRELATED_WINDOWS = 6.0
@@ -60,7 +60,7 @@ class Judgement:
     of the fit; `tolerance`: the user's limit on RMS values [m/s^2]. `shifts`: shift of bias and
     scale of each axis, empty with fewer than six distinct positions; `moved`: text of each
     significant shift; `axis_rms`: RMS drift of each regime and axis; `rate`: judgement of the
-    gyroscope; `expectations`: |f| - g and drift of an axis (`norm`, `drift`) in calibrated ranges.
+    gyroscope; `expectations`: errors of |f| - g (`norm`) and of an axis's drift (`drift`).
     """
 
     kind: Verdict
@@ -84,13 +84,13 @@ class Judgement:
 
     @property
     def exit_code(self) -> int:
-        """1 if not valid, or if a gyroscope's verdict is `RECALIBRATE` or `NO_BETTER`, else 0."""
+        """0 for a valid calibration unless a gyroscope is `RECALIBRATE` or `NO_BETTER`, else 1."""
         is_wrong = self.rate and self.rate.kind in (Verdict.RECALIBRATE, Verdict.NO_BETTER)
         return 0 if self.is_valid and not is_wrong else 1
 
     @property
     def headline_rms(self) -> float:
-        """RMS error of left-out positions if known, else of windows in the calibrated ranges."""
+        """RMS error of left-out positions or, if unknown, of windows in the calibrated ranges."""
         in_sample = self.sections['all'].rms
         return self.left_out_rms if np.isfinite(self.left_out_rms) else in_sample
 
@@ -167,7 +167,7 @@ def judge(
 def _expectations(
     windows: JudgedWindows, full: Section, provenance: Provenance
 ) -> dict[str, Expectation]:
-    """Compare |f| - g and the axes' drift with the errors of the fit on data left out of it."""
+    """Compare |f| - g and the axes' drift with their errors on data left out of the fit."""
     inside = windows.select(windows.is_inside)
     drift = within_positions(inside.force, inside.position)
     found = float(np.sqrt(np.mean(drift**2))) if len(inside) else np.nan
@@ -261,7 +261,7 @@ def axis_shifts(
     if distinct_positions(windows) < POSITIONS_NEEDED:
         return ()
     gravity = windows.gravity
-    # Windows with a large claimed sd, such as the first ones of a bag, have a small weight.
+    # Windows with a large claimed sd, such as the first windows of a bag, have a small weight.
     weight = 1.0 / np.maximum(windows.claimed_sd, _SMALLEST_NORM_SD) ** 2
     precision = means_by(windows.position, weight)
     force = (
@@ -304,7 +304,7 @@ def change_texts(shifts: tuple[AxisShift, ...]) -> tuple[str, ...]:
 
 
 def rms_by_axis(windows: JudgedWindows) -> Floats:
-    """Return for each regime and axis the RMS of force less mean in the position, (2, 3)."""
+    """Return the RMS of the force less its mean in the position, per regime and axis, (2, 3)."""
     about = within_positions(windows.force, windows.position)
     return np.array(
         [

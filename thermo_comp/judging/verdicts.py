@@ -52,7 +52,7 @@ class Section:
     Residuals of the `n` windows of a section: ``|f| - g`` [m/s^2], or angular rate less its mean
     in the rest [rad/s].
 
-    Fields named `raw`: residuals with the constants at the reference temperature only, others:
+    Fields named `raw` hold residuals with the constants at the reference temperature only, others
     with the whole calibration; `claimed_rms`: RMS of the claimed sd of the windows, or NaN.
     """
 
@@ -143,8 +143,8 @@ def judge_rates(windows: JudgedWindows, calibration: Calibration) -> RateJudgeme
     """
     Judge a gyroscope by windows at rest; return None without a gyroscope or angular rates.
 
-    At rest a gyroscope reads the unknown sum of Earth's rate and turn-on bias, so the changes from
-    the mean of each rest are judged, against the sd claimed for the changes.
+    At rest a gyroscope reads the unknown sum of Earth's rate and turn-on bias. Therefore the rate
+    less its mean in each rest is judged; its limit is the sd that the calibration claims for it.
     """
     windows = windows.select(np.asarray(np.isfinite(windows.gyro[:, :6]).all(axis=1)))
     if not windows.gyro.size:

@@ -30,10 +30,10 @@ from ..unit.nonlinearity import AT_REST
 
 #: Default duration of a window of a judgement [s].
 WINDOW_S = 60.0
-# A window counts as inside the calibrated ranges up to this sum of its distances from the ranges
-# of temperature, rate and the farthest column [half ranges], because thermometers have noise.
+# Largest sum of the distances of a window from the ranges of temperature, rate and the farthest
+# column [half ranges] at which the window counts as inside, because thermometers have noise.
 _RANGE_TOLERANCE = 0.02
-# A partial sum is used if it has at least this share of the median number of samples.
+# Smallest number of samples of a usable partial sum / median number of samples of partial sums.
 _LEAST_FILLED = 0.9
 
 
@@ -119,8 +119,8 @@ def corrected_windows(
     window_s: float = WINDOW_S,
 ) -> JudgedWindows:
     """
-    Build the windows of bags, corrected if there is a calibration; raises RecordingError if the
-    sample rate is too low for windows of `window_s`.
+    Build the windows of bags, and correct the windows if there is a calibration. Raises
+    RecordingError if the sample rate is too low for windows of `window_s`.
     """
     if gravity is None:
         gravity = np.nan if calibration is None else calibration.gravity_m_s2
@@ -135,7 +135,7 @@ def corrected_windows(
         noise = along**2 @ np.array(correction.noise)
         # The mean has no rounding noise: a converter adds the remainder to the next sample.
         white = along**2 @ np.square(calibration.noise_density_m_s2_sqrt_hz)
-        # A higher sample rate raises the noise of each sample: the noise of the mean stays equal.
+        # A higher sample rate raises the noise of each sample, and not the noise of the mean.
         covered_s = np.minimum(calibration.unit.cycle_time_s * table['count'], window_s)
         mean_white = white / covered_s
         variance = np.maximum(table['variance'] - noise, 0.0) + mean_white
@@ -187,7 +187,7 @@ def columns_of(windows: JudgedWindows, bags: Sequence[str]) -> dict[str, npt.NDA
 
 # A structured array of partial sums of samples, or of windows.
 _Table: TypeAlias = npt.NDArray[Any]
-# Integer fields of a window: `count` is the total over the window's partial sums, the others are
+# Integer fields of a window: `count` is the total over the window's partial sums, other fields are
 # copied from the first partial sum. Fields in `_AVERAGED` and `_TRIPLES` are means over the sums.
 _ONCE = ('bag', 'position', 'start_ns', 'count')
 _AVERAGED = (

@@ -26,12 +26,12 @@ Role = str  # ``accel``, or the name of a thermometer
 
 ROLES: tuple[Role, ...] = ('accel', 'board', 'case')
 
-BLOCK_MESSAGES = 1 << 15  # messages per block; the overhead per block is then negligible
+BLOCK_MESSAGES = 1 << 15  # messages per block: many, so that the overhead per block is negligible
 
-NO_STAMP_NS = -(2**31) * 10**9  # stands for a missing stamp: the earliest that a header can hold
+NO_STAMP_NS = -(2**31) * 10**9  # marks a missing stamp: the earliest stamp of a header [ns]
 _JUMP_NS = 10**9  # a backward step of the stamps by more than this is a jump of the clock [ns]
 LONGEST_PAUSE_NS = 3600 * 10**9  # longer jumps of the stamps are shortened to this length [ns]
-_MOST_JUMPS = 100  # a recording with more jumps of the stamps by over an hour is refused
+_MOST_JUMPS = 100  # largest number of jumps of the stamps by over an hour; more are refused
 _FEWEST_STAMPS = 10  # smallest number of stamps for a warning about their clock
 _APART_S = 10.0  # largest median time between readings and adjacent samples of one clock [s]
 _REPEAT_NS = 10 * 10**9  # `Readings.thinned` keeps a repeated reading after this time [ns]
@@ -69,7 +69,7 @@ class RecordingInfo:
 
     path: Path
     storage: str
-    topics: Mapping[str, tuple[str, int]]  # type (or types joined by ' | ') and number of messages
+    topics: Mapping[str, tuple[str, int]]  # by topic: type (types joined by ' | '), message count
     start_ns: int  # first log time, 0 without messages
     end_ns: int  # last log time, 0 without messages
     truncated: str | None = None  # description of missing parts
@@ -87,14 +87,14 @@ class ImuColumns(NamedTuple):
     """Fields of sensor_msgs/Imu; a writer repeats an array of one row for all messages."""
 
     orientation: Floats  # quaternion x, y, z, w, shape (n, 4)
-    orientation_covariance: Floats  # shape (n, 9), as of the other covariances
+    orientation_covariance: Floats  # each covariance has the shape (n, 9)
     angular_velocity: Floats  # [rad/s], shape (n, 3)
     angular_velocity_covariance: Floats
     linear_acceleration_covariance: Floats
 
     @classmethod
     def of_rate(cls, rate: Floats | None) -> ImuColumns:
-        """Build from angular rates (None: absent); the orientation is marked absent (REP 145)."""
+        """Build fields from angular rates (None: no rates), without an orientation (REP 145)."""
         none, unknown = np.array([-1.0] + 8 * [0.0]), np.zeros(9)
         level = np.array([0.0, 0.0, 0.0, 1.0])
         if rate is None:
@@ -277,8 +277,8 @@ def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
     """
     Turn a jump of the stamps by over an hour, forwards or backwards, into a gap of an hour.
     A clock that is set during a recording can leave a gap of years, too long for a time grid. A
-    gap of an hour suffices to make the thermal state unknown. RecordingError for more than
-    `_MOST_JUMPS` jumps, or if the recording is too sparse (`_LONG_NS`, `_SPARSEST_NS`).
+    gap of an hour suffices to make the thermal state unknown. Raises RecordingError for more than
+    100 such jumps, and for over ten days with less than one message per 10 s on average.
     """
     last_ns: int | None = None
     offset = 0

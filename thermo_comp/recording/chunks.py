@@ -35,7 +35,7 @@ _CHUNK_HEAD = struct.Struct('<BQQQQII')
 _INDEX_HEAD = struct.Struct('<BQHI')
 _INDEX_ROW_BYTES = 16  # log time and offset of one message, 8 bytes each
 MESSAGE_HEAD_BYTES = 31  # number of bytes before the serialized message in a record
-_MESSAGE_FIELDS_BYTES = MESSAGE_HEAD_BYTES - PREFIX.size  # bytes from `PREFIX` to the message
+_MESSAGE_FIELDS_BYTES = MESSAGE_HEAD_BYTES - PREFIX.size  # bytes between `PREFIX` and message
 MESSAGE = int(Opcode.MESSAGE)
 
 #: Reasons why `scan_records` stopped before the end of the data.
@@ -46,7 +46,7 @@ MAX_CHUNK_BYTES = 1 << 26  # largest declared content of a chunk [bytes]
 _MAX_GROWTH = 1024
 _FREE_GROWTH_BYTES = 1 << 26
 _MAX_WINDOW = 1 << 27  # largest window of zstd [bytes]
-_STEP_BYTES = 1 << 16  # bytes decompressed at a time; pieces of this size before damage are kept
+_STEP_BYTES = 1 << 16  # bytes decompressed at a time; whole pieces before a damaged byte are kept
 _ENGINES: Mapping[str, Callable[[], Any]] = {
     'lz4': lz4.frame.LZ4FrameDecompressor,
     'bz2': bz2.BZ2Decompressor,
@@ -80,7 +80,7 @@ def translated(path: Path, *, is_foreign: bool = False) -> Iterator[None]:
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """Part of a file: a chunk, a chunk without end ('torn'), messages outside chunks ('loose')."""
+    """Part of a file: 'chunk', 'torn' (a chunk without its end), 'loose' (no chunk: messages)."""
 
     position: int
     length: int  # number of bytes, without the message indexes after the part
@@ -107,7 +107,7 @@ def parse_chunk_head(head: bytes, position: int) -> tuple[Span, str, int, int]:
 
 
 def load(read_at: Callable[[int, int], bytes], span: Span, on_record: OnRecord) -> Messages:
-    """Read a span of the file and find its messages, in the order of their positions."""
+    """Read a span of the file; find its messages, in the order of their positions in the file."""
     n_bytes = span.length + span.index_length
     try:
         if span.kind == 'chunk' and max(span.size, n_bytes) > MAX_CHUNK_BYTES:
@@ -126,7 +126,7 @@ def load(read_at: Callable[[int, int], bytes], span: Span, on_record: OnRecord) 
             data = inflate(compression, data[data_at:], MAX_CHUNK_BYTES, is_torn=True)
             return scan_records(data, on_record)[0]
         if head.length != span.length or head.size != span.size:
-            raise DamagedError('its size differs from that in the index of the file')
+            raise DamagedError('its size differs from the size in the index of the file')
         data = inflate(compression, data[data_at : span.length], span.size, span.size + 1)
         if len(data) != span.size:
             raise DamagedError(f'{len(data)} bytes after decompression, expected {span.size}')
@@ -183,7 +183,7 @@ def _indexed(data: Bytes, index: memoryview) -> Messages | None:
 
 def scan_records(data: Bytes, on_record: OnRecord) -> tuple[Messages, str]:
     """
-    Read complete records one by one; return the messages, and why reading stopped early, or ''.
+    Read complete records one by one; return the messages, and why reading stopped early, else ''.
     The last message before zeros is dropped: the zeros may have replaced bytes of this message.
     """
     view = data.data

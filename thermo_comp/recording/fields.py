@@ -4,8 +4,8 @@
 Owns the reading of a number inside messages of any type, by the definition of the message type.
 
 A field is named ``TOPIC:FIELD``, as for ``ros2 topic echo --field``. In plain CDR a number begins
-at a multiple of its size after the encapsulation; the length of a string or sequence, a uint32,
-precedes its content. A field is read in all messages of a batch at once.
+at a multiple of its size after the encapsulation. A string or sequence begins with its length, a
+uint32, then comes its content. A field is read in all messages of a batch at once.
 """
 
 import re
@@ -66,7 +66,7 @@ def definitions_of(kind: str, known: Mapping[str, tuple[str, str]]) -> Definitio
 
 
 def temperature_fields(kind: str, known: Mapping[str, tuple[str, str]]) -> list[str]:
-    """List the fields of numbers with `temp` in their names, except minima and maxima."""
+    """List the number fields with `temp` in the name, without those named as minima or maxima."""
     try:
         fields = definitions_of(kind, known)[kind][1]
     except RecordingError:
@@ -83,7 +83,7 @@ def temperature_fields(kind: str, known: Mapping[str, tuple[str, str]]) -> list[
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """A number in messages of the type `kind`, at the end of a `path` of field names."""
+    """A number in messages of type `kind`; `path` has the field names that lead to the number."""
 
     kind: str
     path: str
@@ -140,11 +140,11 @@ class Field:
         return cursor.number(_KINDS[description[1][0]])
 
 
-_BASE, _NAME, _ARRAY = 1, 2, 3  # kinds of fields in `rosbags`; `_NAME`: message, 4: sequence
+_BASE, _NAME, _ARRAY = 1, 2, 3  # kinds of fields in `rosbags`: number or string, message, array
 
 
 class _Cursor:
-    """The offset up to which each message of a batch has been read [bytes after encapsulation]."""
+    """The next byte to read in each message of a batch, counted after the encapsulation."""
 
     def __init__(self, messages: Messages, definitions: Definitions) -> None:
         self._messages, self._definitions = messages, definitions

@@ -31,7 +31,7 @@ _NEVER_NS = 2**63 - 1
 _LEFT = re.compile(r'\.(?P<number>\d+)\.(?P<process>\d+)-[0-9a-f]+\.partial\.mcap')
 _SHARE = 0.2  # largest ratio of the duration of a pass over the bag to the pause after the pass
 
-#: A new block with its serialized messages, and a description of its bag (None: live topics).
+#: A new block with its serialized messages; the description of its bag, None for live topics.
 News = tuple[Block, RecordingInfo | None]
 
 
@@ -90,8 +90,8 @@ def leftovers(folder: Path) -> dict[Path, int]:
 
 def finish(path: Path, number: int) -> Path | None:
     """
-    Copy an unfinished bag to the bag `number` or, if that bag exists, to the largest number + 1;
-    delete the unfinished bag. Return None if no message was copied; RecordingError if unreadable.
+    Move the messages of an unfinished bag to the bag `number` or, if that bag exists, to the
+    largest number + 1. Return the new bag, None without messages; RecordingError for damage.
     """
     with open_recording(path, require=()) as reader:
         numbers = {int(bag.stem) for bag in numbered_bags(path.parent)}

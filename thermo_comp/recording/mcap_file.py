@@ -3,8 +3,8 @@
 """
 Owns the reading of an MCAP file chunk by chunk, in bounded memory.
 
-The summary of a complete file lists its chunks of messages. A file without a usable summary, or
-cut off anywhere, is read record by record, and its messages are counted. The `mcap` library
+The summary of a complete file lists its chunks of messages. A file that is cut off, or has no
+usable summary, is read record by record, and its messages are counted. The `mcap` library
 reads schemas, channels, metadata and the summary.
 """
 
@@ -43,7 +43,7 @@ _MAX_HELD_BYTES = 1 << 26  # largest memory for messages of overlapping chunks [
 #: Texts for a file that ends inside a record, by the record's opcode; -1: any other opcode.
 _CUTS = {
     0: 'it is unreadable from byte {at} on',
-    int(Opcode.CHUNK): 'it ends inside a chunk, of which the first {} messages are read',
+    int(Opcode.CHUNK): 'it ends inside a chunk: of this chunk, the first {} messages are read',
     int(Opcode.MESSAGE_INDEX): 'it ends inside the index of its last chunk; the chunk is complete',
     -1: 'it ends inside a record; all records before it are read',
 }
@@ -249,7 +249,7 @@ class McapFile(BagFile):
 
 def _in_order(pieces: Iterable[tuple[int, Messages, int | None]]) -> Iterator[Messages]:
     """Merge pieces (place in file, messages, first log time of the next piece) by log time."""
-    # Messages before the first log time of the next piece are final; later messages are held.
+    # Messages before the first log time of the next piece are yielded; later messages are held.
     held: dict[int, Messages] = {}
     for row, piece, next_ns in pieces:
         held[row] = piece

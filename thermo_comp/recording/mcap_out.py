@@ -41,8 +41,8 @@ _COMPRESSORS: Mapping[Compression, Callable[[Any, int], Any]] = {
 }
 #: Transient-local topics (a late subscriber gets the last message), without their namespace.
 _LATCHED = tuple(topic.name for topic in OUTPUTS if topic.is_latched)
-_INFINITE = {'sec': 9223372036, 'nsec': 854775807}  # an infinite duration of a QoS profile
-# Typed as any callable: the type hints differ between versions of the `mcap` library.
+_INFINITE = {'sec': 9223372036, 'nsec': 854775807}  # stands for no time limit in a QoS profile
+# The type is any callable, because type hints differ between versions of the `mcap` library.
 _new_builder: Callable[[], Any] = RecordBuilder
 #: Head of a message record: opcode, length, channel, sequence, log time, publish time.
 _RECORD_HEAD = np.dtype('u1, <u8, <u2, <u4, <i8, <i8')
@@ -51,7 +51,7 @@ _INDEX_ROW = np.dtype([('log', '<u8'), ('offset', '<u8')])
 
 @lru_cache(maxsize=64)
 def known_definition(kind: str) -> tuple[str, str, str]:
-    """Return a message type's encoding, text and RIHS01 hash; RecordingError if Jazzy lacks it."""
+    """Return encoding, text and RIHS01 hash of a type; RecordingError for a type not in Jazzy."""
     store = typestore()
     if kind not in store.fielddefs:
         raise RecordingError(f'the definition of message type {kind} is not known')
@@ -81,7 +81,7 @@ class McapOutput:
         self._tail: list[Messages] = []
         self._at = 0
         self._stream = path.open('xb', buffering=0)
-        self.close = self._stream.close  # closes the file without its summary
+        self.close = self._stream.close  # closes the file without writing the summary
         self._put(MAGIC)
         self._put_record(records.Header('ros2', f'thermo_comp {__version__}'))
         if metadata:

@@ -25,15 +25,15 @@ _SDS = 25.0  # smallest distance of a glitch from the mean of its neighbours, in
 _LEAST = 0.02
 _FEWEST = 30  # smallest number of samples that determines the noise, to search for glitches
 _TENTH, _NEVER = -1.2816, 6.7  # standard normal quantiles of the probabilities 0.1 and 1 - 1e-11
-_COLOURED = 0.5  # coloured noise has fewer degrees of freedom than this fraction of white noise's
+_COLOURED = 0.5  # below this ratio of its degrees of freedom to white noise's, noise is coloured
 _FEWEST_FREE = 2.0  # smallest number of degrees of freedom of a cell
-_ITERATIONS = 30  # number of iterations in `spread_of_variances`, of trials in `roughest_at_rest`
+_ITERATIONS = 30  # iterations in `spread_of_variances`; trial values in `roughest_at_rest`
 
 
 def is_glitch(samples: Floats, quantum: Floats) -> Bools:
     """
-    Return which samples, shape (n, 3), are glitches: a glitch is far from its two neighbours, the
-    neighbours agree, and no motion is near. A glitch left in the data would end a rest.
+    Return which samples, shape (n, 3), are glitches: a glitch is far from the samples before and
+    after it, which agree, and no motion is near. A glitch left in the data would end a rest.
     """
     result = np.zeros(len(samples), dtype=bool)
     if len(samples) < _FEWEST:
@@ -83,8 +83,8 @@ def spread_of_variances(cells: Cells, plausible: Bools, level: Floats) -> Floats
 def roughest_at_rest(cells: Cells, quiet: Bools, is_coloured: Bools, ratio: float) -> Floats:
     """
     Return the largest roughness of a cell at rest, per axis; infinite for white noise. `ratio`:
-    largest variance at rest / noise variance. In coloured noise a step does not show in mean and
-    variance, but in the changes from sample to sample. The roughness is assumed chi-square
+    largest variance at rest / noise variance. In coloured noise a step shows in the changes from
+    sample to sample, but not in mean and variance. The roughness is taken as chi-square
     distributed; the ratio of its tenth percentile to its median gives the degrees of freedom.
     """
     result = np.full(3, np.inf)

@@ -23,12 +23,12 @@ from .reader import RecordingReader, open_recording
 from .stillness import STILL_SD, CellAccumulator, Cells, still_intervals, why_restless
 from .topics import PLAIN, Topics, shown
 
-KELVINS = (180.0, 480.0)  # readings probably in kelvins: no board survives as many degC
+KELVINS = (180.0, 480.0)  # readings in this range are taken for kelvins: too hot for any board
 _RAMP_WINDOW_S = 120.0  # time over which the rate of a ramp is averaged [s]
 _CELL_S, _MIN_REST_S = 0.5, 3.0  # lengths of a cell and of the shortest still interval [s]
 _GAP_INTERVALS = 5.0  # shortest gap between samples / median interval in the first block
 _GLITCH_SHARE = 0.01  # largest share of samples of exactly 0 that is taken for glitches
-_FAULT_SHARE = 0.5  # a larger share of messages marked as without acceleration is a fault
+_FAULT_SHARE = 0.5  # largest accepted share of messages marked as without acceleration
 _WITH_GRAVITY = (0.8, 1.25)  # range of |sample| / gravity at rest if samples contain gravity
 _WITHOUT_GRAVITY = 0.3  # largest |sample| / gravity at rest if gravity is subtracted
 _NO_SAMPLES = (
@@ -103,7 +103,7 @@ def thermal_findings(
 
 
 def unused_thermometers(reader: RecordingReader) -> list[str]:
-    """List unused topics that may hold a temperature, such as that of a barometer."""
+    """List unused topics that may hold a temperature, such as a barometer's temperature."""
     candidates = []
     paths = {role: field.path for role, field in reader.fields.items()}
     used = {(name, paths.get(role)) for role, name in reader.topics.items()}
@@ -127,7 +127,7 @@ def survey_recording(
         topic = reader.topics.get('accel')
         total = reader.info.topics[topic][1] if topic else 0
         accumulator, causes = CellAccumulator(_CELL_S, None), CauseCounter()
-        readings: dict[str, list[Readings]] = {}  # kept in memory: far fewer than the samples
+        readings: dict[str, list[Readings]] = {}  # all are kept: they are far fewer than samples
         clock = _Clock()
         for block in reader.blocks():
             for name, temperature in block.temperatures.items():
@@ -171,7 +171,7 @@ class _Clock:
     last_ns: int = 0
     newest_ns: int = 0  # newest stamp since the last restart of the clock
     step_ns: float = 0.0  # median interval of the first stamps that rise
-    n_backwards: int = 0  # number of stamps not later than an earlier stamp since a restart
+    n_backwards: int = 0  # number of stamps that do not exceed all earlier ones since a restart
     n_restarts: int = 0  # number of steps back by more than `LONGEST_PAUSE_NS`
     n_gaps: int = 0
     longest_gap_s: float = 0.0
@@ -185,7 +185,7 @@ class _Clock:
         self.n, self.last_ns = self.n + len(stamp_ns), int(stamp_ns[-1])
         self.earliest_ns = min(self.earliest_ns, int(stamp_ns.min()))
         self.latest_ns = max(self.latest_ns, int(stamp_ns.max()))
-        # After a step back by an hour or less, samples not later than earlier ones are left out.
+        # After a step back by an hour or less, a fit uses only samples after the newest stamp.
         restarts = np.flatnonzero(steps < -LONGEST_PAUSE_NS)
         self.n_restarts += len(restarts)
         for number, part in enumerate(np.split(later, restarts)):
@@ -224,7 +224,7 @@ def survey_thermometer(readings: Sequence[Readings]) -> ThermometerSurvey | None
     stamp_ns, celsius = stamp_ns[use], celsius[use]
     if not len(celsius):
         return None
-    # Temperature rates are taken between two-minute means: one quantum step is then no ramp.
+    # Rates of temperature are taken between two-minute means, so that a quantum step is no ramp.
     time = (stamp_ns - stamp_ns[0]) * 1e-9
     bins = np.maximum(time // _RAMP_WINDOW_S, 0).astype(np.int64)
     mean_time, mean = means_by(bins, np.column_stack((time, celsius))).T
@@ -263,7 +263,7 @@ class CauseCounter:
             self._stamps_ns |= set(np.unique(block.accel_stamp_ns)[:2].tolist())
 
     def cause(self, cells: Cells, still_sd: float) -> str:
-        """Describe why the samples cannot be those of an accelerometer at rest; '' if they can."""
+        """Describe why these samples cannot come from an accelerometer at rest; '' if they can."""
         if self._n_absent > _FAULT_SHARE * self._n:
             return (
                 'the messages are marked as without acceleration '

@@ -3,8 +3,8 @@
 """
 Owns the reader of recordings: opens a bag of any storage, describes it, reads it as columns.
 
-Reading order is that of a ROS player: log time, and for equal log times the position in the file.
-The files of a split bag are read in the order of its metadata.yaml.
+Messages are read in the order of a ROS player: by log time, with equal log times by the position
+in the file. The files of a split bag are read in the order in its metadata.yaml.
 """
 
 import re
@@ -52,9 +52,9 @@ _BATCH_MESSAGES, _BATCH_BYTES, _BATCH_NS = 1 << 14, 1 << 23, 10 * 10**9
 class RecordingReader(ExitStack):
     """
     An open bag: a rosbag2 directory, a bare ``.mcap`` or ``.db3`` file, or a ROS 1 ``.bag``.
-    A role is ``accel`` or the name of a thermometer; the roles in `require` must be in the bag.
-    After all blocks are read, `info.truncated` names the missing messages. The keys of `topics`
-    and `fields` are roles; the keys of `definitions` (encoding and text) are message types.
+    A role is ``accel`` or the name of a thermometer; the bag must have topics for the roles in
+    `require`. After all blocks are read, `info.truncated` names the missing messages. The keys of
+    `topics` and `fields` are roles; `definitions` has encoding and text of each message type.
     Raises RecordingError if the file is not a bag, is damaged, or a topic is missing or ambiguous.
     """
 
@@ -73,7 +73,7 @@ class RecordingReader(ExitStack):
                 self.topics: Mapping[Role, str] = selected.topics
                 self.fields = dict(self._fields(selected))
             bare = ', '.join(role for role, field in self.fields.items() if not field.header)
-            note = f'readings of {bare} have no stamp: each gets that of the sample before it'
+            note = f'readings of {bare} have no stamp: each gets the stamp of the sample before it'
             chosen = _notes(selected.chosen, note if bare else '')
             self.info = replace(self.info, input=selected.input, chosen=chosen)
         except BaseException as error:
@@ -276,7 +276,7 @@ def _described(path: Path) -> _Description:
 
 
 def _read_metadata(directory: Path) -> _Description | None:
-    """Read a bag's metadata.yaml; None if it is missing or empty, as after a killed recorder."""
+    """Read a bag's metadata.yaml; None for a missing or empty file, as after a recorder's kill."""
     path = directory / 'metadata.yaml'
     try:
         text = read_bounded(path, _MAX_BYTES)
@@ -314,7 +314,7 @@ def _read_metadata(directory: Path) -> _Description | None:
 
 
 def _place_of(file: Path) -> tuple[int, str]:
-    """Return the sort key of a file of a split bag: the number that ends its name, its name."""
+    """Return the sort key of a file of a split bag: number at the end of its name, its name."""
     number = re.search(r'_([0-9]+)$', file.stem)
     return (int(number[1]) if number else 0, file.name)
 
@@ -329,7 +329,7 @@ def _loss(topic: str, n_read: int, n_promised: int) -> str:
 
 
 class ForeignFile(BagFile):
-    """A file read by `rosbags`: sqlite3, ROS 1, MCAP with compressed messages (`is_packed`)."""
+    """A file read by `rosbags`: SQLite, ROS 1, or MCAP with compressed messages (`is_packed`)."""
 
     def __init__(self, path: Path, name: Path, is_packed: bool) -> None:
         from rosbags.rosbag1 import Reader as Reader1

@@ -24,22 +24,22 @@ from .noise import is_glitch, roughest_at_rest, spread_of_variances
 #: Largest variance of a cell at rest (30 samples or more) / the bag's noise variance: white noise
 #: exceeds 4 with a probability below 1e-11, and vibration that must be cut out is far above 4.
 VARIANCE_RATIO = 4.0
-#: Largest sd of samples at rest [g]: above the noise of any sensor, below that of most flights.
+#: Largest sd of samples at rest [g]: above any sensor's noise, below the sd of most flights.
 STILL_SD = 0.05
 _STILL_RATE_SD = np.radians(2.0)  # largest sd of the angular rate in a cell at rest [rad/s]
-_STILL_RATE = np.radians(1.0)  # largest mean angular rate of a cell less its bias [rad/s]
+_STILL_RATE = np.radians(1.0)  # largest mean angular rate of a cell less the rate's bias [rad/s]
 _LEVEL_S = 120.0  # the bias of the angular rate is interpolated between medians over this time [s]
 _ROTATION_S = 10.0  # `without_rotation` subtracts the median angular rate over this time [s]
 _STEP_SDS = 8.0  # smallest step between adjacent cells that ends a rest, in robust sd of steps
 _DRIFT_STEPS, _DRIFT = 9, 5e-5  # number of steps whose median is the drift; largest drift [g/s]
 _QUANTUM_SAMPLES = 20000  # number of samples that are searched for a quantum
 _STEPS_NEEDED = 10  # smallest number of changes that prove a quantum if each is a multiple of it
-STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # one of these numbers of windows has a whole number of cells
+STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # whole cells fill one of these numbers of windows exactly
 _LONGEST_CELL_NS = 86400e9  # largest length of a cell, reached only with wrong stamps [ns]
 MIN_SAMPLES = 30  # usual smallest number of samples in a cell
 _LARGEST = 1e100  # largest valid sample: squares of larger samples may overflow
 _WORD = 32768.0  # middle of the range of unsigned 16-bit numbers
-_LONGER = (23, 31)  # numbers of bits of 24- and 32-bit words, without the sign
+_LONGER = (23, 31)  # numbers of bits of 24- and 32-bit words without the sign bit
 _STUCK = 0.3  # ratio of the noise's sd to the quantum below which most samples are equal
 
 
@@ -75,8 +75,8 @@ class Cells:
 
 class CellAccumulator:
     """
-    Reduces streamed samples to cells of `cell_s`, or of `least` samples if these last longer.
-    A whole number of cells fills `window_s` or, if a cell is longer, 2 to 60 times `window_s`.
+    Reduces streamed samples to cells that last `cell_s`, or as long as `least` samples if longer.
+    Whole cells fill `window_s`, or 2 to 60 times `window_s` if a cell is longer than `window_s`.
     Samples of `full_scale` or more are saturated and dropped.
     """
 
@@ -93,7 +93,7 @@ class CellAccumulator:
         self._last_ns: int | None = None
         self._last = np.zeros((0, 3))  # last sample of the previous block
         self._shift = np.zeros(3)
-        # Columns of a cell's row: its number; number of samples; sums of the times, of samples
+        # Columns of a cell's row: number of the cell; number of samples; sums of times, of samples
         # (and rates) and of their squares; change of the samples from the cell before; sums of
         # squared changes from sample to sample. The last row changes while samples are added.
         self._sums: list[Floats] = [np.empty((0, 15))]
@@ -177,7 +177,7 @@ class CellAccumulator:
         )
 
     def _look_for_sign(self, samples: Floats) -> None:
-        """Detect unsigned 16-bit words: whole numbers, none negative, some beyond 32768."""
+        """Detect unsigned 16-bit words: samples are whole numbers, none negative, some > 32768."""
         self._is_negative |= bool((samples < 0.0).any())
         if not self._is_negative and np.max(samples, initial=0.0) > _WORD:
             is_word = (samples == np.rint(samples)) & (samples < 2.0 * _WORD)
@@ -257,7 +257,7 @@ def _quantum_of(samples: Floats, few: list[Floats]) -> Floats:
         if len(changes) < 3:
             continue
         # Changes by an equal number of quanta differ by rounding only. The smallest change is the
-        # quantum if all changes are whole multiples of it, or have only a few distinct values.
+        # quantum if all changes are its whole multiples, or if there are few distinct changes.
         n_levels = 1 + int(np.sum(np.diff(changes) > 0.1 * changes[0]))
         steps = changes / changes[0]
         is_whole = len(changes) >= _STEPS_NEEDED and (np.abs(steps - np.rint(steps)) < 0.1).all()

@@ -89,9 +89,9 @@ class Topics:
     """
     Topics of the inputs in a bag, the choice of counts or Imu, and the part to read.
     A name matches with or without its leading slash and, if only one topic fits, with any
-    namespace. If no topic has the default name of an input other than `case`, the only topic of
-    the input's type is used: for samples, an Imu (imu/data_raw first) before counts. Thermometers
-    besides board and case: `further`, and ``temperature/<name>`` in the board topic's namespace.
+    namespace. An input other than `case` without a topic of its default name uses the only topic
+    of its type; for samples, an Imu (imu/data_raw first) before counts. `further` and topics
+    ``temperature/<name>`` in the board topic's namespace are thermometers besides board and case.
     A thermometer's reading may be a field, ``TOPIC:FIELD``, as for ``ros2 topic echo --field``.
     """
 
@@ -137,7 +137,7 @@ _USUAL = Topics()
 
 
 class Selected(NamedTuple):
-    """Topic and field of each role; `input`: kind of the samples; `chosen`: notes on topics."""
+    """Topic and field of each role; kind of the samples; notes on topics chosen by their type."""
 
     topics: dict[Role, str]
     fields: dict[Role, str]
@@ -173,12 +173,12 @@ def is_thermometer(name: str) -> bool:
 
 
 def shown(name: str) -> str:
-    """Return a name from a bag as safe to print: shortened, without control characters."""
+    """Return a name from a bag for a message: shortened, without control characters."""
     return one_line(name if len(name) <= _MAX_SHOWN else name[:_MAX_SHOWN] + '...')
 
 
 def choice_note(name: str, key: str, wanted: str, among: str) -> str:
-    """Return the note that a topic was chosen by its type; '' if its name is the wanted one."""
+    """Return the note that a topic was chosen by its type; '' for a topic of the wanted name."""
     if is_called(name, split_field(wanted)[0]):
         return ''
     kind = _TYPES[key].rpartition('/')[2]
@@ -278,7 +278,7 @@ def _text_of_corrected(name: str) -> str:
 
 
 def _text_of_unnamed(present: Present, board: str, taken: Collection[str]) -> str:
-    """Return advice on unused temperature topics, one of which may be the board's, or ''."""
+    """Return advice that an unused temperature topic may be the board's; '' if all are used."""
     names = sorted(shown(name) for name in of_kind(present, TEMPERATURE) if name not in taken)
     among = ' or '.join(names)
     text = f'no {board}: if the board thermometer is {among}, give --topic board=TOPIC'

@@ -50,7 +50,7 @@ def decode_blocks(
     Decode messages in their order; a block ends where `frame_id` changes. `channels`: for
     each role, the topic of each channel number; `fields`: the field with a thermometer's reading.
     A temperature in a field of another message type is in `raw` as a Temperature message.
-    RecordingError, without a path, if the bytes do not fit the message type.
+    Raises RecordingError, without a path, if the bytes do not fit the message type.
     """
     is_imu = any(topic.type == IMU for topic in channels.get('accel', {}).values())
     temperatures, log_ns, raw = {}, {}, {}
@@ -144,8 +144,8 @@ def encode_stamped(
 ) -> Bytes:
     """
     Serialize (CDR, little-endian) a header and float64 numbers as rows of bytes, shape (n, size).
-    A piece has the indices of its numbers in a message, and their values, of shape (n, width), or
-    (width,) if equal in all messages; numbers that are in no piece are 0.
+    A piece is a slice of the numbers of a message and their values, of shape (n, width), or
+    (width,) if equal in all messages. Numbers of a message that are in no piece are 0.
     """
     text = frame_id.encode() + b'\0'
     head = pack('<BBHiII', 0, 1, 0, 0, 0, len(text)) + text

@@ -39,8 +39,8 @@ class BagWriter(AbstractContextManager['BagWriter']):
     Write a bag, ``*.mcap`` or a rosbag2 directory; use the writer as a context manager.
     Messages are buffered until they have 64 MiB or `flush` is called, and then merged in log-time
     order. If `is_precious`, a bag that cannot be finished is kept. A killed process leaves an
-    unfinished bag under a hidden name beside the target. Raises OutputError if the bag may not or
-    cannot be written; ValueError for wrong shapes and for times outside the range of ROS stamps.
+    unfinished bag under a hidden name beside the target. Raises OutputError if the bag cannot or
+    may not be written; ValueError for wrong shapes, and for times outside the range of ROS stamps.
     """
 
     def __init__(
@@ -122,7 +122,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
         messages: Sequence[bytes] | Messages,
         definition: tuple[str, str] | None = None,
     ) -> None:
-        """Write serialized (CDR) messages; a type unknown to ROS 2 Jazzy needs a `definition`."""
+        """Write serialized (CDR) messages; `definition` is needed for types not in ROS 2 Jazzy."""
         times = _as_times('log_ns', log_ns, len(messages))
         if not isinstance(messages, Messages):
             messages = Messages.of(messages, np.zeros(len(messages)), times)
@@ -244,7 +244,7 @@ def table_writer(
     """
     Write a table in the format of its suffix (`TABLES`, else CSV); the file appears when complete.
     Yields a function that appends columns by name, shape (n,), with the same names in each call.
-    CSV drops the metadata. OutputError if the table cannot be written, or pyarrow is missing.
+    A CSV has no metadata. Raises OutputError if the table or its format cannot be written.
     """
     kind = TABLES.get(Path(path).suffix, CSV)
     with drafted(path, kind, overwrite=overwrite) as partial, ExitStack() as stack:

@@ -51,8 +51,8 @@ class Curve(NamedTuple):
     """
     Bias [micro-g] and scale [ppm] of x, y, z in a soak or ramp, shape (n, 6), and their sd.
 
-    `value` is the difference from a soak at the reference temperature; `sd` is the sd of bias and
-    scale, not of the difference.
+    `value` is the bias or scale less its value in a soak at the reference temperature; `sd` is the
+    sd of bias and scale, not of this difference.
     """
 
     program: Program
@@ -85,9 +85,9 @@ class AxisOverTemperature(NamedTuple):
     bias and scale in a soak [micro-g/K, ppm/K].
 
     Cells of a row, as rounded texts: soak or ramp; temperature [degC]; bias, its expanded
-    uncertainty and its deviation [micro-g]; scale relative to that at the reference temperature,
-    its expanded uncertainty and its deviation [ppm]. A deviation is the bias or scale less a
-    straight line of the fitted slope through the value in a soak at the reference temperature.
+    uncertainty and its deviation [micro-g]; scale relative to the scale at the reference
+    temperature, its expanded uncertainty and its deviation [ppm]. A deviation is the bias or scale
+    less a line of the fitted slope through its value in a soak at the reference temperature.
     """
 
     axis: str
@@ -137,7 +137,7 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
 
 
 def unclaimed_gravity_sd(evidence: Evidence, info: CertificateInfo) -> float | None:
-    """Return the part of gravity's sd that the covariance lacks [m/s^2]; None if not stated."""
+    """Return the sd of gravity that the covariance lacks [m/s^2]; None without a stated sd."""
     stated = info.gravity.standard_uncertainty_m_s2
     if stated is None:
         return 0.0 if evidence.gravity_sd else None
@@ -239,7 +239,7 @@ def _gravity_part(evidence: Evidence, info: CertificateInfo) -> float:
 
 
 def conformity(evidence: Evidence) -> tuple[str, str]:
-    """Return the statement of conformity and its rule; '' and a reason if none is made."""
+    """Return the statement of conformity and its rule; without a statement, '' and the reason."""
     judgement = evidence.judgement
     if judgement is None:
         return '', 'No recording was judged: no statement of conformity is made.'

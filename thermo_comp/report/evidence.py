@@ -369,7 +369,7 @@ def shown_bag(bag: ReducedBag, index: int, detector: DetectorSettings) -> ShownB
         rows.append((b.rate, b.var_rate, c.rate, c.var_rate, *lead.acceleration))
         flags.append((tracker.detector.regime, tracker.detector.direction))
     time: Floats = np.array([stamp_ns - start_ns for _, stamp_ns, _ in readings]) * 1e-9
-    # The same time may have several regimes: the last one applies. Equal successive regimes are
+    # Of several regimes at the same time, the last regime applies. Equal successive regimes are
     # joined.
     state_at = {
         0.0: (Regime.UNKNOWN, 0),

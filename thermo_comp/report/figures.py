@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the figures: of bags over time, like the paper's Fig. 3, 4, 6 and 7, and by position; of a
-calibration over temperature; of a fleet.
+Owns the figures of bags over time (like Fig. 3, 4, 6 and 7 of Golovach's paper) and by position,
+of a calibration over temperature, and of a fleet.
 """
 
 from collections.abc import Mapping, Sequence
@@ -47,7 +47,7 @@ _LABEL: style.Line = {'textcoords': 'offset points', 'fontsize': 7.5}
 
 
 def draw_temperatures(evidence: Evidence) -> Figure:
-    """Draw the readings of case and board thermometer (the paper's Fig. 3)."""
+    """Draw the readings of case and board thermometer (Fig. 3 of Golovach's paper)."""
     figure, (axes,), shown, unit = _panels(evidence, [2.5])
     for label, readings, line in (
         ('T case', shown.bag.case, style.CASE_LINE),
@@ -62,7 +62,7 @@ def draw_temperatures(evidence: Evidence) -> Figure:
 
 
 def draw_dynamics(evidence: Evidence) -> Figure:
-    """Draw drift, derivatives of the temperatures and regime flag (the paper's Fig. 4 a, b, c)."""
+    """Draw drift, derivatives of the temperatures, and regime flag (Golovach's Fig. 4 a, b, c)."""
     drift, name = _drift(evidence)
     heights = [1.725] * bool(len(drift)) + [1.495, 1.15, 0.8625]
     figure, panels, shown, unit = _panels(evidence, heights, is_flagged=True)
@@ -90,7 +90,7 @@ def draw_dynamics(evidence: Evidence) -> Figure:
 
 
 def draw_residuals(evidence: Evidence) -> Figure:
-    """Draw the residual of each axis, without and with the calibration (the paper's Fig. 6)."""
+    """Draw the residual of each axis, without and with the calibration (Golovach's Fig. 6)."""
     residuals = evidence.axis_residuals()
     rows = _rows(evidence)
     dynamic = required(evidence.windows).is_dynamic[rows]
@@ -116,7 +116,7 @@ def draw_residuals(evidence: Evidence) -> Figure:
 
 
 def draw_gravity(evidence: Evidence) -> Figure:
-    """Draw |f| - g over time: raw and corrected, then corrected alone (the paper's Fig. 7)."""
+    """Draw |f| - g over time: raw and corrected, then corrected alone (Golovach's Fig. 7)."""
     residuals = evidence.residuals
     corrected = [name for name in residuals if name != RAW]
     sets = [forces for forces in (list(residuals), corrected) if forces]
@@ -138,7 +138,7 @@ def _panels(
 ) -> tuple[Figure, list[Axes], ShownBag, float]:
     """
     Return a figure, its panels over time, the bag that they show, and the unit of time [s].
-    `more`: height besides the panels [in]; `is_flagged`: the last panel, the flag, is not shaded.
+    `more`: height besides the panels [in]; `is_flagged`: the last panel has the flag, not shaded.
     """
     shown = required(evidence.shown)
     unit, name = style.time_unit(shown.duration_s)
@@ -353,8 +353,8 @@ def _draw_less_line(
 def soak_measurements(evidence: Evidence) -> tuple[Floats, Floats]:
     """
     Average the residual in each soak of each position. Return temperatures (n,), and the residual
-    as an error of the bias [micro-g] and of the scale [ppm], (n, 6). The error of the scale is NaN
-    if the force along the axis is below half of gravity.
+    as an error of the bias [micro-g] and as an error of the scale [ppm], (n, 6). The error of the
+    scale is NaN if the force along the axis is below half of gravity.
     """
     windows, residual = evidence.windows, evidence.axis_residuals().get(CHOSEN)
     if windows is None or residual is None:

@@ -105,7 +105,7 @@ def load_certificate_info(path: str | Path, serial: str | None = None) -> Certif
         info = build(CertificateInfo, {} if data is None else data)
         if serial and info.unit.serial and info.unit.serial != serial:
             raise SchemaError(
-                'unit.serial', f'must be that of the calibration, {serial}, got {info.unit.serial}'
+                'unit.serial', f'must be {serial}, as in the calibration, got {info.unit.serial}'
             )
     except ValueError as error:
         raise ThermoCompError(f'{path}: {error}') from error

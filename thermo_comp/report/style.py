@@ -82,7 +82,7 @@ _WIDTH = 7.1  # width of a figure and of the text of a printed page [in]
 
 
 def drawing() -> AbstractContextManager[None]:
-    """Return a context in which matplotlib uses the style of the report, not that of the user."""
+    """Return a context in which matplotlib uses the report's style, not the user's settings."""
     return style.context(_RC, after_reset=True)
 
 
@@ -225,7 +225,7 @@ def spelt(text: str) -> str:
 
 
 def rounded(value: float, expanded: float) -> tuple[str, str]:
-    """Round an uncertainty to two digits, the value to the same place; '–' if unknown."""
+    """Round an uncertainty to two digits ('–': unknown), and the value to the same place."""
     if not 0.0 < expanded < math.inf:
         return number(value, 6), '–'
     place = 1 - math.floor(math.log10(expanded))

@@ -88,7 +88,7 @@ def parse_cyclogram(text: str) -> Cyclogram:
     Steps are separated by commas, semicolons or lines: ``TARGET[@RATE] [SOAK]`` with the target in
     degC, the rate in K/min and the soak as ``90min``, ``1.5h`` or ``30s``. The first step is the
     starting temperature and takes no rate; a later step without a rate keeps the last rate (1
-    K/min if none was given). Example: ``20 30min, 35@0.5 1h, 5@1 1h, 20``.
+    K/min at first). Example: ``20 30min, 35@0.5 1h, 5@1 1h, 20``.
     """
     text = _PROGRAMS.get(text.strip(), text)
     time, temperature, rate = [0.0], list[float](), 1.0
@@ -198,9 +198,10 @@ def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
     """
     Return the positions of a test in recording order: 'chamber-18' (18 positions of 9.5 h),
     'chamber-9' (9 positions of 3 h), 'tumble' (18 positions of 20 min at room temperature),
-    'tumble-3' or 'tumble-1' ('tumble', then 3 positions or 1 of 3 h in the chamber), 'held-out' (3
-    positions with ramps and attitudes of no other plan), 'centrifuge', 'rate-table' (12 mountings,
-    at rest and at four rotation rates in three soaks). `seed` sets attitudes and temperatures.
+    'tumble-3', 'tumble-1' ('tumble', then 3 positions, or 1 position, of 3 h in the chamber),
+    'held-out' (3 positions with ramps and attitudes of no other plan), 'centrifuge', 'rate-table'
+    (12 mountings, at rest and at four rotation rates in three soaks). `seed` sets attitudes and
+    temperatures.
     """
     if name not in PLAN_NAMES:
         raise ValueError(f'`name` must be one of {", ".join(PLAN_NAMES)}, got {name!r}')

@@ -37,7 +37,7 @@ class PartHistory:
     step: float
 
     def of(self, part: str) -> Floats:
-        """Return the temperature of a part less that in the reference state [K], shape (m,)."""
+        """Return a part's temperature less its temperature in the reference state [K], (m,)."""
         return self.deviation[:, self.nodes.index(part)]
 
 
@@ -47,7 +47,7 @@ class Effect(ABC):
     Base class of the causes of thermal errors. Two signals, `first` and `second`, change the bias
     of each axis by ``bias * first + bias_curvature * second``, and the scale likewise.
 
-    The coefficients of the bias are in ug, those of the scale in ppm, per unit of the signal.
+    The coefficients are in ug (bias) or ppm (scale) per unit of the signal.
     """
 
     scale: Triple = ZERO
@@ -70,8 +70,8 @@ class Effect(ABC):
 class PartEffect(Effect):
     """
     Temperature coefficient of a part, or stress or thermo-EMF between two parts. The two signals
-    are the temperature d of `part` less that in the reference state [K], and d^2; if a part `cold`
-    is given, each less the same signal of `cold`.
+    are d and d^2; d is the temperature of `part` less its temperature in the reference state [K].
+    If a part `cold` is given, the same signals of `cold` are subtracted.
     """
 
     part: str
@@ -90,11 +90,11 @@ class FlowEffect(Effect):
     """
     Effect of the size of a heat flow between two parts, less its effect in the reference state.
 
-    With ``x = |T_hot - T_cold| / knee`` and ``flow = x ** exponent`` the first signal is ``flow``,
-    less that in the reference state, times ``d ** power``; d is the temperature of `cold` less
-    that in the reference state [K]. The second signal is the first times the difference d. The
+    With ``x = |T_hot - T_cold| / knee`` and ``flow = x ** exponent`` the first signal is ``flow``
+    less its value in the reference state, times ``d ** power``; d is the temperature of `cold`
+    less its temperature in the reference state [K]. The second signal is the first times d. The
     exponent is 1.25 for convection in a gap, 1 for the load of a heat pump, 2 for the losses of a
-    heat pump. If `is_limited`, like the supply of a heat pump, ``flow / (1 + flow)`` replaces
+    heat pump. If `is_limited` (a heat pump has a limited supply), ``flow / (1 + flow)`` replaces
     ``flow``.
     """
 
@@ -120,7 +120,7 @@ class FlowEffect(Effect):
 
 @dataclass(frozen=True)
 class CreepEffect(Effect):
-    """Creep in a part: its temperature less that temperature lagged by `time_constant` [s]."""
+    """Creep in a part: its temperature less its temperature lagged by `time_constant` [s]."""
 
     part: str
     time_constant: float

@@ -79,7 +79,7 @@ class Specimen:
 
     def triad(self, network: ThermalNetwork, drift: Iterable[Effect], **others: Any) -> UnitModel:
         """Return a triad of bare sensor heads on a board, with random constants."""
-        # At 4 Hz, noise of 3 ug/sqrt(Hz) and rounding give means over 60 s an sd of 0.65 ug.
+        # At 4 Hz, means over 60 s have an sd of 0.65 ug: noise of 3 ug/sqrt(Hz), and rounding.
         noise: dict[str, Any] = {'noise_density': (3.0, 3.0, 3.0), 'full_scale_g': 9.975}
         return self.unit(network, tuple(drift), bias_ug=1500.0, **noise, **others)
 

@@ -232,7 +232,7 @@ def _thermal_truth(unit: UnitModel, cyclogram: Cyclogram, seed: int) -> Truth:
 
 
 def _switched(load: SwitchedLoad, knots: Floats, seed: int) -> tuple[Floats, Bools]:
-    """Add a load's switching times to `knots` [s]; return also in which intervals it is on."""
+    """Add a load's switching times to `knots` [s]; return whether the load is on between knots."""
     n = 2 + int(knots[-1] // load.spell[0])
     flips = np.cumsum(generator(seed, Stream.LOAD).uniform(*load.spell, size=n))
     fine = np.unique(np.concatenate([knots, flips[flips <= knots[-1]]]))

@@ -31,8 +31,8 @@ _ROWS = 1 << 20
 class Stream(IntEnum):
     """
     Sources of random numbers, such as the noise of the accelerometer. Each source has a separate
-    stream, so that numbers drawn from one source do not change those of another. The value of a
-    source must never change or be reused, because it determines the random numbers of a seed.
+    stream: numbers drawn from one source do not change the numbers of other sources. The value of
+    a source must never change or be reused: it determines the random numbers of a seed.
     """
 
     ACCEL_NOISE = 0
@@ -98,7 +98,7 @@ def rounded(charge: Floats, remainder: Ints) -> tuple[NDArray[np.int32], Ints]:
 class ThermometerModel:
     """
     A thermometer on a part: ``reading = quantum * round((T + noise) / quantum)``; a quantum of 0
-    means no rounding. `phase`: time of the first reading in reading intervals, 0..1.
+    means no rounding. `phase`: time of the first reading / interval between readings, 0..1.
     """
 
     node: str
