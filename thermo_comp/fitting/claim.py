@@ -187,7 +187,12 @@ def _widened(
     prior, state = _with_unseen(regression, posterior, typical), posterior.state
     if of_means is None:
         with_unseen = regression.solve(state, prior, n_steps=0)
-        return with_unseen.layout, with_unseen.covariance.copy()
+        layout = with_unseen.layout
+        # The added columns have the weight 0 in the fit: add the squares of the weights that the
+        # data prefer, and of the changes of the other unknowns with these weights. The prior sd
+        # of a weight, at most the sd by the data, at least halves the weight in this step.
+        step = 2.0 * regression.at(state, prior).solution[0][: layout.n_unit]
+        return layout, with_unseen.covariance + np.outer(step, step)
     # The drifts of warm-ups within the positions determine the chosen curve. A warm-up heats the
     # board in another way than a chamber does, so the curve fitted to the positions' means is an
     # alternative: half of the squared difference of the curves is added to the covariance. Columns
