@@ -34,7 +34,7 @@ from .gains import log_bayes_factors
 from .initial_triad import white_noise_of
 from .regression import PosteriorMode, Regression
 from .unknowns import POSE_SD, Noise, Prior, State
-from .windows import BEND, LAGS, PRODUCTS
+from .windows import BEND
 
 #: Degrees of freedom of the half-Student prior of the sd of mounting offsets, as in [2]_.
 STUDENT_NU = 4.0
@@ -318,18 +318,10 @@ def _pruned(regression: Regression, posterior: PosteriorMode, candidates: Candid
     is_kept = candidates.fixed | candidates.forced | candidates.fixed[1]
     droppable = np.argwhere((prior.column_sd > 0.0) & ~is_kept).tolist()
     column_sd, weight_sd = prior.column_sd.copy(), regression.weight_sd(prior)
-    windows = regression.windows
-    is_lag = np.isin(windows.groups, LAGS) & (windows.lag >= 0)
-    is_product = np.isin(windows.groups, PRODUCTS)
     while droppable:
         part, column = np.array(droppable).T
         places = layout.weights[part, :, column]
         gains = log_bayes_factors(mode, covariance, places, weight_sd[part, :, column])
-        # A product t m of temperature and lag can replace the lag m at the rates of one chamber
-        # program, but not at others: a model with products keeps a lag (marginality, [3]_).
-        used = column_sd > 0.0
-        is_last = (used & is_product).any(axis=1) & ((used & is_lag).sum(axis=1) == 1)
-        gains[(used & is_lag & is_last[:, np.newaxis])[part, column]] = np.inf
         weakest = int(np.argmin(gains))
         if gains[weakest] >= LEAST_GAIN:
             break

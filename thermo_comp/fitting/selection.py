@@ -227,9 +227,6 @@ class Growth:
         together = PRODUCTS, (*LAGS, 'product', 'gradient_x_temperature', 'square')
         sets = [tuple(group for group in groups if group in absent) for groups in together]
         sets = [*((group,) for group in absent), *(groups for groups in sets if len(groups) > 1)]
-        if {*LAGS} & {*absent} and not {*LAGS} & {*chosen.groups}:
-            # Products and powers of lags are tried only in a model with lags (marginality).
-            sets = [each for each in sets if {*LAGS} & {*each} or not {*PRODUCTS} & {*each}]
         gains = {groups: inactive.gain(typical, np.isin(self._names, groups)) for groups in sets}
         likely = [groups for groups in sets if gains[groups] > CLEAR_GAIN]
         likely.sort(key=gains.__getitem__, reverse=True)
@@ -316,17 +313,7 @@ def _grown(
         trials = growth.with_bends(first, ('board', *PRODUCTS))
         growth.tried += trials
         chosen = _best(chosen, trials)
-    chosen = growth.added(chosen, progress)
-    may_bend = BEND in growth.free and {*PRODUCTS} & {*chosen.groups}
-    if may_bend and BEND not in chosen.groups and not chosen.is_complete:
-        # A bend of the curve over a part's temperature is found only in a model with the part's
-        # lag, not in a model that approximates the lag by products and squares. Add groups to a
-        # model with lags and bends if its error is below three times that of the chosen model.
-        _, *with_bends = growth.with_bends(first, LAGS)
-        if with_bends and with_bends[0].score.rms < 3.0 * chosen.score.rms:
-            growth.tried += with_bends
-            chosen = _best(chosen, [growth.added(with_bends[0], progress)])
-    return chosen
+    return growth.added(chosen, progress)
 
 
 def fit_all(
