@@ -14,6 +14,7 @@ from thermo_comp.fitting import FitOptions, fit_bags, reduce_bag
 from thermo_comp.fitting.claim import claim_of
 from thermo_comp.fitting.initialisation import Problem, _candidates
 from thermo_comp.fitting.options import sets_of
+from thermo_comp.fitting.raw_checks import judge_missing
 from thermo_comp.fitting.reduction import Readings
 from thermo_comp.fitting.windows import N_SECTIONS, Model, thermal_windows
 from thermo_comp.simulation.campaign import Position, parse_cyclogram, positions
@@ -56,9 +57,12 @@ def test_a_rest_partly_in_the_range_of_the_model_is_used_there_only(bags):
     lower, upper = np.quantile(everything.temperature, (0.3, 0.7))
     for range_c, is_used in (((lower, upper), True), ((90.0, 95.0), False)):
         model = replace(everything.model, range_c=range_c)
-        board = thermal_windows(bags, model, everything.tracks).temperature
+        windows = thermal_windows(bags, model, everything.tracks)
+        board = windows.temperature
         assert (len(board) < len(everything.temperature)) == is_used
         assert (board.min() >= lower and board.max() <= upper) == is_used
+        # WHY: samples beyond the range were reported as samples without temperatures.
+        assert not list(judge_missing(bags, windows))
 
 
 def test_the_sets_differ_only_with_soaks_at_several_temperatures(bags):
