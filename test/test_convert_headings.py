@@ -139,6 +139,9 @@ def test_the_accelerometer_is_chosen_among_several_triads_of_a_table():
         ('t [s],ax [g],ay [g],az [g],T [°C]', 'ax [g]', ('s', 'g', 'degC')),
         ('t,imu0_ax,imu0_ay,imu0_az,T_board,T_case', 'imu0_ax', ('', '', 'degC')),
         ('elapsed_h,ax,ay,az,temp (°F)', 'ax', ('h', '', 'degF')),
+        # The `g` at the end was read as a gyroscope's letter: "column 'ax_g' is given twice".
+        ('time,ax_g,ay_g,az_g,temp', 'ax_g', ('', 'g', 'degC')),
+        ('t,acc_x_g,acc_y_g,acc_z_g,gx_dps,gy_dps,gz_dps,temp', 'acc_x_g', ('', 'g', 'degC')),
         # Headings that PlotJuggler writes for sensor_msgs/Imu, and those of the EuRoC data sets.
         ('__time,/imu/angular_velocity/x,/imu/angular_velocity/y,/imu/angular_velocity/z,'
          '/imu/linear_acceleration/x,/imu/linear_acceleration/y,/imu/linear_acceleration/z,temp',

@@ -15,6 +15,7 @@ from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.reduction import reduce_source
 from thermo_comp.fitting.sensors import gradients_at_rest
+from thermo_comp.fitting.sources import KnownForce, Section
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.simulation.campaign import Position, parse_cyclogram, plan, positions
@@ -323,3 +324,18 @@ def test_a_named_group_without_columns_is_reported(rng):
     assert 'no columns of part,' in texts[0]
     known = fit(bags, replace(options, groups=('curve',)))
     assert all(finding.name != 'groups' for finding in known.findings)
+
+
+@pytest.mark.parametrize(('ratio', 'is_reported'), [(1.0, False), (1.0005, True)])
+def test_a_stated_norm_that_the_fit_ignores_is_reported(rng, ratio, is_reported):
+    # WHY: bags with a stated |f| of 9.8155 m/s^2 and gravity of 9.80665 m/s^2 gave scale factors
+    # with an error of 902 ppm, without a message.
+    known = KnownForce('stated', (Section(0.0, np.inf, ratio * STANDARD_GRAVITY, 0.0),))
+    bags = [
+        replace(recorded(rng, up, f'p{k}', (20.0, 30.0, 20.0)), force=known)
+        for k, up in enumerate(positions(3, 3))
+    ]
+    options = FitOptions(gravity=STANDARD_GRAVITY, input='m/s^2', groups=('curve',))
+    texts = [str(each) for each in fit(bags, options).findings if each.name == 'gravity']
+    assert bool(texts) == is_reported
+    assert all('an error of 500 ppm if gravity is wrong' in text for text in texts)

@@ -285,6 +285,23 @@ def test_a_position_that_alone_determines_a_parameter_has_no_left_out_norm(rng):
     np.testing.assert_allclose(np.sqrt(mode.variance[places]), 1e-3, rtol=1e-3)
 
 
+def test_a_damped_step_moves_all_linear_unknowns_and_no_others(solved):
+    # WHY: turn-on offsets, which are linear unknowns, were kept constant.
+    regression, prior, fitted = solved
+    layout, sd = fitted.layout, np.sqrt(fitted.variance)
+    for name in ('offset', 'turn_on'):
+        places = getattr(layout, name)
+        if places.size:
+            moved = replace(
+                fitted.state, **{name: getattr(fitted.state, name) + 10.0 * sd[places]}
+            )
+            step = regression.at(moved, prior).linear_step() / sd
+            np.testing.assert_allclose(step[places], -10.0, atol=0.1)
+            assert (
+                np.abs(step[np.concatenate((layout.start.ravel(), layout.up.ravel()))]).max() < 0.1
+            )
+
+
 @pytest.mark.parametrize('seed', [0, 1, 5, 7, 8, 11])
 def test_no_step_of_the_solver_increases_the_objective(seed):
     # The bags start far from thermal equilibrium, so products of lag state and weight are large.

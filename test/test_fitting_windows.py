@@ -14,6 +14,7 @@ from thermo_comp.fitting import FitOptions, fit_bags, reduce_bag
 from thermo_comp.fitting.claim import claim_of
 from thermo_comp.fitting.initialisation import Problem, _candidates
 from thermo_comp.fitting.options import sets_of
+from thermo_comp.fitting.raw_checks import judge_missing
 from thermo_comp.fitting.reduction import Readings
 from thermo_comp.fitting.windows import N_SECTIONS, Model, thermal_windows
 from thermo_comp.simulation.campaign import Position, parse_cyclogram, positions
@@ -56,9 +57,12 @@ def test_a_rest_partly_in_the_range_of_the_model_is_used_there_only(bags):
     lower, upper = np.quantile(everything.temperature, (0.3, 0.7))
     for range_c, is_used in (((lower, upper), True), ((90.0, 95.0), False)):
         model = replace(everything.model, range_c=range_c)
-        board = thermal_windows(bags, model, everything.tracks).temperature
+        windows = thermal_windows(bags, model, everything.tracks)
+        board = windows.temperature
         assert (len(board) < len(everything.temperature)) == is_used
         assert (board.min() >= lower and board.max() <= upper) == is_used
+        # WHY: samples beyond the range were reported as samples without temperatures.
+        assert not list(judge_missing(bags, windows))
 
 
 def test_the_sets_differ_only_with_soaks_at_several_temperatures(bags):
@@ -107,6 +111,30 @@ def test_columns_of_the_fit_equal_those_of_the_tracker(bags):
     late = time > 300.0
     # The tracker's lags follow estimates, not readings: play operators reverse at other times.
     np.testing.assert_allclose(rows[late, n_sets:] / scale, mean[late] / scale, atol=0.05)
+
+
+def test_lags_after_a_pause_depend_on_the_temperatures_in_it(bags):
+    # WHY: the lags were computed as if the temperature had stepped at the end of a pause, so the
+    # drifts of bags with pauses had three times the error.
+    whole, first_s, last_s = bags[0], 780.0, 1200.0
+    temperatures = {}
+    for name, readings in whole.temperatures.items():
+        seconds = (readings.stamp_ns - whole.start_ns) * 1e-9
+        kept = (seconds < first_s) | (seconds > last_s)
+        temperatures[name] = Readings(readings.stamp_ns[kept], readings.value[kept])
+    paused = replace(whole, temperatures=temperatures)
+    before, after = windows_of([whole]), windows_of([paused])
+    is_lag = [column.group in ('board', 'gradient_lag') for column in before.model.columns]
+    places = np.searchsorted(before.data.time, after.data.time - 1e-6)
+    at = np.minimum(places, len(before.data.time) - 1)
+    same = (np.abs(before.data.time[at] - after.data.time) < 1.0) & (
+        after.data.time > last_s + 60.0
+    )
+    assert same.sum() >= 25
+    expected, actual = before.raw[at][:, is_lag], after.raw[:, is_lag]
+    # The ramp continues in the pause, so the interpolated temperature is nearly the true one.
+    error = np.sqrt(np.mean((actual - expected)[same] ** 2, axis=0))
+    assert (error < 0.05 * np.sqrt(np.mean(expected**2, axis=0))).all()
 
 
 def test_columns_sections_and_initial_lag_states_agree_with_formulas(bags):

@@ -99,7 +99,9 @@ def read_headings(
     accel = accel or next((three for key, three in every.items() if _ROS_ACCEL.search(key)), None)
     if accel is None:
         return None
-    gyro = next((three for key, three in triads.items() if _GYRO.search(key)), None)
+    # A heading such as `ax_g` ends with the unit g, not with the letter of a gyroscope.
+    others = (key for key, three in triads.items() if three != accel)
+    gyro = next((triads[key] for key in others if _GYRO.search(key)), None)
     time = times[-1] if times else ''
     time_unit, accel_unit = _stated(time, _TIMES | _LONG_TIMES), _stated(accel[0], _ACCELS)
     gyro_unit = _stated(gyro[0], _RATES) if gyro else ''

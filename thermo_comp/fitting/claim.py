@@ -185,24 +185,30 @@ def _widened(
     `typical`, `of_means`: see `Fit`
     """
     prior, state = _with_unseen(regression, posterior, typical), posterior.state
-    if of_means is None:
-        with_unseen = regression.solve(state, prior, n_steps=0)
-        return with_unseen.layout, with_unseen.covariance.copy()
-    # The drifts of warm-ups within the positions determine the chosen curve. A warm-up heats the
-    # board in another way than a chamber does, so the curve fitted to the positions' means is an
-    # alternative: half of the squared difference of the curves is added to the covariance. Columns
-    # that change more within the positions than between them keep the weights of the chosen fit.
-    within = within_positions(regression.columns, regression.windows.position)
-    is_of_means = np.mean(within**2, axis=0) < np.mean((regression.columns - within) ** 2, axis=0)
-    weights = np.where(is_of_means, of_means.weights, state.weights)
-    other = replace(of_means, weights=weights)
-    # Columns that only `of_means` has get a tiny prior sd, so that the covariance has their rows.
-    is_used = other.weights.any(axis=1) & (prior.column_sd == 0.0)
-    prior = replace(prior, column_sd=np.where(is_used, 1e-9, prior.column_sd))
+    other = state
+    if of_means is not None:
+        # The drifts of warm-ups within the positions determine the chosen curve. A warm-up heats
+        # the board in another way than a chamber does, so the curve fitted to the positions' means
+        # is an alternative: half of the squared difference of the curves is added to the
+        # covariance. Columns that change more within the positions than between them keep the
+        # weights of the chosen fit.
+        within = within_positions(regression.columns, regression.windows.position)
+        between = np.mean((regression.columns - within) ** 2, axis=0)
+        is_of_means = np.mean(within**2, axis=0) < between
+        weights = np.where(is_of_means, of_means.weights, state.weights)
+        other = replace(of_means, weights=weights)
+        # Columns that only `of_means` has get a tiny prior sd: the covariance then has their rows.
+        is_used = other.weights.any(axis=1) & (prior.column_sd == 0.0)
+        prior = replace(prior, column_sd=np.where(is_used, 1e-9, prior.column_sd))
     with_unseen = regression.solve(state, prior, n_steps=0)
     layout = with_unseen.layout
+    # The added columns have the weight 0 in the fit: add the squares of the weights that the data
+    # prefer, and of the changes of the other unknowns with these weights. The prior sd of a
+    # weight, at most the sd by the data, at least halves the weight in this step.
+    step = 2.0 * regression.at(state, prior).solution[0][: layout.n_unit]
     difference = (as_vector(other, layout) - as_vector(state, layout))[: layout.n_unit]
-    return layout, with_unseen.covariance + 0.5 * np.outer(difference, difference)
+    excess = np.outer(step, step) + 0.5 * np.outer(difference, difference)
+    return layout, with_unseen.covariance + excess
 
 
 def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floats) -> Prior:

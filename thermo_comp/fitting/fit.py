@@ -34,7 +34,15 @@ from .gyroscope import RateRow, add_gyroscope
 from .initialisation import Problem, initial_triad
 from .joining import joined
 from .likeness import Likeness, judge_likeness, likenesses
-from .nonlinear import choose, is_beyond, judge_terms, of_file, with_blank, with_forces
+from .nonlinear import (
+    choose,
+    is_beyond,
+    judge_forces,
+    judge_terms,
+    of_file,
+    with_blank,
+    with_forces,
+)
 from .options import COUNTS_FULL_SCALE, FitOptions
 from .priors import constants_of, offset_sd_of
 from .reduction import ReducedBag, reduce_source
@@ -304,6 +312,7 @@ def _fit(
     has_case = all(len(bag.case.value) for bag in bags)
     findings += enforce(data_checks.judge_windows(windows, up, has_case, earlier), options)
     findings += raw_checks.judge_missing(bags, windows)
+    findings += judge_forces(windows, options)
     progress(0.7)
     problem = Problem(bags, options, start, up, progress, is_by_settled, has_pieces)
     fit = regressed(windows, problem)

@@ -110,15 +110,7 @@ def with_forces(windows: ThermalWindows, options: FitOptions) -> ThermalWindows:
     The windows stay unchanged if all |f| are within 1e-3 of gravity, and neither the options nor
     the prior have nonlinear terms.
     """
-    still, spin, sd = np.outer((options.gravity, 0.0, 0.0), np.ones(windows.data.n_positions))
-    radii = set()
-    for p, (bag, rest) in enumerate(windows.rests):
-        if (known := bag.source.force) is not None:
-            first_ns = bag.start_ns - round(bag.since_s * 1e9)
-            size = known.of(rest.start_ns, rest.end_ns, first_ns, options.gravity)
-            still[p], spin[p], sd[p] = size
-            if known.radius:
-                radii.add((known.radius, known.radius_sd))
+    still, spin, sd, radii = _stated(windows, options)
     prior = options.prior.nonlinearity if options.prior else None
     is_usual = np.ptp([*np.hypot(still, spin), options.gravity]) < 1e-3 * options.gravity
     if is_usual and prior is None and options.k2_sd is None and options.k3_sd is None:
@@ -136,6 +128,39 @@ def with_forces(windows: ThermalWindows, options: FitOptions) -> ThermalWindows:
     t = windows.temperature - windows.model.reference_temperature
     forces = Forces(kinds, t, still, spin, sd, radius_sd / radius)
     return replace(windows, data=replace(windows.data, forces=forces))
+
+
+def _stated(
+    windows: ThermalWindows, options: FitOptions
+) -> tuple[Floats, Floats, Floats, set[tuple[float, float]]]:
+    """
+    Return for each position the stated |f| at rest, the centripetal acceleration and the sd of
+    |f| [m/s^2], shape (n_positions,); and the distances from the axis of rotation with their sd.
+    """
+    still, spin, sd = np.outer((options.gravity, 0.0, 0.0), np.ones(windows.data.n_positions))
+    radii = set()
+    for p, (bag, rest) in enumerate(windows.rests):
+        if (known := bag.source.force) is not None:
+            first_ns = bag.start_ns - round(bag.since_s * 1e9)
+            size = known.of(rest.start_ns, rest.end_ns, first_ns, options.gravity)
+            still[p], spin[p], sd[p] = size
+            if known.radius:
+                radii.add((known.radius, known.radius_sd))
+    return still, spin, sd, radii
+
+
+def judge_forces(windows: ThermalWindows, options: FitOptions) -> Iterator[Finding]:
+    """Report stated |f| that differ so little from gravity that the fit does not use them."""
+    still, spin, *_ = _stated(windows, options)
+    sizes = np.hypot(still, spin)
+    error = float(np.abs(sizes - options.gravity).max())
+    if windows.data.forces is None and error > 1e-6 * options.gravity:
+        text = (
+            f'the bags state |f| of {sizes.min():.7g} to {sizes.max():.7g} m/s^2, within 1e-3 of '
+            f'gravity, {options.gravity:.7g} m/s^2 (--gravity): the fit uses gravity. The scale '
+            f'factors have an error of {1e6 * error / options.gravity:.0f} ppm if gravity is wrong'
+        )
+        yield advice('gravity', text)
 
 
 def is_beyond(windows: ThermalWindows) -> bool:

@@ -266,14 +266,12 @@ def judge_missing(bags: Sequence[ReducedBag], windows: ThermalWindows) -> Iterat
     if not windows.has_temperature:
         return
     counts = [_missing(bag, track) for bag, track in zip(bags, windows.tracks, strict=True)]
-    n_still, n_unsettled, n_between = np.sum(counts, axis=0).tolist()
-    n_used = float(windows.data.weight.sum()) * windows.typical_count
-    unsettled = n_unsettled / n_still
-    missing = 1.0 - n_used / n_still - unsettled
+    n_still, n_unsettled, n_missing, n_between = np.sum(counts, axis=0).tolist()
+    unsettled, missing = n_unsettled / n_still, n_missing / n_still
     reported = 0.1  # largest share of the time at rest without temperature that is not reported
     if missing > reported:
         why = 'do the thermometers and the accelerometer use the same clock?'
-        if n_between > 0.5 * missing * n_still:
+        if n_between > 0.5 * n_missing:
             why = f'does a thermometer stick, or drop out? {_longest_pause(bags)}'
         share = f'{100.0 * missing:.0f} % of the time at rest'
         yield advice('unmeasured', f'{share} has no temperatures and is left out: {why}')
@@ -288,23 +286,26 @@ def judge_missing(bags: Sequence[ReducedBag], windows: ThermalWindows) -> Iterat
         )
 
 
-def _missing(bag: ReducedBag, track: Track) -> tuple[float, float, float]:
+def _missing(bag: ReducedBag, track: Track) -> tuple[float, float, float, float]:
     """
-    Return three numbers of samples at rest: all samples; the samples before the board temperature
-    is accurate; later samples without a temperature while all thermometers are recorded.
+    Return four numbers of samples at rest: all samples; the samples before the board temperature
+    is accurate; other samples without a temperature; and those of the latter that were recorded
+    later, between the first and the last readings of all thermometers.
     """
     read = [readings.stamp_ns for readings in bag.temperatures.values() if len(readings.stamp_ns)]
     begin_s = 1e-9 * (max(stamp_ns[0] for stamp_ns in read) - bag.start_ns)
     end_s = 1e-9 * (min(stamp_ns[-1] for stamp_ns in read) - bag.start_ns)
-    n_still = n_unsettled = n_between = 0.0
+    n_still = n_unsettled = n_missing = n_between = 0.0
     for rest in bag.intervals:
         is_known = np.interp(rest.time, track.grid_s, track.is_known, left=0.0) == 1.0
         is_settled = rest.time >= track.settled_s
         n_still += float(rest.count.sum())
-        n_unsettled += float(rest.count[(rest.time >= track.start_s) & ~is_settled].sum())
+        is_unsettled = (rest.time >= track.start_s) & ~is_settled
+        n_unsettled += float(rest.count[is_unsettled].sum())
+        n_missing += float(rest.count[~is_known & ~is_unsettled].sum())
         is_between = ~is_known & is_settled & (rest.time > begin_s) & (rest.time < end_s)
         n_between += float(rest.count[is_between].sum())
-    return n_still, n_unsettled, n_between
+    return n_still, n_unsettled, n_missing, n_between
 
 
 def _longest_pause(bags: Sequence[ReducedBag]) -> str:

@@ -213,7 +213,9 @@ class Point:
         layout, local, unit = self.layout, self.normal.local.copy(), self.normal.unit.copy()
         # A factor 1e6 on the Hessian's diagonal divides the steps of nonlinear unknowns by about
         # 1e6; a far larger factor would cause rounding errors with a correlated prior.
-        at = [*range(2 + layout.stretch.shape[1]), *range(layout.of_axis.shape[1], layout.n_local)]
+        first = layout.of_axis.shape[1]
+        starts = range(first, first + layout.start.shape[1])
+        at = [*range(2 + layout.stretch.shape[1]), *starts]
         local[..., at, at] *= 1e6
         end = unit.shape[-1] - 1
         at = [0, *range(end - len(layout.shared), end)]

@@ -316,17 +316,7 @@ def _grown(
         trials = growth.with_bends(first, ('board', *PRODUCTS))
         growth.tried += trials
         chosen = _best(chosen, trials)
-    chosen = growth.added(chosen, progress)
-    may_bend = BEND in growth.free and {*PRODUCTS} & {*chosen.groups}
-    if may_bend and BEND not in chosen.groups and not chosen.is_complete:
-        # A bend of the curve over a part's temperature is found only in a model with the part's
-        # lag, not in a model that approximates the lag by products and squares. Add groups to a
-        # model with lags and bends if its error is below three times that of the chosen model.
-        _, *with_bends = growth.with_bends(first, LAGS)
-        if with_bends and with_bends[0].score.rms < 3.0 * chosen.score.rms:
-            growth.tried += with_bends
-            chosen = _best(chosen, [growth.added(with_bends[0], progress)])
-    return chosen
+    return growth.added(chosen, progress)
 
 
 def fit_all(

@@ -450,7 +450,7 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
     tracker = ThermalTracker(detector, spec, config)
     board, *others = tracker.thermometers.values()
     step_ns, begin_ns = round(step_s * 1e9), max(int(bag.board.stamp_ns[0]), bag.start_ns)
-    rows, is_heard = [], []
+    rows, is_heard, is_fresh = [], [], []
     readings = iter(readings_in_order(bag, inputs))
     reading = next(readings, None)
     for stamp_ns in range(begin_ns, max(bag.end_ns, begin_ns) + step_ns, step_ns):
@@ -460,11 +460,17 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
             tracker.read(*reading)
             reading = next(readings, None)
         rows.append(tracker.sample(stamp_ns))
+        is_fresh.append(not any(sensor.beyond(stamp_ns) for sensor in (board, *others)))
         is_heard.append(
             board.beyond(stamp_ns) <= config.temperature_timeout_s
             and all(sensor.beyond(stamp_ns) <= config.case_timeout_s for sensor in others)
         )
     states, is_known = np.array(rows), np.array(is_heard)
+    # The tracker holds the temperatures in a pause of the recording, after which they step. Lags
+    # after the pause depend on the temperatures in it: interpolate these between both sides.
+    fresh, places = np.flatnonzero(is_fresh), StateLayout(spec).places
+    for place in (BOARD, *(places[Gradient(name)] for name in spec.sensors)):
+        states[:, place] = np.interp(np.arange(len(states)), fresh, states[fresh, place])
     n_unsettled = int(np.argmax(states[:, VAR_BOARD] <= 4.0 * np.median(states[:, VAR_BOARD])))
     is_known[:n_unsettled] = False
     start_s = (begin_ns - bag.start_ns) * 1e-9
