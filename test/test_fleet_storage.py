@@ -125,7 +125,8 @@ class TestDiscovery:
     def test_folders_give_unit_and_lot(self, tmp_path):
         for name in (
             *('lot-A/u1/1.mcap', 'lot-A/u1/2.mcap', 'lot-B/u2/1.mcap', 'u3/1.mcap', 'u4/log.csv'),
-            *('u3/truth.csv', 'out/fleet.csv', '.hidden/x.mcap'),
+            *('u3/truth.csv', 'out/fleet.csv', 'out/fleet.parquet', '.hidden/x.mcap'),
+            *('u5/log.ulg', 'u6/notes.txt'),
         ):
             (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
             (tmp_path / name).touch()
@@ -135,7 +136,7 @@ class TestDiscovery:
             *(('lot-B/u2', 'lot-B', ['lot-B/u2/1.mcap']), ('u3', '', ['u3/1.mcap'])),
         ]
         # WHY: a unit with tables and no bags was left out without a message.
-        assert folders_of_tables(Storage(str(tmp_path))) == ('u4',)
+        assert folders_of_tables(Storage(str(tmp_path))) == ('u4', 'u5')
 
     def test_bags_without_folders_are_sorted_by_serial(self, tmp_path):
         for seed, names in ((1, ['a.mcap', 'd.mcap']), (2, ['b.mcap', 'c.mcap'])):

@@ -266,9 +266,9 @@ def learn(
     Estimate the ageing model by evidence, without starts that contradict all other starts.
 
     At most four `Change`s are added, each with a log Bayes factor of at least `_LEAST_GAIN`. A
-    start of the node is left out if an equation of its rests (a row) is more than 5 sd from the
-    prediction by all other rows. Returns the `Ageing`, the `Model` of the used rests, and
-    these rests.
+    start of the node is left out if, in the model of all starts, an equation of its rests (a row)
+    is more than 5 sd from the prediction by all other rows. Returns the `Ageing`, the `Model` of
+    the used rests, and these rests.
     """
     centre = usual(calibration)
     is_used = np.ones(len(series), dtype=np.bool_)

@@ -22,6 +22,9 @@ _STAMPS = (
     *('mtime', 'LastModified', 'last_modified', 'updated', 'created'),
 )
 
+# Ends of the names of tables and logs. Folders also have other files with names in .txt.
+_TABLES = ('.csv', '.tsv', '.mat', '.parquet', '.ulg', '.bin')
+
 
 class StoredFile(NamedTuple):
     """A file in a listing; `stamp` (ETag or time) changes with the file's content."""
@@ -146,14 +149,14 @@ def find_units(storage: Storage) -> list[FoundUnit]:
 
 
 def folders_of_tables(storage: Storage) -> tuple[str, ...]:
-    """Return the folders with tables, which `convert` can convert to bags, but without a bag."""
+    """Return the folders with tables or logs that `convert` can convert, but without a bag."""
     stored = storage.files()
     with_bags = tuple(f'{_folder(name)}/' for name in group_files(stored))
-    # fleet.csv is the result of an earlier run, not a table of samples.
+    # fleet.csv and fleet.parquet are results of an earlier run, not tables of samples.
     tables = {
         _folder(file.name)
         for file in stored
-        if file.name.endswith(('.csv', '.mat')) and not file.name.endswith('/fleet.csv')
+        if file.name.endswith(_TABLES) and not file.name.endswith(('/fleet.csv', '/fleet.parquet'))
     }
     return tuple(sorted(name for name in tables - {''} if not f'{name}/'.startswith(with_bags)))
 
