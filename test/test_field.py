@@ -338,6 +338,10 @@ def test_wrong_arguments_and_logs_of_update_give_a_message(tmp_path, unit_file, 
         assert text in cli('update', unit_file, path, *new, code=1).stderr
     bag = ROOT / 'bags' / 'held_out.mcap'
     assert 'cannot be mixed with bags' in cli('evaluate', log, bag, '-c', unit_file, code=2).stderr
+    # WHY: these options were ignored without a message.
+    for given in (('--window', 5), ('--serial', 'u7'), ('--from', 10), ('--specific-force', '2g')):
+        error = cli('evaluate', log, '-c', unit_file, *given, code=2).stderr
+        assert 'rest logs take no options except --tolerance and --gravity' in error
     broken = write_log(tmp_path / 'broken', rests(unit, upright, jump_of(3000.0, 2.0), days=4))
     printed = cli('update', unit_file, broken, *new, code=1).stderr
     assert 'on 2030-01-03 |f| differs from the gravity 9.80665 m/s^2 by 3 mg RMS' in printed

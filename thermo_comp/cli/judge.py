@@ -60,18 +60,21 @@ def evaluate(
       thermo_comp evaluate held_out.mcap -c unit42.yaml --tolerance 100ug
     """
     from ..field.series import is_rest_log
+    from ..fitting.sources import ForceOptions
     from ..judging.evaluation import drifts_of, history_of
     from ..judging.evaluation import evaluate as run
     from ..judging.windows import columns_of
+    from ..recording.topics import Topics
     from ..recording.writer import TABLES, table_writer
     from ..unit.calibration_file import load_calibration
 
     logs = [path for path in bags if is_rest_log(path)]
     if logs:
-        if len(logs) < len(bags) or len(calibration) > 1 or csv is not None:
-            raise options.usage(
-                'rest logs need one calibration and no --csv, and cannot be mixed with bags'
-            )
+        of_bags = topics != Topics() or known_force != ForceOptions() or judging['serial']
+        if of_bags or csv is not None or judging['window_s'] != options.WINDOW_S:
+            raise options.usage('rest logs take no options except --tolerance and --gravity')
+        if len(logs) < len(bags) or len(calibration) > 1:
+            raise options.usage('rest logs need one calibration, and cannot be mixed with bags')
         _evaluate_rests(logs, calibration[0], judging, out)
         return
     if csv is not None:

@@ -248,11 +248,15 @@ def site(
     return {'gravity': gravity, 'gravity_sd': usual_sd if sd is None else sd}
 
 
+#: Default length of a window at rest [s].
+WINDOW_S = 60.0
+
+
 @expanded
 def judging(
     where: tuple[float | None, float] = place,
     window_s: float = option(
-        'Length of a window at rest, in s.', 60.0, metavar='S', min=1e-3, max=86400.0
+        'Length of a window at rest, in s.', WINDOW_S, metavar='S', min=1e-3, max=86400.0
     ),
     tolerance: str | None = option('Largest accepted RMS of |f| - g, e.g. 100ug, 1e-3m/s^2.'),
     serial: str | None = SERIAL,
