@@ -203,9 +203,8 @@ def _widened(
     with_unseen = regression.solve(state, prior, n_steps=0)
     layout = with_unseen.layout
     # The added columns have the weight 0 in the fit: add the squares of the weights that the data
-    # prefer, and of the changes of the other unknowns with these weights. The prior sd of a
-    # weight, at most the sd by the data, at least halves the weight in this step.
-    step = 2.0 * regression.at(state, prior).solution[0][: layout.n_unit]
+    # prefer, and of the changes of the other unknowns with these weights.
+    step = regression.at(state, prior).solution[0][: layout.n_unit]
     difference = (as_vector(other, layout) - as_vector(state, layout))[: layout.n_unit]
     excess = np.outer(step, step) + 0.5 * np.outer(difference, difference)
     return layout, with_unseen.covariance + excess
