@@ -3,8 +3,8 @@
 """
 Owns the table of the node's ROS topics: name, type, QoS, serialization of the regime flags.
 
-Node, replay, recorders, player, bag writer and docs/ros_interface.md use this table. A message is
-serialized in little-endian CDR: 4 bytes of encapsulation, then the fields.
+Node, replay, recorders, player, bag writer and docs/ros_interface.md use the table of topics. A
+message is serialized in little-endian CDR: 4 bytes of encapsulation, then the fields.
 """
 
 from collections.abc import Callable

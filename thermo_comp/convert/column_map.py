@@ -234,7 +234,7 @@ def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
     accel = values(named.accel)
     unit = named.accel_unit
     if not unit:
-        # The unit of the times is not known yet: rests are searched as if sampled every second.
+        # The unit of the times is not known yet: the search for rests takes 1 s between samples.
         still = find_stillness(np.arange(len(accel)) * 10**9, accel)
         unit, reason = infer_unit(still.magnitude)
         if unit == 'unknown':

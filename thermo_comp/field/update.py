@@ -33,7 +33,7 @@ OVERRIDES = ('gravity', 'unit')
 # The rests of a node start are taken for another unit's rests if the RMS of |f| - g exceeds both
 # limits.
 _LARGEST_PART = 1e-3  # relative to gravity: 1 mg, as after a shock
-_LARGEST_SIGMAS = 30.0  # relative to the claimed sd: some milli-g for a poor sensor
+_LARGEST_SIGMAS = 30.0  # RMS / claimed sd: 30 claimed sds are some milli-g for a poor sensor
 
 
 @dataclass(frozen=True)

@@ -146,8 +146,9 @@ def _valid_columns(
                 values, order = np.append(values, coldest - column.knee_k), 0
             valid = ranges.valid_range(values, 0.01, order)
             if k not in weighed:
-                # A column with zero weight contributes only to the covariance. Its range therefore
-                # includes every value that it can have within the temperature range.
+                # A column with zero weight contributes only to the covariance. The range of such a
+                # column therefore includes every value that the column can have within the
+                # temperature range.
                 largest = (upper - lower) ** column.term.order
                 valid = ranges.union((valid, (-largest, largest)))
         if k in of_parts and column.term.order % 2:

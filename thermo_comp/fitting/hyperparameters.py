@@ -38,8 +38,8 @@ from .windows import BEND, LAGS, PRODUCTS
 
 #: Degrees of freedom of the half-Student prior of the sd of mounting offsets, as in [2]_.
 STUDENT_NU = 4.0
-#: Smallest log Bayes factor of a column that is kept: a factor below 1 is "not worth more than a
-#: bare mention" (Kass and Raftery, Bayes factors, JASA 90 (1995), section 3.2).
+#: Smallest log Bayes factor of a column that is kept: a log Bayes factor below 1 is "not worth
+#: more than a bare mention" (Kass and Raftery, Bayes factors, JASA 90 (1995), section 3.2).
 LEAST_GAIN = 1.0
 #: Gain in log evidence that makes a model clearly more likely than another: odds of 55 : 1.
 CLEAR_GAIN = 4.0
@@ -134,7 +134,7 @@ def _updated(
 
 
 def _misalignment_sd(posterior: PosteriorMode) -> float:
-    """Move the prior sd of the misalignment to its mode if more than one element is determined."""
+    """Move the prior sd of M to its mode if the data determine more than one element of M."""
     prior, misalignment = posterior.prior, posterior.state.misalignment
     if prior.informative is not None or prior.unseen_misalignment_sd:
         return prior.misalignment_sd

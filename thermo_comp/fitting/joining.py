@@ -6,7 +6,7 @@ recorded one after the other while the unit is turned to the next attitude.
 
 Between the parts of a recording the unit may have stayed switched on, so the parts count as one
 turn-on: positions of one turn-on do not show how well the bias repeats from turn-on to turn-on.
-Lags do not restart where a part begins, and a rest may continue from one part to the next.
+Lags do not restart where the recording's next bag begins, and a rest may continue in this bag.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def _intervals(parts: Sequence[ReducedBag]) -> tuple[StillInterval, ...]:
         shift_s = 1e-9 * (part.start_ns - parts[0].start_ns)
         is_alike = abs(part.window_s - parts[0].window_s) < 0.01 * parts[0].window_s
         for number, rest in enumerate(part.intervals):
-            # Windows count as whole if they are as long as those of the first part, within 1 %.
+            # Windows stay whole if as long, within 1 %, as those of the recording's first bag.
             n_whole = rest.n_whole if is_alike else 0
             begin_s, time = rest.begin_s + shift_s, rest.time + shift_s
             shifted = replace(rest, begin_s=begin_s, time=time, n_whole=n_whole)

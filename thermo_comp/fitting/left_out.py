@@ -279,10 +279,11 @@ def settled_error(
     Return the expected error of the bias after all lags settled [m/s^2]; inf without bias columns.
 
     In bags that all begin at one temperature the lags change together with the board temperature,
-    so the bias after the lags have settled is extrapolated from such bags. Its expected error is
-    the root sum of squares of its posterior sd and of ``excess * growth``. `excess`: left-out
-    drift beyond the noise [m/s^2]; growth: ratio of this posterior sd to that of the bias in the
-    windows, at least 1. `settled`: columns at settled temperatures, shape (k, m).
+    so the bias after the lags have settled is extrapolated from such bags. The expected error of
+    the settled bias is the root sum of squares of the posterior sd of this bias and of ``excess *
+    growth``. `excess`: left-out drift beyond the noise [m/s^2]; growth: posterior sd of the
+    settled bias / posterior sd of the bias in the windows, at least 1. `settled`: columns at
+    settled temperatures, shape (k, m).
     """
     if not posterior.layout.used[0].any():
         return np.inf

@@ -106,7 +106,8 @@ def _scatter(deviations: Floats, layout: ParameterLayout, K: Floats) -> Floats:
     curves are set to 0: with chance correlations from few units, one position would determine all
     constants of a new unit. The correlations between curves are reduced by a ratio estimated from
     their scatter [1]_. A dynamic curve is first replaced by its difference from the static curve:
-    both curves are equal in most units, but reduced correlations would make both differ.
+    the two curves are equal in most units, and a reduced correlation between the curves would make
+    them differ.
     """
     to_differences = np.eye(deviations.shape[1])
     for block in (*layout.bias, *layout.scale):
@@ -175,7 +176,7 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
     Parts of two units of a type have different time constants, so a lag is interpolated between
     the lags of the bank, which is common to all units; a lag of 0 s is always 0 K. A lag of two
     stages, a lag behind a temperature between board and sensor, and a lag with a lead are sums of
-    first-order lags. A power of such a sum is approximated by the power of one lag of the board
+    first-order lags. A power of a sum of lags is approximated by the power of one lag of the board
     that has the same delay as the sum in a long ramp.
     """
     tau, second, lag = column.tau_s, column.second_tau_s, column.source

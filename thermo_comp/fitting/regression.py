@@ -120,8 +120,8 @@ class Point:
     @property
     def _common_variance(self) -> float:
         """Prior variance of the sum, over the bags, of an initial lag state; 0 if not used."""
-        # The prior sd of the mean of a lag state over the bags is only 0.1 times its sd in one
-        # bag, because a mean other than 0 would be an effect of the unit.
+        # The prior sd of the mean of an initial lag state over the bags is only 0.1 times its sd
+        # in one bag: a mean other than 0 would repeat in all bags, and be a property of the unit.
         is_used = self.regression.n_bags > 1 and bool(self.layout.start.size)
         return is_used * (0.1 * self.regression.n_bags) ** 2 * self.prior.start_variance_ratio
 
@@ -233,7 +233,8 @@ class Point:
         If the step increases the energy, fractions of the step of the nonlinear unknowns (those
         that multiply other unknowns) are tried, each with a new step of the linear unknowns.
         """
-        # Take energy and step first: only the last linearisation is kept (`linearised`).
+        # Compute energy and step of this state before those of the next: `Regression.linearised`
+        # keeps only one linearisation, the last.
         energy, (step, _) = self.energy, self.solution
         result = self.with_step(step)
         if result.energy <= energy:

@@ -200,8 +200,9 @@ class Base:
 @dataclass(frozen=True)
 class Products:
     """
-    Sums over windows of the products of all pairs of whitened base series. A cell is the set of
-    the windows of one position in one section of the chamber program.
+    Sums over windows of the products of all pairs of whitened base series. A cell of `Products`
+    (not of samples) is the set of the windows of one position in one section of the chamber
+    program.
 
     base: order of the base series
     means: mean of each base series, not whitened, in each position, shape (n_positions, n_base)
@@ -231,8 +232,8 @@ class Products:
 
 class Series:
     """
-    The values of the base series in the windows of a fit, and their sums of products. Nominal
-    scale factors convert the readings to m/s^2.
+    The values of the base series (such as columns and readings) in the windows of a fit, and the
+    sums of products of these series. Nominal scale factors convert the readings to m/s^2.
 
     windows: the data of the fit
     nominal_scale: nominal scale factors [input units per m/s^2], shape (3,)

@@ -81,9 +81,10 @@ def rest_gradient_range(
     """
     Return the valid range of the first sensor's gradient at rate 0, ``gradient - lag_s * rate``.
 
-    The range of a prior calibration, `earlier`, is included. The windows give no range without the
-    sensor, without ramps (which determine the lag), or if their range would exceed +-100 K, as for
-    bags too short for a rate. The result is None if neither prior nor windows give a range.
+    The result includes the range of a prior calibration, `earlier`. The windows give no range
+    without the sensor, without ramps (which determine the lag), or if their range would exceed
+    +-100 K, as for bags too short for a rate. The result is None if neither prior nor windows give
+    a range.
     """
     lower, upper = valid_range(windows.gradient - lag_s * windows.rate, 0.01)
     is_small = max(-lower, upper) < 100.0

@@ -37,8 +37,8 @@ from .unknowns import Windows
 #: slope at a temperature), and the curves over the temperatures of parts.
 CURVE, SET, BEND, PART = 'curve', 'set', 'bend', 'part'
 #: `LAGS`: groups of columns linear in a difference of temperatures. `PRODUCTS`: groups of the lag
-#: times powers of the temperature, and of the square and cube of the lag. 'board', `PRODUCTS` and
-#: the curve form the curves over a part's temperature.
+#: times powers of the temperature, and of the square and cube of the lag. A curve over a part's
+#: temperature is a sum of columns of the curve over board temperature, 'board' and `PRODUCTS`.
 LAGS, PRODUCTS = ('gradient', 'board', 'gradient_lag'), ('product', 'square')
 #: Number of windows into which a short rest is divided, to determine the noise of the rest.
 FEWEST_WINDOWS = 20
@@ -68,7 +68,7 @@ class Sets:
 
     @property
     def families(self) -> tuple[TemperatureFunction, TemperatureFunction]:
-        """Families of static and dynamic curve; if `is_shared`, dynamic order >= static order."""
+        """Function families of both curves; if `is_shared`, the dynamic order is >= the static."""
         is_higher = self.is_shared and self.static.n_free > self.dynamic.n_free
         return self.static, self.static if is_higher else self.dynamic
 

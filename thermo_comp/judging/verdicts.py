@@ -80,7 +80,7 @@ class Sections(dict[str, Section]):
 
     @property
     def worst_ratio(self) -> float:
-        """Largest ratio of RMS error to claimed RMS in a section: a regime, or all windows."""
+        """Largest ratio of RMS error to claimed RMS in static, dynamic or all windows."""
         return max(part.ratio for part in (*self.regimes, self['all']))
 
     def facts(self) -> dict[str, Any]:
@@ -143,8 +143,9 @@ def judge_rates(windows: JudgedWindows, calibration: Calibration) -> RateJudgeme
     """
     Judge a gyroscope by windows at rest; return None without a gyroscope or angular rates.
 
-    At rest a gyroscope reads the unknown sum of Earth's rate and turn-on bias. Therefore the rate
-    less its mean in each rest is judged; its limit is the sd that the calibration claims for it.
+    At rest a gyroscope reads the unknown sum of Earth's rate and turn-on bias. The judged error is
+    therefore the angular rate less its mean in each rest; the RMS of this error may be at most
+    `LARGEST_RATIO` times the RMS of its claimed sd.
     """
     windows = windows.select(np.asarray(np.isfinite(windows.gyro[:, :6]).all(axis=1)))
     if not windows.gyro.size:

@@ -192,7 +192,7 @@ class StuckCheck:
             moved_by = np.abs(values[:, 1:].T - np.take(first[:3], [axis - 2, axis - 1]))
             changes = np.abs(np.diff(values))
         most_moved = np.fmax.accumulate(np.append(moved, moved_by.min(axis=1)))[1:]
-        # Like `_continued`, ignore changes up to the `STUCK_SAMPLES`th repeat of a reading.
+        # Like `_continued`, ignore changes of the other axes up to repeat number `STUCK_SAMPLES`.
         changes[:, equal <= STUCK_SAMPLES] = 0.0
         noisy = np.take(self._noisy, [axis - 2, axis - 1])[:, np.newaxis]
         counts = n_noisy + np.cumsum(np.sum(changes >= noisy, axis=0))

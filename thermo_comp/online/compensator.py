@@ -250,13 +250,13 @@ class Compensator:
         return None if self.is_refusing else row
 
     def is_leap(self, stamp_ns: int) -> bool:
-        """Whether a rising stamp is too far ahead to be accepted from a single sample."""
+        """Whether a stamp is too long after all earlier stamps to be accepted from one sample."""
         leapt_ns, self.leapt_ns = self.leapt_ns, None
         near_ns = stamp_ns - self.leap_ns
         is_far = self.last_ns != EVER_NS and max(self.last_ns, self.reading_ns) < near_ns
         if is_far and (leapt_ns is None or stamp_ns <= leapt_ns):
             self.leapt_ns = stamp_ns
-            self.event_ns = EVER_NS  # so `is_leap` also tests the next sample
+            self.event_ns = EVER_NS  # makes `is_leap` test the next sample, too
             return True
         return False
 

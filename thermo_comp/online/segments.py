@@ -42,8 +42,9 @@ UNMEASURED_SD_K: Final = 10.0
 
 class SlowState(NamedTuple):
     """
-    Arguments of the variance due to parameters and initial lag states: thermal state, remaining
-    shares of the unknown initial lag states, board rate of a ramp at the start [K/s].
+    Arguments of the variance due to parameters and initial lag states: thermal state; share of
+    each unknown initial lag state that remains; rate of the board in a ramp in which the unit may
+    have been switched on [K/s].
     """
 
     state: tuple[float, ...]

@@ -170,7 +170,7 @@ def _indexed(data: Bytes, index: memoryview) -> Messages | None:
     if begin != len(index) or not is_inside:
         return None
     head = gather(data, at, MESSAGE_HEAD_BYTES)
-    # For a length that is too small, the unsigned difference is huge, which the next test refuses.
+    # A length below the size of the fields becomes a huge unsigned number, refused as > len(data).
     length = number_at(head, 1, '<u8') - np.uint64(_MESSAGE_FIELDS_BYTES)
     if int(np.max(length)) > len(data) or (number_at(head, 0, 'u1') != MESSAGE).any():
         return None

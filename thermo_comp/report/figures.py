@@ -26,7 +26,7 @@ from .certificate import Curve, curves, slopes
 from .evidence import CHOSEN, LEFT_OUT, RAW, Evidence, Position, ShownBag, required
 from .style import minus, number
 
-# Drift is relative to the mean reading over this time from the start of a position [s].
+# Duration from the start of a position [s]; drift is a reading less the mean reading in it.
 _ZERO_S = 120.0
 _SHADE = '#E9E9E9'
 # Diameter of the ring of the position with the largest residual [pt].

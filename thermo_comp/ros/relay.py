@@ -234,7 +234,7 @@ class Relay:
         if waiting is None:
             self._correct(messages)
             return
-        # The rest log needs the thermal state at the end of each second of the stamps.
+        # The rest log needs the thermal state after the last sample of each second, by the stamps.
         for second, run in groupby(messages, key=itemgetter(_SECOND)):
             if second != self._second or len(waiting) >= BLOCK:
                 self.gather()

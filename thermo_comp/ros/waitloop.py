@@ -355,7 +355,7 @@ def separate_node(name: str, ros_args: Sequence[str]) -> Iterator[Node]:
         try:
             yield node
         finally:
-            # Otherwise the node's publishers would live until the next garbage collection.
+            # Without `destroy_node` the publishers would live until the next garbage collection.
             node.destroy_node()
     finally:
         context.try_shutdown()

@@ -124,9 +124,9 @@ def positions(n: int, seed: int = 0) -> Floats:
 
     Six attitudes are the faces of a cube, nine the corners of a three-capped prism, twelve the
     corners of an icosahedron: the best sets of 6, 9 and 12 attitudes to determine bias, scale and
-    misalignment. Other sets of up to 26 attitudes consist of the faces of a cube, then its edges,
-    then its corners; larger sets follow a uniform spiral on the sphere. Sets of 6, 9, 12, 18, 24
-    and 26 vectors sum to about 0. `seed` tilts each attitude by a small random angle.
+    misalignment. Sets of up to 26 attitudes, except 9 and 12, consist of the faces of a cube, then
+    its edges, then its corners; larger sets follow a uniform spiral on the sphere. Sets of 6, 9,
+    12, 18, 24 and 26 vectors sum to about 0. `seed` tilts each attitude by a small random angle.
     """
     if n == 9:
         # The prism has three corners on the equator and, at azimuths between them, three corners
@@ -229,7 +229,7 @@ def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
 def steps(
     begins_s: tuple[float, ...], rates: tuple[float, ...], dwell_s: float, ramp_s: float
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return times [s] and rotation rates of runs from each of `begins_s` through all `rates`."""
+    """Return times [s] and rotation rates: at each of `begins_s` begins a run through `rates`."""
     time, rate = [0.0], [0.0]
     for begin in begins_s:
         now = begin

@@ -125,8 +125,9 @@ class ThermometerModel:
 @dataclass(frozen=True)
 class GyroModel:
     """
-    The gyroscope of a unit, with a scale of 1. All values are in mdeg/s (in `drift` instead of ug;
-    in `noise_density` per root Hz); `turn_on`: sd of the bias between runs.
+    The gyroscope of a unit, with a scale of 1. All values are in mdeg/s, `noise_density` in mdeg/s
+    per root Hz; the bias coefficients of `drift`, elsewhere in ug, are in mdeg/s, too. `turn_on`:
+    sd of the bias between runs.
     """
 
     drift: tuple[Effect, ...]

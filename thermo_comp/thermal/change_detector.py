@@ -32,7 +32,7 @@ SETTLING_MEMORIES: Final = 5.0  # age / memory above which a filter's noise is s
 LONGEST_HALF_SWING_S: Final = 600.0  # longest half period of a temperature ripple [s]
 LARGEST_BASELINE_SHARE: Final = 0.25  # largest baseline rate of a soak / smallest ramp's rate
 SWING_MARGIN: Final = 1.25  # assumed swing / observed swing of the rate about its trend
-SWING_SIGMAS: Final = 3.0  # number of noise sds subtracted from an observed swing of the rate
+SWING_SIGMAS: Final = 3.0  # noise sds subtracted from the observed amplitude (swing) of the rate
 SWING_MEMORY_LAGS: Final = 10.0  # time constant of the decay of the swing / lag of the sensor
 
 

@@ -60,7 +60,7 @@ class ThermalTracker:
         self._weight = 0.0
         self._weight_ns = 0
         self._target = 0.0
-        #: Gradient of each sensor in the last static regime, less lag times rate of the board [K].
+        #: Gradient of each sensor in the last static regime less `_board_lag_s` * board rate [K].
         self._rest_gradients: dict[str, float] = {}
         self._begin_watch()
         self.reconfigure(config or ThermalConfig(), board_lag_s, rest_gradient_range_k, None)
@@ -146,7 +146,7 @@ class ThermalTracker:
                     continue
                 is_first = bank.stamp_ns is None and is_young
                 if not (is_first or self.is_live(stamp_ns, sensor)):
-                    # The sensor is lost: update the lags of its gradient with an estimate.
+                    # The sensor is lost: update its gradient's lags with an estimated gradient.
                     gradient, variance = self._lost_gradient(name, stamp_ns, board.rate)
                     bank.step(stamp_ns, gradient, sqrt(variance))
         for name in self.spec.sensors:

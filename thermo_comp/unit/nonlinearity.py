@@ -123,9 +123,9 @@ def unit_of(kind: Kind) -> float:
 
 def linearised(x: Real, k2: Real, kq: Real, k3: Real) -> Real:
     """
-    Solve ``x = f + k2 f^2 + kq |f| f + k3 f^3`` for f by one step of Halley's method from x. The
-    step leaves an error of f of about (k^2 - k3) (x - f)^3, with k = k2 + kq sign(f). At f = 10 g
-    the error of f is 1e-14 g for k2 = 100 ug/g^2, and 1e-11 g for k3 = 10 ug/g^3.
+    Solve ``x = f + k2 f^2 + kq |f| f + k3 f^3`` for f by one step of Halley's method from x.
+    Halley's step leaves an error of f of about (k^2 - k3) (x - f)^3, with k = k2 + kq sign(f). At
+    f = 10 g the error of f is 1e-14 g for k2 = 100 ug/g^2, and 1e-11 g for k3 = 10 ug/g^3.
     """
     r = k3 * x * x
     s = k2 * x + kq * abs(x) + r

@@ -129,7 +129,8 @@ _ALL: Final = (
     # `gradient`: heat flow from a thermometer to the board; `rate`: a fit never uses this kind.
     Term('gradient', 'g_s', _gradient),
     Term('rate', 'dT_board/dt [K/s]', lambda _: state.Rate()),
-    # `board`: of a part that lags the board; `gradient_lag`: of a part between two thermometers.
+    # `board`: lag of a part behind the board; `gradient_lag`: the lagged gradient, a further
+    # column for a part between two thermometers.
     Term('board', 'T_board - lagged T_board', _part, positive=('tau_s',)),
     Term('gradient_lag', 'lagged g_s', _lagged_gradient, positive=('tau_s',)),
     # `square` with lag: for a curve over a part's temperature; without: squared heat flow.
