@@ -21,7 +21,7 @@ from thermo_comp.simulation.campaign import Position, parse_cyclogram, positions
 from thermo_comp.simulation.run import arrays
 from thermo_comp.thermal.lags import Lag, Play
 from thermo_comp.thermal.settings import DetectorSettings, ThermalConfig
-from thermo_comp.thermal.state import Gradient, StateLayout
+from thermo_comp.thermal.state import BOARD, Gradient, StateLayout
 from thermo_comp.thermal.tracker import ThermalTracker
 from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.columns import ColumnTable, bank, memory_of
@@ -164,6 +164,16 @@ def test_columns_sections_and_initial_lag_states_agree_with_formulas(bags):
     lines = [0, *(k for k, column in enumerate(bank(), start=6) if column.group == 'board')]
     np.testing.assert_allclose(data.kelvins[lines], rms[lines], rtol=1e-6)
     assert data.kelvins[1] == pytest.approx(rms[1] / (2.0 * np.abs(t).max()), rel=0.02)
+
+
+def test_the_board_temperature_is_measured_while_the_case_thermometer_is_silent(bags):
+    # Without case readings from 900 s on, a bag still has board temperatures for the lags.
+    bag = bags[0]
+    is_early = (bag.case.stamp_ns - bag.start_ns) * 1e-9 < 900.0
+    case = Readings(bag.case.stamp_ns[is_early], bag.case.value[is_early])
+    silent = replace(bag, temperatures={**bag.temperatures, 'case': case})
+    whole, track = (windows_of([each]).tracks[0] for each in (bag, silent))
+    np.testing.assert_allclose(track.states[:, BOARD], whole.states[:, BOARD], atol=0.01)
 
 
 @pytest.mark.parametrize('name', ['board', 'case'])

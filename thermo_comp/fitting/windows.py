@@ -460,18 +460,29 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
             tracker.read(*reading)
             reading = next(readings, None)
         rows.append(tracker.sample(stamp_ns))
-        is_fresh.append(not any(sensor.beyond(stamp_ns) for sensor in (board, *others)))
+        is_fresh.append([sensor.beyond(stamp_ns) == 0.0 for sensor in (board, *others)])
         is_heard.append(
             board.beyond(stamp_ns) <= config.temperature_timeout_s
             and all(sensor.beyond(stamp_ns) <= config.case_timeout_s for sensor in others)
         )
     states, is_known = np.array(rows), np.array(is_heard)
-    # The tracker holds the temperatures in a pause of the recording, after which they step. Lags
-    # after the pause depend on the temperatures in it: interpolate these between both sides.
-    fresh, places = np.flatnonzero(is_fresh), StateLayout(spec).places
-    for place in (BOARD, *(places[Gradient(name)] for name in spec.sensors)):
-        states[:, place] = np.interp(np.arange(len(states)), fresh, states[fresh, place])
+    _bridge_pauses(states, np.array(is_fresh), spec)
     n_unsettled = int(np.argmax(states[:, VAR_BOARD] <= 4.0 * np.median(states[:, VAR_BOARD])))
     is_known[:n_unsettled] = False
     start_s = (begin_ns - bag.start_ns) * 1e-9
     return Track(start_s, step_s, states, is_known, start_s + step_s * n_unsettled)
+
+
+def _bridge_pauses(states: Floats, is_fresh: Bools, spec: MemorySpec) -> None:
+    """
+    Interpolate board temperature and gradients while readings are missing, because lags after a
+    pause depend on the temperatures in it. The tracker holds these, and they step after the pause.
+
+    `states`: (n, width), changed in place; `is_fresh`: whether each thermometer, the board's first,
+    has a recent reading, (n, n_thermometers)
+    """
+    places, row = StateLayout(spec).places, np.arange(len(states))
+    of_gradients = [(places[Gradient(name)], is_fresh.all(axis=1)) for name in spec.sensors]
+    for place, fresh in ((BOARD, is_fresh[:, 0]), *of_gradients):
+        if fresh.any():
+            states[:, place] = np.interp(row, row[fresh], states[fresh, place])
