@@ -478,8 +478,8 @@ def _bridge_pauses(states: Floats, is_fresh: Bools, spec: MemorySpec) -> None:
     Interpolate board temperature and gradients while readings are missing, because lags after a
     pause depend on the temperatures in it. The tracker holds these, and they step after the pause.
 
-    `states`: (n, width), changed in place; `is_fresh`: whether each thermometer, the board's first,
-    has a recent reading, (n, n_thermometers)
+    `states`: (n, width), changed in place; `is_fresh`: whether a thermometer has a recent reading,
+    (n, n_thermometers), the board's first
     """
     places, row = StateLayout(spec).places, np.arange(len(states))
     of_gradients = [(places[Gradient(name)], is_fresh.all(axis=1)) for name in spec.sensors]
