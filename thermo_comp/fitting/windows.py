@@ -448,9 +448,11 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
     bag, detector = averaged(bag, model.detector, inputs, mean_s)
     config = ThermalConfig()
     tracker = ThermalTracker(detector, spec, config)
-    board, *others = tracker.thermometers.values()
+    thermometers = tracker.thermometers.values()  # the board's first
+    timeouts_s = np.full(len(thermometers), config.case_timeout_s)
+    timeouts_s[0] = config.temperature_timeout_s
     step_ns, begin_ns = round(step_s * 1e9), max(int(bag.board.stamp_ns[0]), bag.start_ns)
-    rows, is_heard, is_fresh = [], [], []
+    rows, overdue_s = [], []
     readings = iter(readings_in_order(bag, inputs))
     reading = next(readings, None)
     for stamp_ns in range(begin_ns, max(bag.end_ns, begin_ns) + step_ns, step_ns):
@@ -460,13 +462,10 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
             tracker.read(*reading)
             reading = next(readings, None)
         rows.append(tracker.sample(stamp_ns))
-        is_fresh.append([sensor.beyond(stamp_ns) == 0.0 for sensor in (board, *others)])
-        is_heard.append(
-            board.beyond(stamp_ns) <= config.temperature_timeout_s
-            and all(sensor.beyond(stamp_ns) <= config.case_timeout_s for sensor in others)
-        )
-    states, is_known = np.array(rows), np.array(is_heard)
-    _bridge_pauses(states, np.array(is_fresh), spec)
+        overdue_s.append([thermometer.beyond(stamp_ns) for thermometer in thermometers])
+    states, overdue = np.array(rows), np.array(overdue_s)
+    is_known = np.all(overdue <= timeouts_s, axis=1)
+    _bridge_pauses(states, overdue == 0.0, spec)
     n_unsettled = int(np.argmax(states[:, VAR_BOARD] <= 4.0 * np.median(states[:, VAR_BOARD])))
     is_known[:n_unsettled] = False
     start_s = (begin_ns - bag.start_ns) * 1e-9

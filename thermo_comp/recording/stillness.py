@@ -107,19 +107,26 @@ class CellAccumulator:
         """Add the next samples and angular rates, shape (n, 3), in file order, to the cells."""
         if not len(stamp_ns):
             return
-        use = (np.abs(samples) < _LARGEST).all(axis=1)
+        # Tests of three slices need a fifth of the time of a reduction over an axis of length 3.
+        x, y, z = (np.abs(samples) < _LARGEST).T
+        use = x & y & z
         before = int(stamp_ns[0]) - 1 if self._last_ns is None else self._last_ns
         use &= stamp_ns > np.maximum.accumulate(np.concatenate(([before], stamp_ns[:-1])))
         self._n_dropped += int((~use).sum())
         self._n_repeated += int((np.diff(stamp_ns, prepend=before) == 0).sum())
-        if self._full_scale is not None:
+        if not use.all():
+            stamp_ns, samples = stamp_ns[use], samples[use]
+            rate = None if rate is None else rate[use]
+        if self._full_scale is not None and len(samples):
             if self._full_scale == _WORD - 1.0 and not self._middle:
-                self._look_for_sign(samples[use])
-                self._full_scale = widened(self._full_scale, samples[use])
-            saturated = use & (np.abs(samples - self._middle) >= self._full_scale).any(axis=1)
-            self._n_saturated += int(saturated.sum())
-            use &= ~saturated
-        stamp_ns, samples = stamp_ns[use], samples[use]
+                self._look_for_sign(samples)
+                self._full_scale = widened(self._full_scale, samples)
+            x, y, z = (np.abs(samples - self._middle) < self._full_scale).T
+            use = x & y & z
+            if not use.all():
+                self._n_saturated += int((~use).sum())
+                stamp_ns, samples = stamp_ns[use], samples[use]
+                rate = None if rate is None else rate[use]
         if not len(stamp_ns):
             return
         if self._last_ns is None:
@@ -136,7 +143,6 @@ class CellAccumulator:
             self._n_looked_at += int((part[1:] != part[:-1]).any(axis=1).sum()) + 1
         self._is_integer = self._is_integer and bool((samples == np.rint(samples)).all())
         glitches = is_glitch(samples, self._quantum)
-        rate = None if rate is None else rate[use]
         if glitches.any():
             self._n_glitches += int(glitches.sum())
             stamp_ns, samples = stamp_ns[~glitches], samples[~glitches]
@@ -206,22 +212,23 @@ class CellAccumulator:
         since = stamp_ns - self._start_ns
         ids = since // self._cell_ns
         first = np.flatnonzero(np.concatenate(([True], ids[1:] != ids[:-1])))
-        columns = np.zeros((len(since), self._sums[0].shape[1]))
-        n = (columns.shape[1] - 9) // 2
-        columns[:, 1] = 1.0
-        columns[:, 2] = (since - ids * self._cell_ns) * 1e-9
-        columns[:, 3:6] = samples - self._shift
+        # Each row of `terms` is a column of `_sums`: sums along contiguous rows are fast.
+        terms = np.zeros((self._sums[0].shape[1], len(since)))
+        n = (len(terms) - 9) // 2
+        terms[1] = 1.0
+        terms[2] = (since - ids * self._cell_ns) * 1e-9
+        terms[3:6] = samples.T - self._shift[:, None]
         if n > 3 and rate is not None:
-            columns[:, 6:9] = np.where(np.abs(rate) < _LARGEST, rate, 0.0)
-        columns[:, 3 + n : -6] = columns[:, 3 : 3 + n] ** 2
+            terms[6:9] = np.where(np.abs(rate.T) < _LARGEST, rate.T, 0.0)
+        np.square(terms[3 : 3 + n], out=terms[3 + n : -6])
         last = self._sums[-1]
         before = np.concatenate((last[-1:, 0] if len(last) else ids[:1], ids[:-1]))
-        previous = self._last if len(last) else samples[:1]
-        change = np.diff(np.concatenate((previous, samples)), axis=0)
-        columns[:, -3:] = np.where((ids == before)[:, None], change**2, 0.0)
-        columns[:, -6:-3] = np.where((ids == before + 1)[:, None], change, 0.0)
+        previous = self._last - self._shift if len(last) else terms[3:6, :1].T
+        change = np.diff(terms[3:6], prepend=previous.T)
+        terms[-3:] = np.where(ids == before, change**2, 0.0)
+        terms[-6:-3] = np.where(ids == before + 1, change, 0.0)
         self._last = samples[-1:]
-        sums = np.add.reduceat(columns, first, axis=0)
+        sums = np.add.reduceat(terms, first, axis=1).T
         sums[:, 0] = ids[first]
         if len(last) and sums[0, 0] == last[-1, 0]:
             sums[0, 1:] += last[-1, 1:]
@@ -231,7 +238,10 @@ class CellAccumulator:
 
 def widened(full_scale: float, samples: Floats) -> float:
     """Return `full_scale`, or 2^23 - 1 or 2^31 - 1 counts if most samples exceed 65536."""
-    size = np.max(np.abs(samples), axis=1) if len(samples) else np.zeros(1)
+    size = np.abs(samples)
+    if np.max(size, initial=0.0) < 2.0 * _WORD:
+        return full_scale
+    size = size.max(axis=1)
     if np.median(size) < 2.0 * _WORD:
         return full_scale
     return next(2.0**bits - 1.0 for bits in _LONGER if np.median(size) < 2.0**bits or bits == 31)
