@@ -87,6 +87,7 @@ class TestUsage:
             (('export', 'a', '--to', 'ardupilot', '--device-id', '7', '-o', 'b'), '--to px4'),
             (('export', 'a', '--to', 'imu_tk', '--up', '0', '0', '1', '-o', 'b'),
              r'--up needs'),
+            (('export', 'a', '--to', 'imu_tk', '--number', '1', '-o', 'b'), r'--number needs'),
             (('export', 'a', '--to', 'betaflight', '-o', 'b'), r'betaflight'),
             (('report', '-o', 'b'), r'give bags, a calibration, or both'),
             (('fit', 'a.mcap', '-o', 'b', '--gravity', '9.8', '--rate-hz', '9'), r'for tables'),

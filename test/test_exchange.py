@@ -233,6 +233,12 @@ def test_impossible_arguments_of_import_and_export_are_refused(cubic):
     text = export_calibration(cubic, 'px4').text
     with pytest.raises(CalibrationError, match='no set of parameters 1'):
         import_calibration(text, serial='7', number=1)
+    for text_of_one in (
+        'SM: [1, 0, 0, 0, 1, 0, 0, 0, 1]\nbias: [0, 0, 0]',
+        '1 0 0 0 1 0 0 0 1  1 0 0 0 1 0 0 0 1  1 2 3',
+    ):
+        with pytest.raises(CalibrationError, match='no set of parameters 1, only one set'):
+            import_calibration(text_of_one, serial='7', number=1)
     empty = re.sub(r'TMAX\t45', 'TMAX\t5', text)
     with pytest.raises(CalibrationError, match=r'range 5\.\.5 degC is empty'):
         import_calibration(empty, serial='7')

@@ -199,6 +199,8 @@ def export(
 
     if device_id and to != 'px4':
         raise options.usage('--device-id needs --to px4')
+    if number is not None and to in ('imu_tk', 'imu_calib'):
+        raise options.usage('--number needs --to px4, ardupilot or kalibr')
     if up is not None and to not in ('px4', 'ardupilot'):
         raise options.usage('--up needs --to px4 or --to ardupilot')
     check_output(output, PARAMETERS, overwrite=force, others=[path])

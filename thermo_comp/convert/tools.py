@@ -264,7 +264,7 @@ def _write_kalibr(content: Content) -> str:
     )
 
 
-def _read_imu_tk(text: str, _number: int | None) -> Content | None:
+def _read_imu_tk(text: str, number: int | None) -> Content | None:
     """Read imu_tk's ``.calib``: 21 numbers, with or without headings; None for another format."""
     lines = (line for line in text.splitlines() if not _HEADING.match(line))
     try:
@@ -273,18 +273,25 @@ def _read_imu_tk(text: str, _number: int | None) -> Content | None:
         return None
     if len(numbers) != 21:
         return None
+    _refuse_number('imu_tk', number)
     T, K = numbers[:18].reshape(2, 3, 3)
     return _triad('imu_tk', _regular(T @ K), numbers[18:])
 
 
-def _read_imu_calib(text: str, _number: int | None) -> Content | None:
+def _read_imu_calib(text: str, number: int | None) -> Content | None:
     """Read imu_calib's YAML; None for another tool's file."""
     data = _mapping(text)
     if not {'SM', 'bias'} <= data.keys():
         return None
+    _refuse_number('imu_calib', number)
     matrix = _regular(_array(data['SM'], 'SM', 9).reshape(3, 3))
     bias = np.linalg.solve(matrix, _array(data['bias'], 'bias', 3))
     return _triad('imu_calib', matrix, np.asarray(bias, np.float64))
+
+
+def _refuse_number(tool: str, number: int | None) -> None:
+    if number is not None:
+        raise CalibrationError(f'a file of {tool} has no set of parameters {number}, only one set')
 
 
 def _read_kalibr(text: str, number: int | None) -> Content | None:
