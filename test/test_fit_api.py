@@ -137,6 +137,7 @@ def test_a_bag_of_another_environment_is_excluded_and_increases_the_claimed_sd()
     assert joint.static.x.bias_function == alone.static.x.bias_function
     later = tc.fit(with_another[-1:], gravity=G, input='m/s^2', prior=alone)
     assert later.axes == alone.axes
+    assert later.provenance.sources == alone.provenance.sources
     bag, up = with_another[-1], UPS[4] / np.linalg.norm(UPS[4])
     force = alone.correct(bag.time_s, bag.counts, **bag.temperatures).specific_force
     true_error = np.sqrt(np.nanmean((force - G * up) ** 2)) / MICRO_G

@@ -244,8 +244,7 @@ def _fit_one_environment(
     elif earlier is not None and not is_updated:
         # All bags contradict the prior's effects of temperature and cannot update them: the bags
         # count as recorded in another environment, and the prior is kept.
-        provenance = first.calibration.provenance
-        refit = replace(first, calibration=replace(earlier, provenance=provenance))
+        refit = replace(first, calibration=earlier)
     others = 'the other bags' if earlier is None else 'the prior'
     left_out = [bags[k] for k in excluded]
     calibration, finding = with_excluded_error(
