@@ -22,7 +22,6 @@ from ..text import one_line
 from ..typing import Bools, Floats
 from ..unit.calibration import Calibration, LackOfFit, RegimeSet
 from ..unit.gravity import MICRO_G
-from ..unit.metrics import means_by
 from .coverage import distinct_directions
 from .data_checks import POSITIONS_NEEDED, Finding, advice
 from .evidence import drift_variance
@@ -111,7 +110,7 @@ def contradiction(
     lack = np.square(lacks).max(axis=0) if lacks else np.zeros(3)
     ratio = np.sum(drift**2, axis=1) / np.sum(claimed + prior.sigma**2 + lack, axis=1)
     mean = np.bincount(data.bag, ratio) / np.maximum(np.bincount(data.bag), 1)
-    norm = _norm_errors(regression, state)
+    norm = regression.norm_errors(state)
     along = regression.at(state, prior).norms_by_unit @ inverse
     usual = np.mean(drift**2) + np.mean(np.sum(along**2, axis=1)) + offset_sd_of(earlier) ** 2
     may_update = bool(_is_far_above(float(np.mean(norm**2)), usual))
@@ -133,12 +132,6 @@ def _at_calibration(
     return regression, with_calibration(calibration, regression, state)
 
 
-def _norm_errors(regression: Regression, state: State) -> Floats:
-    """Return the error of |f| of each position's mean [m/s^2], shape (n_positions,)."""
-    means = means_by(regression.windows.position, regression.force(state))
-    return np.asarray(np.linalg.norm(means, axis=1) - regression.norms(state))
-
-
 def with_excluded_error(
     calibration: Calibration, bags: Sequence[ReducedBag], others: str, *, is_updated: bool
 ) -> tuple[Calibration, Finding]:
@@ -152,7 +145,7 @@ def with_excluded_error(
     windows = thermal_windows(bags, prior_model(calibration))
     regression, state = _at_calibration(calibration, windows.data, calibration.gravity_m_s2)
     drift = within_positions(regression.force(state), windows.data.position)
-    of_norms = np.mean(_norm_errors(regression, state) ** 2)
+    of_norms = np.mean(regression.norm_errors(state) ** 2)
     regimes = ~windows.is_dynamic, windows.is_dynamic
     # A regime without windows gets the drift of all windows.
     static, dynamic = (

@@ -24,6 +24,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..typing import Bools, Floats, Ints
+from ..unit.metrics import means_by
 from .layout import Layout, Tangent, lay_out
 from .series import Base, Series
 from .unknowns import Prior, State, Windows
@@ -229,6 +230,11 @@ class Equations(Series):
         if self.forces is not None:
             along = self.forces.linearise(along, state.nonlinear, rows)
         return np.asarray(along @ np.linalg.inv(state.inverse).T)
+
+    def norm_errors(self, state: State) -> Floats:
+        """Return the error of |f| of each position's mean [m/s^2], shape (n_positions,)."""
+        means = means_by(self.windows.position, self.force(state))
+        return np.asarray(np.linalg.norm(means, axis=1) - self.norms(state))
 
     def weight_sd(self, prior: Prior) -> Floats:
         """Return the prior sd of weights by bias and scale, axis, and column, (2, 3, m)."""
