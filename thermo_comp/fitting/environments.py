@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the exclusion of bags that were recorded in another thermal environment (such as still air)
-than most bags or a prior, and the error that the calibration states for these bags.
+than most bags or a prior calibration, and the error that the calibration states for these bags.
 
 In still air the board temperature responds to the case temperature in another way than in a
 chamber with a fan. No thermometer is at the axes, so in another environment the bias is another

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the joining of bags that are successive parts of one recording, as split by a recorder, or
-recorded one after the other while the unit is turned to the next attitude.
+Owns the joining of bags that are successive parts of one recording: a recorder split it, or the
+parts were recorded one after the other, and the unit was turned between them.
 
 Between the parts of a recording the unit may have stayed switched on, so the parts count as one
 turn-on: positions of one turn-on do not show how well the bias repeats from turn-on to turn-on.
-Lags do not restart where the recording's next bag begins, and a rest may continue in this bag.
+Lags continue from each part into the next part, and a rest may continue, too.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def joined(bags: Sequence[ReducedBag]) -> list[ReducedBag]:
     for bag in sorted(bags, key=lambda bag: bag.start_ns):
         before = [recording for recording in recordings if _continues(recording[-1], bag)]
         if before:
-            # If several (simulated) recordings end here, take the one with the smallest `_step`.
+            # If `bag` continues several (simulated) recordings, choose the smallest step.
             min(before, key=lambda recording: _step(recording[-1], bag)).append(bag)
         else:
             recordings.append([bag])
@@ -101,7 +101,7 @@ def _one_recording(parts: Sequence[ReducedBag]) -> ReducedBag:
 
 
 def _readings(parts: Sequence[Readings]) -> Readings:
-    """Join a thermometer's readings in successive parts; drop readings without a rising stamp."""
+    """Join a thermometer's readings in successive parts; drop a reading if no stamp has risen."""
     stamp_ns = np.concatenate([part.stamp_ns for part in parts])
     value = np.concatenate([part.value for part in parts])
     newest = np.maximum.accumulate(stamp_ns)
@@ -116,7 +116,7 @@ def _intervals(parts: Sequence[ReducedBag]) -> tuple[StillInterval, ...]:
         shift_s = 1e-9 * (part.start_ns - parts[0].start_ns)
         is_alike = abs(part.window_s - parts[0].window_s) < 0.01 * parts[0].window_s
         for number, rest in enumerate(part.intervals):
-            # Windows stay whole if as long, within 1 %, as those of the recording's first bag.
+            # Windows count as whole if their length is, within 1 %, that of the first part.
             n_whole = rest.n_whole if is_alike else 0
             begin_s, time = rest.begin_s + shift_s, rest.time + shift_s
             shifted = replace(rest, begin_s=begin_s, time=time, n_whole=n_whole)
