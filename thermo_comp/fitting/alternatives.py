@@ -29,7 +29,7 @@ def model_of(
 ) -> Model:
     """
     Return the model of the prior calibration; without a prior calibration, return the model that
-    `options` name, with all columns that need only thermometers in the bags.
+    `options` name, with all columns whose thermometers are in the bags.
 
     `parts`: the part whose temperature determines each axis, or None for the bank of lags
     """
@@ -124,5 +124,4 @@ def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
 
 
 def _better(fit: Fit | None, other: Fit) -> Fit:
-    """Return `other` if it is better than `fit` on left-out data, or if `fit` is None."""
     return other if fit is None or is_better(fit.selected.score, other.selected.score) else fit

@@ -163,7 +163,7 @@ def _valid_columns(
 
 
 def _of_columns(windows: ThermalWindows, mask: Bools) -> list[int]:
-    """Return the response columns that a mask selects, directly or in a curve over a part."""
+    """Return the response columns in a mask, also as summands of curves over parts."""
     sums, n_curves = windows.model.part_sums, len(windows.model.sets.groups)
     contained = mask[: sums.shape[1]] | (sums != 0.0)[mask[sums.shape[1] :]].any(axis=0)
     return [int(k) for k in np.flatnonzero(contained[n_curves:])]

@@ -65,7 +65,7 @@ def claim_of(fit: Fit, gravity_sd: float = 0.0, known_offset_sd: float = 0.0) ->
     """
     regression, chosen = fit.regression, fit.posterior
     # The rests of a mounting share an offset, but the regression has an offset for each rest. Give
-    # each offset `n_rests` times the variance, so that the mounting's mean keeps the variance.
+    # each offset `n_rests` times the variance: the mean offset of a mounting keeps its variance.
     mounting = regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
     prior = replace(chosen.prior, offset_sd=chosen.prior.offset_sd * n_rests**0.5)
@@ -85,7 +85,6 @@ def claim_of(fit: Fit, gravity_sd: float = 0.0, known_offset_sd: float = 0.0) ->
         covariance = covariance + _excess(mixture, posterior.covariance)
     covariance = covariance + _excess(_jackknifed(regression, posterior), covariance)
     if turn_on_variance:
-        # Derivatives of the unknowns w.r.t. a bias offset on each axis that all positions share.
         point = regression.at(posterior.state, prior)
         by_offset = np.array([point.by_offset(axis) for axis in range(3)])
         covariance = covariance + turn_on_variance * (by_offset.T @ by_offset)
@@ -119,8 +118,9 @@ def _over_offsets(
     n_mountings = int(windows.mounting[-1]) + 1
     is_single = windows.n_turn_ons == 1 < n_mountings
     if scale <= 0.0:
-        # An sd stated by the user includes mounting and turn-on offsets. The mean offset of m
-        # mountings has the variance sd^2 / m in the regression, but sd^2 if all share one offset.
+        # An sd stated by the user is that of mounting and turn-on offsets together. In the
+        # regression the mean offset of m mountings has the variance sd^2 / m. If the mountings
+        # share one offset, this mean has the variance sd^2.
         variance = offset_sd**2 * (1.0 - 1.0 / n_mountings) if is_single else 0.0
         return posterior.covariance, offset_sd, variance
     kind = 'mounting' if is_single or windows.has_turn_ons else 'both'
@@ -192,13 +192,14 @@ def _widened(
         is_of_means = np.mean(within**2, axis=0) < between
         weights = np.where(is_of_means, of_means.weights, state.weights)
         other = replace(of_means, weights=weights)
-        # With a tiny prior sd, columns only in the fit of the means have rows in the covariance.
+        # Columns that only the fit of the means has get a tiny prior sd, so that `with_unseen` has
+        # their weights.
         is_used = other.weights.any(axis=1) & (prior.column_sd == 0.0)
         prior = replace(prior, column_sd=np.where(is_used, 1e-9, prior.column_sd))
     with_unseen = regression.solve(state, prior, n_steps=0)
     layout = with_unseen.layout
-    # The added columns have the weight 0 in the fit: add the squares of the weights that the data
-    # prefer, and of the changes of the other unknowns with these weights.
+    # The weights of the added columns are 0 in the fit: add to the covariance the square of the
+    # step of all unknowns to the mode of the model with the added columns.
     step = regression.at(state, prior).solution[0][: layout.n_unit]
     difference = (as_vector(other, layout) - as_vector(state, layout))[: layout.n_unit]
     excess = np.outer(step, step) + 0.5 * np.outer(difference, difference)
@@ -210,10 +211,10 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
     Add to the prior the columns that the data do not determine, so that their variance is not 0.
 
     The weight of an inactive column is consistent with 0, but the data bound it only to ``1 /
-    sqrt(S)``, S being the information about the weight given the active columns. An added column
-    has the weight 0 and the sd ``min(1 / sqrt(S), prior sd)``. A column is added if this sd
-    exceeds two sd of a window's noise. For the comparison with the noise, the sd of a nearly
-    constant column is scaled to the RMS of the board temperature t [K].
+    sqrt(S)``, S being the information about the weight given the active columns. A column is
+    added, with the weight 0 and the sd ``min(1 / sqrt(S), prior sd)``, if this sd exceeds two sd
+    of a window's noise. For the comparison with the noise, the sd of a nearly constant column is
+    scaled to the RMS of the board temperature t [K].
     """
     groups, prior = np.array(regression.windows.groups), posterior.prior
     kelvins = regression.windows.kelvins
@@ -267,7 +268,7 @@ def _over_mountings(
     priors = [replace(prior, offset_sd=sd) for sd in tried.tolist()]
     fits = [regression.solve(posterior.state, each, n_steps=1) for each in priors]
     # If tilts of the supports were fitted to drifts that mounting offsets cause, the fitted sd of
-    # the tilts is too large: try a tenth of this sd, too (`n_steps` Gauss-Newton steps).
+    # the tilts is too large: try a tenth of this sd, too.
     rigid = [
         regression.solve(posterior.state, replace(each, tilt_sd=0.1 * each.tilt_sd), n_steps=3)
         for each in priors
@@ -295,7 +296,7 @@ def _mixture(
 
     The equations of all priors are linearised at the mode `posterior`. The priors' own modes
     differ by percents in bias and scale if the attitudes do not separate bias and scale. Equations
-    linearised there would give well determined combinations a part of the sds of bias and scale.
+    linearised at these modes would increase the sd of well determined sums of bias and scale.
     """
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
@@ -356,8 +357,8 @@ def _norm_evidence(
 def _jackknifed(regression: Regression, posterior: PosteriorMode) -> Floats:
     """
     Return the covariance of the unit's unknowns by the jackknife over the sections of the test,
-    less the share of noise, shape (n_unit, n_unit); 0 for one section, or if noise explains the
-    changes of the unknowns.
+    less the part due to noise, shape (n_unit, n_unit). The result is 0 if there is one section, or
+    if noise explains the changes of the unknowns.
     """
     n = posterior.layout.n_unit
     last = int(regression.windows.section.max())
@@ -375,7 +376,7 @@ def _jackknifed(regression: Regression, posterior: PosteriorMode) -> Floats:
     # Under noise alone each ratio (of squared change to variance) has mean 1 and variance 2.
     if ratio.sum() - len(ratio) < 2.0 * np.sqrt(2.0 * len(ratio)):
         return np.zeros((n, n))
-    # Noise contributes about len(ratio) to the sum of the ratios, lacking effects the rest.
+    # Noise contributes about len(ratio) to the sum of the ratios; model errors cause the rest.
     share = 1.0 - len(ratio) / ratio.sum()
     return np.asarray(share * last / (last + 1) * without.T @ without)
 

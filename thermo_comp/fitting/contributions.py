@@ -24,7 +24,7 @@ from .regression import PosteriorMode, Regression
 @dataclass(frozen=True)
 class Contributions:
     """
-    RMS contributions to the readings of an axis [m/s^2]; None if the fit lacks the unknowns.
+    RMS contributions to the samples of an axis [m/s^2]; None if the fit lacks the unknowns.
 
     thermal_response: response of the unit, less its value at the mean of the columns over all
         windows; RMS over the windows

@@ -314,5 +314,4 @@ def with_step(state: State, step: Floats, layout: Layout) -> State:
 
 
 def _unit_vector(vector: Floats) -> Floats:
-    """Scale vectors to length 1, shape (..., 3)."""
     return np.asarray(vector / np.linalg.norm(vector, axis=-1, keepdims=True))

@@ -68,7 +68,7 @@ class Candidates:
 def settle(
     regression: Regression, state: State, prior: Prior, candidates: Candidates, rounds: int = 25
 ) -> PosteriorMode:
-    """Update prior sds and noises, at most `rounds` times, until all change by less than 5 %."""
+    """Update prior sds and noises, at most `rounds` times, until changes are below about 5 %."""
     posterior = regression.solve(state, prior, n_steps=3)
     for _ in range(rounds):
         prior, change = _updated(regression, posterior, candidates)
@@ -121,7 +121,7 @@ def _updated(
 
     return moved, max(
         change('column_sd', moves & (effective > 0.3)),
-        # An sd of offsets counts only if the data determine more than one of these offsets.
+        # The sd of offsets counts for convergence if the data determine more than one offset.
         change('offset_sd') * bool(determined[layout.offset].sum() > 1.0),
         change('turn_on_sd') * bool(determined[layout.turn_on].sum() > 1.0),
         # A change of the sd of the supports' tilts by 15 % hardly changes the fit.
@@ -141,8 +141,8 @@ def _misalignment_sd(posterior: PosteriorMode) -> float:
     gamma = float(posterior.determined[posterior.layout.misalignment].sum())
     share = 1.5 * max(1.0 - 1.0 / max(gamma, 1.0), 0.0)
     square = share * np.sum(misalignment**2) + prior.misalignment_scale**2
-    # Upper bound of the sd: 0.03 rad, for separate sensors on a printed bracket. Misalignments of
-    # a larger sd would, by their second order, explain any error of |f| on six faces.
+    # Upper bound of the sd of M: 0.03 rad, for separate sensors on a printed bracket. A larger M
+    # would, by its second-order effect, explain any error of |f| on six faces.
     return min(float(np.sqrt(square / (share * gamma + 1.0))), 0.03)
 
 
@@ -284,9 +284,9 @@ def with_slow_noise(
             step, best = (step**0.5, best) if better is None else (step, better)
         return best
 
-    # Residuals lack the noise that the parameters absorb; the log evidence accounts for this part.
-    # All accelerometers have flicker noise, so a process with one correlation time is chosen only
-    # if its log evidence exceeds the log evidence of flicker noise by `CLEAR_GAIN`.
+    # Residuals lack the noise that the parameters absorb; the log evidence accounts for the
+    # absorbed noise. All accelerometers have flicker noise, so a process with one correlation time
+    # is chosen only if its log evidence exceeds that of flicker noise by `CLEAR_GAIN`.
     single, best = likeliest(1), likeliest(whitener.n_flicker)
     if single.log_evidence > best.log_evidence + CLEAR_GAIN:
         best = single
@@ -356,7 +356,6 @@ def undisturbed(residual: Floats, weight: Floats, position: Ints) -> Floats:
     size = residual * np.sqrt(weight)[:, None]
     for part in np.split(size, np.flatnonzero(np.diff(position)) + 1):
         if len(part) > 6:
-            # Subtract a running median over seven windows.
             np.subtract(part, median_filter(part, (7, 1), mode='mirror'), out=part)
     size = np.abs(size)
     # The 80 % quantile of |x| is 1.2816 sd of a normal x. The median of |x| is not used: it can be

@@ -90,7 +90,7 @@ class Layout:
 
     @cached_property
     def unit(self) -> Ints:
-        """Indices of the unit's unknowns in the equations of each axis; last: residual, (3, k)."""
+        """Indices of the unit's unknowns, then the residual, in each axis' equations, (3, k)."""
         common = np.append(self.shared, self.n_unit)
         return np.hstack((self.axis, np.tile(common, (3, 1))))
 

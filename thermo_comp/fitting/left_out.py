@@ -14,7 +14,8 @@ if the other positions determine |f|.
 
 Model A is better than B if the error of A is smaller by more than the standard error over folds,
 both for positions and for sections of the program; `gain` lists exceptions. Left-out positions
-detect columns that fit only one recording, left-out sections columns that fit only one program.
+detect columns that fit only one recording; left-out sections detect columns that fit only one
+program.
 
 References
 ----------
@@ -121,7 +122,7 @@ class Score:
     force: specific force in windows, by fits without their position, (n, 3); NaN if not scored
     drift: drift of each window, (n, 3), by a fit without its position; if that fit does not
         determine the drift, by a fit without its section
-    halves: drift in each half of the program by a fit without it, at temperatures of both halves
+    halves: drift of each left-out half of the program, at temperatures that both halves contain
     noise: white noise of a window, RMS of the axes [m/s^2]
     by_thermometer: error of a window due to a coarse board thermometer, RMS of the axes [m/s^2]
     settled: expected error of the bias at settled temperatures [m/s^2] (`settled_error`), or 0
@@ -179,10 +180,10 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     The gain is the sum of the log ratios (`Folds.gain_of`) of the drift of positions and of
     sections. For drifts that agree to 5 %, the gain is the log ratio of the errors of left-out
     |f|, or 0 if this ratio is below two standard errors. The gain is 0 if `after` has a larger
-    error of left-out |f|, or (with `by_halves`) a larger drift of left-out halves of the program,
-    a sign of too many columns. If noise does not explain the drift, the gain is also 0 for a
-    larger expected error of the bias at settled temperatures. A drift that noise explains need not
-    decrease for a gain, because the drift of left-out soaks contains no effects of ramps.
+    error of left-out |f|; a larger drift of left-out halves of the program (with `by_halves`), a
+    sign of too many columns; or a drift above the noise and a larger expected error of the bias at
+    settled temperatures. A drift that noise explains need not decrease for a gain, because the
+    drift of left-out soaks contains no effects of ramps.
     """
     *drifts, norms = _beyond_thermometer(before, after)
     drift = [ratio for ratio in drifts if ratio]
@@ -347,8 +348,9 @@ def _by_positions(
 
 def _determines_drift(point: Point, posterior: PosteriorMode, root: Floats, rows: slice) -> bool:
     """
-    Whether the fit without a position, of covariance ``root @ root.T``, determines the drift in
-    `rows`: the variance of the drift is below 10 times (variance by the fit to all data + noise).
+    Whether the fit without a position, with the covariance ``root @ root.T``, determines the drift
+    in the position's windows `rows`: the variance of the drift is below 10 times (variance by the
+    fit to all data + noise).
     """
     regression, sigma = point.regression, point.prior.sigma
     if not point.layout.used[0].any():

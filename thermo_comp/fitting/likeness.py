@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the correlation of the columns of two terms in the bags, and the advice of a further bag in
+Owns the correlation of the columns of two terms in the bags, and the advice to record a bag in
 which these columns are less correlated.
 
 In one environment the board follows the case in the same way in all bags. A lag of the board
@@ -97,7 +97,7 @@ def likenesses(fit: Fit) -> tuple[Likeness, ...]:
     try:
         pairs = [_likeness(point, groups, pair) for pair in _PAIRS if used & {*pair.groups}]
     except np.linalg.LinAlgError:
-        # The fit has succeeded: a rounding error in this table of correlations must not end it.
+        # The fit has succeeded: a rounding error in this table must not turn it into a failure.
         return ()
     return tuple(likeness for likeness in pairs if likeness is not None)
 

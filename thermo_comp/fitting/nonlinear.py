@@ -263,7 +263,6 @@ def choose(
 
 
 def _blank_term(kind: Kind, sd: float, *evidence: float) -> NonlinearTerm:
-    """Return a nonlinear term with all coefficients 0."""
     return NonlinearTerm(kind, (0.0,) * 3, (0.0,) * 3, sd, *evidence)
 
 

@@ -164,7 +164,6 @@ def _without_range(column: Column) -> Column:
 
 
 def _in_one_stage(column: Column, tau_s: float) -> Column:
-    """Return a column whose lag has one stage, no share of the gradient, and no lead."""
     return replace(column, tau_s=tau_s, second_tau_s=0.0, sensor_share=0.0, lead_s=0.0)
 
 

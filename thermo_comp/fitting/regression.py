@@ -3,9 +3,10 @@
 """
 Owns the regression: the posterior of all unknowns under a given prior, by Gauss-Newton.
 
-All unknowns have Gaussian priors, except attitudes, whose prior is flat. Gauss-Newton finds the
-mode; the inverse of the Hessian is the covariance. The unknowns of positions and bags are
-eliminated first. A position is left out by subtracting its part of the unit's normal equations.
+All unknowns have Gaussian priors, except attitudes without a pose, whose prior is flat. Gauss-
+Newton finds the mode; the inverse of the Hessian is the covariance. The unknowns of positions and
+bags are eliminated first. A position is left out by subtracting its part of the unit's normal
+equations.
 
 References
 ----------
@@ -282,7 +283,7 @@ class Regression(Equations):
     _linearised: tuple[State, Layout, Floats, Tangent, Normal] | None = None
 
     def at(self, state: State, prior: Prior, grams: Floats | None = None) -> Point:
-        """Linearise about `state`, inactive weights set to 0; `grams` default to all windows'."""
+        """Linearise about `state`, inactive weights set to 0; `grams`: None for all windows."""
         layout = self.layout(prior.column_sd > 0.0, prior.nonlinear_sd > 0.0)
         grams = self.products(layout.used).of_positions if grams is None else grams
         return Point(self, without_inactive(state, layout), prior, layout, grams)

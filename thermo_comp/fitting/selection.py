@@ -31,7 +31,7 @@ from .unknowns import POSE_SD, InformativePrior, Prior, State
 from .windows import BEND, CURVE, LAGS, PART, PRODUCTS, SET, ThermalWindows
 
 #: Ratio of a large initial sd of mounting offsets to the scale of their prior. In data sheets the
-#: bias of tactical triads repeats to 0.3 .. 1 mg over turn-ons, 10 to 20 times this scale.
+#: bias of tactical triads repeats to 0.3 .. 1 mg over turn-ons, 10 to 20 times the prior's scale.
 LARGE_OFFSETS = 10.0
 
 
@@ -110,7 +110,6 @@ _Model = TypeVar('_Model', Trial, Selected)
 
 
 def _best(chosen: Trial, trials: Sequence[Trial]) -> Trial:
-    """Return the best model: each trial that is better than the chosen model replaces it."""
     for trial in trials:
         if is_better(chosen.score, trial.score):
             chosen = trial
@@ -211,7 +210,7 @@ class Growth:
         return chosen
 
     def trials(self, chosen: Trial, groups: Sequence[str]) -> list[Trial]:
-        """Add to the chosen model each of up to 4 sets of groups with large gains; fit each."""
+        """Fit the chosen model plus each of up to 4 sets of groups that have large gains."""
         absent = [group for group in groups if group in self.free and group not in chosen.groups]
         if not absent:
             return []
@@ -244,9 +243,9 @@ def better_start(fits: Sequence[_Model]) -> _Model:
     """
     Choose by left-out data between the first fit, begun with a small prior sd of mounting offsets
     or of the misalignment, and the last fit, begun with a large sd. If left-out data do not
-    decide, the last fit is chosen if its log density is larger by `CLEAR_GAIN`. Mounting offsets
-    and misalignments explain |f| in few positions equally well, but only misalignments predict |f|
-    in a new position.
+    decide, the last fit must have a log density larger by `CLEAR_GAIN`. Mounting offsets and
+    misalignments explain |f| in few positions equally well, but only misalignments predict |f| in
+    a new position.
     """
     small, large = fits[0], fits[-1]
     evidence_gain = log_density(large.posterior) - log_density(small.posterior)

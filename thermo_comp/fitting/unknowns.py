@@ -187,7 +187,7 @@ class Noise(NamedTuple):
 
     @property
     def rate(self) -> float:
-        """Slow noise per root of a short time / white-noise sd of a window [1/sqrt(s)]."""
+        """Sd of slow noise's change in a short time t / (sqrt(t) white-noise sd) [1/sqrt(s)]."""
         return math.sqrt(sum(2.0 * self.ratio / time_s for time_s in self.times_s))
 
 
