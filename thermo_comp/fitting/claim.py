@@ -118,9 +118,9 @@ def _over_offsets(
     n_mountings = int(windows.mounting[-1]) + 1
     is_single = windows.n_turn_ons == 1 < n_mountings
     if scale <= 0.0:
-        # An sd stated by the user is that of mounting and turn-on offsets together. In the
-        # regression the mean offset of m mountings has the variance sd^2 / m. If the mountings
-        # share one offset, this mean has the variance sd^2.
+        # An sd stated by the user is for the sum of mounting and turn-on offset. In the regression
+        # the mean offset of m mountings has the variance sd^2 / m. If the mountings share one
+        # offset, the mean has the variance sd^2.
         variance = offset_sd**2 * (1.0 - 1.0 / n_mountings) if is_single else 0.0
         return posterior.covariance, offset_sd, variance
     kind = 'mounting' if is_single or windows.has_turn_ons else 'both'

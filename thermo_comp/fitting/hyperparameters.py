@@ -286,7 +286,7 @@ def with_slow_noise(
 
     # Residuals lack the noise that the parameters absorb; the log evidence accounts for the
     # absorbed noise. All accelerometers have flicker noise, so a process with one correlation time
-    # is chosen only if its log evidence exceeds that of flicker noise by `CLEAR_GAIN`.
+    # is chosen only if it has more log evidence than flicker noise, by `CLEAR_GAIN`.
     single, best = likeliest(1), likeliest(whitener.n_flicker)
     if single.log_evidence > best.log_evidence + CLEAR_GAIN:
         best = single

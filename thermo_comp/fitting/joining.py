@@ -100,7 +100,7 @@ def _one_recording(parts: Sequence[ReducedBag]) -> ReducedBag:
 
 
 def _readings(parts: Sequence[Readings]) -> Readings:
-    """Join a thermometer's readings in successive parts; keep only readings of rising stamps."""
+    """Join a thermometer's readings in successive parts; keep readings with rising stamps only."""
     stamp_ns = np.concatenate([part.stamp_ns for part in parts])
     value = np.concatenate([part.value for part in parts])
     newest = np.maximum.accumulate(stamp_ns)

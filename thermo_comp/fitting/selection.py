@@ -243,9 +243,9 @@ def better_start(fits: Sequence[_Model]) -> _Model:
     """
     Choose by left-out data between the first fit, begun with a small prior sd of mounting offsets
     or of the misalignment, and the last fit, begun with a large sd. If left-out data do not
-    decide, the last fit must have a log density larger by `CLEAR_GAIN`. Mounting offsets and
-    misalignments explain |f| in few positions equally well, but only misalignments predict |f| in
-    a new position.
+    decide, the last fit is chosen only for a log density larger by `CLEAR_GAIN`. Mounting offsets
+    and misalignments explain |f| in few positions equally well, but only misalignments predict |f|
+    in a new position.
     """
     small, large = fits[0], fits[-1]
     evidence_gain = log_density(large.posterior) - log_density(small.posterior)
