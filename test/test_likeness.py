@@ -95,6 +95,6 @@ def test_an_inflation_above_100_gives_advice(parts, correlation, n_directions, i
     assert [finding.name for finding in found] == ['alike'] * is_advised
     if is_advised:
         assert 'on axis x' in found[0].message
-        assert 'correlation 0.99600; a model with both gives each weight an sd 11' in (
+        assert 'correlation 0.99600; in a model with both, the sd of a weight is 11' in (
             found[0].message
         )

@@ -28,10 +28,10 @@ def model_of(
     bags: Sequence[ReducedBag], options: FitOptions, parts: tuple[Part, Part, Part] | None = None
 ) -> Model:
     """
-    Return the model of the prior calibration; without a prior, the model named in `options` with
-    all columns whose thermometers the bags contain.
+    Return the model of the prior calibration; without a prior calibration, return the model that
+    `options` name, with all columns whose thermometers are in the bags.
 
-    `parts`: the part of the unit, with its lag, of each axis, or None for the bank of lags
+    `parts`: the part whose temperature determines each axis, or None for the bank of lags
     """
     prior, reference = options.prior, options.reference_temperature
     if prior is not None:
@@ -45,7 +45,7 @@ def model_of(
         {name for name, readings in bag.temperatures.items() if len(readings.value)}
         for bag in bags
     )
-    # Thermometers of the model beside the board's: case (recorded or not), and those in every bag.
+    # Thermometers beside the board's: case (recorded or not), and any others that are in all bags.
     sensors = 'case', *sorted(set.intersection(*recorded) - {'board', 'case'})
     detector = options.detector or learn_detector(bags)
     columns: tuple[Column, ...] = ()
@@ -71,8 +71,8 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     fit = _with_lags(windows, problem)
     has_case = all(len(bag.case.value) for bag in bags)
     has_choice = has_case and options.prior is None and options.detector is None
-    # Compare detectors if the chosen model, or a model with an almost equal score (`is_near`) and
-    # less than 80 % of the chosen model's noise on each axis, has a curve for each regime.
+    # Compare detectors if the chosen model has a curve for each regime, or if such a model has an
+    # almost equal score (`is_near`) and less than 80 % of the chosen model's noise on each axis.
     trials = fit.selected.trials
     chosen = next(trial for trial in trials if trial.is_chosen)
     limit = 0.8 * chosen.posterior.prior.sigma
@@ -100,16 +100,16 @@ def windows_of(
     tracks: Sequence[Track] | None = None,
     undisturbed: Floats | None = None,
 ) -> ThermalWindows:
-    """Return the windows of bags; `tracks`: thermal states of the bags, if computed before."""
+    """Return the windows of bags; `tracks`: thermal states of the bags, if already computed."""
     windows = with_forces(thermal_windows(bags, model, tracks), options)
     return replace(windows, data=replace(windows.data, undisturbed=undisturbed))
 
 
 def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
     """
-    Fit models with one lag per axis (`find_parts`) until the left-out drift of a fit is at most
-    `Parts.most_drift`; if there is no such fit, also fit the model of `windows`. Return the best
-    fit. With a prior calibration, or for Golovach's model, fit only the model of `windows`.
+    Fit models with one lag per axis (`find_parts`) until one has a left-out drift of at most
+    `Parts.most_drift`. Unless there is such a model, also fit the model of `windows`. Return the
+    best fit. With a prior calibration, or for Golovach's model, fit only the model of `windows`.
     """
     bags, options = problem.bags, problem.options
     is_free = options.prior is None and options.model != 'golovach'
@@ -124,5 +124,4 @@ def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
 
 
 def _better(fit: Fit | None, other: Fit) -> Fit:
-    """Return `other` if it is better than `fit` on left-out data, or if `fit` is None."""
     return other if fit is None or is_better(fit.selected.score, other.selected.score) else fit

@@ -50,7 +50,7 @@ def build_calibration(
     earlier: Calibration | None = None,
     nonlinearity: Nonlinearity | None = None,
 ) -> Calibration:
-    """Return a fit's calibration; valid ranges include the ranges of the prior, `earlier`."""
+    """Return a fit's calibration; its valid ranges include the ranges of `earlier`, the prior."""
     (windows, regression, *_), posterior = fit, fit.posterior
     model, prior, state, layout = windows.model, posterior.prior, posterior.state, claim.layout
     # Columns of the response whose weights are in the covariance, also if the weight is 0.
@@ -163,7 +163,7 @@ def _valid_columns(
 
 
 def _of_columns(windows: ThermalWindows, mask: Bools) -> list[int]:
-    """Return the response columns that a mask selects, directly or in a sum of `part_sums`."""
+    """Return the response columns in a mask, also as summands of curves over parts."""
     sums, n_curves = windows.model.part_sums, len(windows.model.sets.groups)
     contained = mask[: sums.shape[1]] | (sums != 0.0)[mask[sums.shape[1] :]].any(axis=0)
     return [int(k) for k in np.flatnonzero(contained[n_curves:])]

@@ -4,14 +4,14 @@
 Owns the published uncertainty: the covariance of the fit, increased for columns that the data do
 not determine, and for effects that the model lacks.
 
-The standard deviation of mounting and turn-on offsets, unless the user states it, is marginalised:
-the covariance is that of a mixture of fits on a grid of this standard deviation. The weight of a
-fit in the mixture is its evidence, limited by the evidence of |f| in the positions, times the
-prior density of the offset sd (half-Student [1]_ without a prior calibration). The covariance
-includes the error of local gravity, which changes all scale factors by the same ratio.
+Unless the user states the sd of mounting and turn-on offsets, this sd is marginalised: a mixture
+of fits, one for each sd of a grid, has the published covariance. The weight of a fit in the
+mixture is its evidence, limited by the evidence of |f| in the positions, times the prior density
+of the offset sd (half-Student [1]_ without a prior calibration). The covariance includes the error
+of local gravity, which changes all scale factors by the same ratio.
 
 If the model lacks an effect, the best weights of columns differ between sections of the chamber
-program. A jackknife [2]_ estimates these differences, as large as the error in another program.
+program. A jackknife [2]_ estimates these differences: errors in another program are as large.
 
 References
 ----------
@@ -65,7 +65,7 @@ def claim_of(fit: Fit, gravity_sd: float = 0.0, known_offset_sd: float = 0.0) ->
     """
     regression, chosen = fit.regression, fit.posterior
     # The rests of a mounting share an offset, but the regression has an offset for each rest. Give
-    # each offset `n_rests` times the variance, so that the mounting's mean keeps the variance.
+    # each offset `n_rests` times the variance: the mean offset of a mounting keeps its variance.
     mounting = regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
     prior = replace(chosen.prior, offset_sd=chosen.prior.offset_sd * n_rests**0.5)
@@ -85,7 +85,6 @@ def claim_of(fit: Fit, gravity_sd: float = 0.0, known_offset_sd: float = 0.0) ->
         covariance = covariance + _excess(mixture, posterior.covariance)
     covariance = covariance + _excess(_jackknifed(regression, posterior), covariance)
     if turn_on_variance:
-        # Derivatives of the unknowns by a bias offset on each axis that all positions share.
         point = regression.at(posterior.state, prior)
         by_offset = np.array([point.by_offset(axis) for axis in range(3)])
         covariance = covariance + turn_on_variance * (by_offset.T @ by_offset)
@@ -119,8 +118,9 @@ def _over_offsets(
     n_mountings = int(windows.mounting[-1]) + 1
     is_single = windows.n_turn_ons == 1 < n_mountings
     if scale <= 0.0:
-        # An sd stated by the user includes mounting and turn-on offsets. The mean offset of m
-        # mountings has the variance sd^2 / m in the regression, but sd^2 if all share one offset.
+        # An sd stated by the user is for the sum of mounting and turn-on offset. In the regression
+        # the mean offset of m mountings has the variance sd^2 / m. If the mountings share one
+        # offset, the mean has the variance sd^2.
         variance = offset_sd**2 * (1.0 - 1.0 / n_mountings) if is_single else 0.0
         return posterior.covariance, offset_sd, variance
     kind = 'mounting' if is_single or windows.has_turn_ons else 'both'
@@ -148,20 +148,19 @@ def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Fl
     Return the values to try for the sd of the offsets of mountings or turn-ons [m/s^2], and the
     log prior density of the logarithm of this sd at these values.
 
-    `scale`: `Prior.offset_scale` [m/s^2]; `known_sd`: offset sd by a prior calibration [m/s^2],
-    0 without a prior calibration; `kind`: 'mounting', 'turn-on' or 'both', see `prior_ratio`
+    `scale`: scale of the sd's prior in the fit [m/s^2]; `known_sd`: sd of the offsets by a prior
+    calibration [m/s^2], else 0; `kind`: 'mounting', 'turn-on' or 'both', see `prior_ratio`
     """
     if known_sd:
         # A test of 12 positions determines the sd of mounting offsets within a factor of 1.5.
         ratio = 10.0 ** np.arange(-1.5, 1.51, 0.125)
         return known_sd * ratio, log_student(np.log(ratio) / np.log(1.5))
-    # Scale of the prior of the sd, a half-Student density, relative to `scale`. 'mounting':
-    # mountings within a turn-on; 'turn-on': a single turn-on, which does not show how well the
-    # bias repeats (a value between 0 and `LARGE_OFFSETS`); 'both': several turn-ons, or mountings
-    # that each begin with a turn-on.
+    # Scale of the half-Student prior of the sd, divided by `scale`, for offsets of these kinds.
+    # 'mounting': of mountings within a turn-on; 'turn-on': of a single turn-on, which does not
+    # show how well the bias repeats; 'both': of turn-ons, or of mountings each with a turn-on.
     prior_ratio = {'mounting': 1.0 / 3.0, 'turn-on': 1.0, 'both': LARGE_OFFSETS}[kind]
-    # The log evidence is smooth over the grid's step, a third of a decade of the sd. The smallest
-    # sd is far below the error of a long test (0.05 ug). The density of the logarithm of the sd is
+    # The log evidence changes smoothly over the grid's step, a third of a decade. The smallest sd
+    # is far below the error of a long test (0.05 ug). The density of the logarithm of the sd is
     # the density of the sd times the sd.
     ratio = 10.0 ** np.linspace(-3.45, 2.25, 19)
     return scale * ratio, log_student(ratio / prior_ratio) + np.log(ratio)
@@ -179,11 +178,7 @@ def _places(layout: Layout, widened: Layout) -> Ints:
 def _widened(
     regression: Regression, posterior: PosteriorMode, typical: Floats, of_means: State | None
 ) -> tuple[Layout, Floats]:
-    """
-    Return layout and covariance, extended by the columns that the data do not determine.
-
-    `typical`, `of_means`: see `Fit`
-    """
+    """Return layout and covariance, extended by the columns that the data do not determine."""
     prior, state = _with_unseen(regression, posterior, typical), posterior.state
     other = state
     if of_means is not None:
@@ -197,13 +192,14 @@ def _widened(
         is_of_means = np.mean(within**2, axis=0) < between
         weights = np.where(is_of_means, of_means.weights, state.weights)
         other = replace(of_means, weights=weights)
-        # Columns that only `of_means` has get a tiny prior sd: the covariance then has their rows.
+        # Columns that only the fit of the means has get a tiny prior sd, so that `with_unseen` has
+        # their weights.
         is_used = other.weights.any(axis=1) & (prior.column_sd == 0.0)
         prior = replace(prior, column_sd=np.where(is_used, 1e-9, prior.column_sd))
     with_unseen = regression.solve(state, prior, n_steps=0)
     layout = with_unseen.layout
-    # The added columns have the weight 0 in the fit: add the squares of the weights that the data
-    # prefer, and of the changes of the other unknowns with these weights.
+    # The weights of the added columns are 0 in the fit: add to the covariance the square of the
+    # step of all unknowns to the mode of the model with the added columns.
     step = regression.at(state, prior).solution[0][: layout.n_unit]
     difference = (as_vector(other, layout) - as_vector(state, layout))[: layout.n_unit]
     excess = np.outer(step, step) + 0.5 * np.outer(difference, difference)
@@ -215,16 +211,16 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
     Add to the prior the columns that the data do not determine, so that their variance is not 0.
 
     The weight of an inactive column is consistent with 0, but the data bound it only to ``1 /
-    sqrt(S)``, S being the information about the weight given the active columns. A column gets the
-    weight 0 and the sd ``min(1 / sqrt(S), prior sd)``, if this sd exceeds two sd of a window's
-    noise. For the comparison with the noise, the sd of a nearly constant column is scaled to the
-    RMS of the board temperature t [K].
+    sqrt(S)``, S being the information about the weight given the active columns. A column is
+    added, with the weight 0 and the sd ``min(1 / sqrt(S), prior sd)``, if this sd exceeds two sd
+    of a window's noise. For the comparison with the noise, the sd of a nearly constant column is
+    scaled to the RMS of the board temperature t [K].
     """
     groups, prior = np.array(regression.windows.groups), posterior.prior
     kelvins = regression.windows.kelvins
     active = groups[prior.column_sd.any(axis=0)]
-    # Columns to add are those of lags and curves (few temperatures do not determine all powers),
-    # and those active in only one of bias and scale, whose drifts one attitude does not separate.
+    # Add columns of lags and curves (few temperatures do not determine all powers), and columns
+    # active only in the bias or only in the scale: one attitude does not separate their drifts.
     curves = [PART if PART in active else CURVE]
     may = np.isin(groups, [*LAGS, *curves]) | prior.column_sd.any(axis=0)
     inactive = regression.inactive(posterior, may & typical.any(axis=0))
@@ -248,12 +244,12 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
         typical = np.minimum(typical, of_curve)
         # A curve column that the data do not determine may change the curve's slope by 50 %.
         sd = np.where(groups == CURVE, np.minimum(sd, 0.5 * of_curve), sd)
-    # n lags together must have at most the prior variance of one lag: each limit is divided by n.
+    # n lags together have at most the prior variance of one lag: divide each sd limit by sqrt(n).
     is_lag = is_of_lags & (sd > 0.0)
     share = np.sqrt(np.maximum(is_lag.sum(axis=1, keepdims=True), 1))
     sd = np.where(is_lag, np.minimum(sd, typical / share), sd)
     units = np.array([[1.0], [1.0 / (regression.gravity or 1.0)]])
-    # A column is nearly constant if its `kelvins` are below 1 % of the `kelvins` of column t.
+    # A column is nearly constant if its RMS / slope [K] is below 1 % of the RMS of column t.
     is_constant = kelvins < 0.01 * float(kelvins[0])
     ratio = np.where(is_constant, float(kelvins[0]) / np.maximum(kelvins, 1e-9), 1.0)
     matters = (sd > 0.0) & (sd * ratio > 2.0 * float(np.mean(prior.sigma)) * units)
@@ -272,7 +268,7 @@ def _over_mountings(
     priors = [replace(prior, offset_sd=sd) for sd in tried.tolist()]
     fits = [regression.solve(posterior.state, each, n_steps=1) for each in priors]
     # If tilts of the supports were fitted to drifts that mounting offsets cause, the fitted sd of
-    # the tilts is too large: try a tenth of this sd, too. Its mode is some steps from the fit.
+    # the tilts is too large: try a tenth of this sd, too.
     rigid = [
         regression.solve(posterior.state, replace(each, tilt_sd=0.1 * each.tilt_sd), n_steps=3)
         for each in priors
@@ -296,11 +292,11 @@ def _mixture(
     regression: Regression, posterior: PosteriorMode, priors: Sequence[Prior], log_weight: Floats
 ) -> tuple[Floats, Floats]:
     """
-    Return the unit's covariance about the mode by a mixture over `priors`, and their weights.
+    Return the covariance about the mode by a mixture over `priors`, and the weight of each prior.
 
-    The equations of all priors are linearised at the mode `posterior`. Bias and scale that the
-    attitudes do not separate differ by percents between the priors' modes: linearised there, the
-    equations would give a part of the sds of bias and scale to well determined combinations.
+    The equations of all priors are linearised at the mode `posterior`. The priors' own modes
+    differ by percents in bias and scale if the attitudes do not separate bias and scale. Equations
+    linearised at these modes would increase the sd of well determined sums of bias and scale.
     """
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
@@ -361,8 +357,8 @@ def _norm_evidence(
 def _jackknifed(regression: Regression, posterior: PosteriorMode) -> Floats:
     """
     Return the covariance of the unit's unknowns by the jackknife over the sections of the test,
-    less the share of noise, shape (n_unit, n_unit); 0 for one section, or if noise explains the
-    changes of the unknowns.
+    less the part due to noise, shape (n_unit, n_unit). The result is 0 if there is one section, or
+    if noise explains the changes of the unknowns.
     """
     n = posterior.layout.n_unit
     last = int(regression.windows.section.max())
@@ -380,7 +376,7 @@ def _jackknifed(regression: Regression, posterior: PosteriorMode) -> Floats:
     # Under noise alone each ratio (of squared change to variance) has mean 1 and variance 2.
     if ratio.sum() - len(ratio) < 2.0 * np.sqrt(2.0 * len(ratio)):
         return np.zeros((n, n))
-    # Noise contributes about len(ratio) to the sum of the ratios: the rest is by lacking effects.
+    # Noise contributes about len(ratio) to the sum of the ratios; model errors cause the rest.
     share = 1.0 - len(ratio) / ratio.sum()
     return np.asarray(share * last / (last + 1) * without.T @ without)
 

@@ -24,14 +24,14 @@ from .regression import PosteriorMode, Regression
 @dataclass(frozen=True)
 class Contributions:
     """
-    RMS contributions to the readings of an axis [m/s^2]; None if the fit lacks the unknowns.
+    RMS contributions to the samples of an axis [m/s^2]; None if the fit lacks the unknowns.
 
     thermal_response: response of the unit, less its value at the mean of the columns over all
         windows; RMS over the windows
     initial_lag_states: effect of the initial lag states, RMS over the windows
     support_tilt: effect of the tilts less its mean in each position, RMS over the windows
-    mounting_offsets, turn_on_offsets: RMS of the bias offsets of all positions, and of all bags;
-        it includes the posterior variance, as |f| shows only the vertical part of an offset
+    mounting_offsets, turn_on_offsets: RMS of the bias offsets of all positions, and of all bags,
+        with the posterior variance added, because |f| shows only the vertical part of an offset
     slow_noise: sd of the slow noise, see `Noise`
     """
 
@@ -50,7 +50,7 @@ def contributions_of(regression: Regression, posterior: PosteriorMode) -> Contri
     residual = regression.residual(state, layout)
 
     def effect_of(name: str) -> Floats:
-        """Return the part of the readings that vanishes without the unknowns `name`, (n, 3)."""
+        """Return the part of the samples that the fit explains by the unknowns `name`, (n, 3)."""
         zero = np.zeros_like(getattr(state, name))
         return regression.residual(replace(state, **{name: zero}), layout) - residual
 

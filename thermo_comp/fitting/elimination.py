@@ -27,7 +27,7 @@ def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
     Return the lower Cholesky factors of matrices that are positive definite except for rounding
     errors, shape (..., n, n).
 
-    Each matrix is scaled to a unit diagonal, or by the root of a given `diagonal`, shape (..., n).
+    Each matrix is scaled to a unit diagonal, or by the roots of a given `diagonal`, (..., n).
     Jitters of rising size are added to the scaled diagonal until a Cholesky factor exists.
     """
     square = np.einsum('...ii->...i', matrix) if diagonal is None else diagonal
@@ -92,7 +92,7 @@ def inverse_root(factor: Floats) -> Floats:
 class Blocks:
     """
     Diagonal blocks of the normal equations whose k unknowns are eliminated: the blocks of the n
-    positions or of the n bags, or the single block `Reduced.common`.
+    positions or of the n bags, or the single block of the prior of sums (`Reduced.common`).
 
     root: inverse of each block's lower Cholesky factor, shape (n, k, k)
     whitened: `root` times the off-diagonal block of the eliminated and the m remaining unknowns

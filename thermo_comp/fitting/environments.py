@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the exclusion of bags that were recorded in another thermal environment (such as still air)
-than most bags or a prior, and the error that the calibration states for these bags.
+than most bags or a prior calibration, and the error that the calibration states for these bags.
 
 In still air the board temperature responds to the case temperature in another way than in a
 chamber with a fan. No thermometer is at the axes, so in another environment the bias is another
@@ -38,7 +38,6 @@ from .windows import ThermalWindows, thermal_windows
 
 
 def _is_far_above(square: Floats | float, usual: float) -> Bools:
-    """Whether the mean square error `square` exceeds 5^2 times the mean square error `usual`."""
     return np.asarray(square > 5.0**2 * usual)
 
 
@@ -116,7 +115,7 @@ def contradiction(
     may_update = bool(_is_far_above(float(np.mean(norm**2)), usual))
     is_far = _is_far_above(mean, 1.0)
     if np.mean(is_far) > 0.5:
-        # A change of environment hardly shows in some attitudes: all bags count if most deviate.
+        # A change of environment hardly shows in some attitudes: if most bags deviate, return all.
         is_far[:] = True
     may_update |= len(distinct_directions(state.up)) >= POSITIONS_NEEDED
     return np.flatnonzero(is_far).tolist(), may_update

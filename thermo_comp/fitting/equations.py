@@ -3,7 +3,7 @@
 """
 Owns the measurement equation of the windows, and its linearisation.
 
-Equation [m/s^2] of the mean reading N of window w, position p, axis i; K0: nominal scale::
+Equation [m/s^2] of the mean sample N of window w, position p, axis i; K0: nominal scale::
 
     N / K0 = kappa a (1 + S s) + b + B beta + o_p + o_b + kappa (A l_p)_i g + noise,
     a = (A u_p)_i g,  A = M^-1,  M: misalignment,  kappa: scale factor / K0,  b: bias,
@@ -69,7 +69,7 @@ class Equations(Series):
         )
 
     def norms(self, state: State) -> Floats:
-        """Return |f| of each position, without its error `State.stretch`, (n_positions,)."""
+        """Return |f| of each position, without its relative error `State.stretch`, shape (n,)."""
         if self.forces is None:
             return np.full(self.windows.n_positions, self.gravity)
         return self.forces.norms(state.radius, np.zeros_like(state.stretch))
@@ -80,7 +80,7 @@ class Equations(Series):
         return np.asarray(self.forces.norms(state.radius, state.stretch)[:, None])
 
     def layout(self, used: Bools, nonlinear: Bools | None = None) -> Layout:
-        """Return `lay_out`'s result, cached; `nonlinear`: active coefficients, None for all."""
+        """Return the indices of the unknowns; `nonlinear`: active coefficients, None for all."""
         if nonlinear is None:
             nonlinear = np.ones(self.n_coefficients, dtype=bool)
         key = used.tobytes() + nonlinear.tobytes()
@@ -99,10 +99,10 @@ class Equations(Series):
 
     def _effects(self, state: State) -> tuple[Floats, Floats, Floats, Floats, Floats]:
         """
-        Return, at the reference temperature, the force `along` the axes; the derivatives of the
-        readings by rotations of the attitude, (n_positions, 3, 2); the readings without the bias,
+        Return, at the reference temperature, the force `along` the axes; derivatives of samples
+        w.r.t. rotations of the attitude, (n_positions, 3, 2); samples without the bias,
         (n_positions, 3); the sum of the nonlinear terms and the sum of their changes per kelvin,
-        (2, n_positions, 3); and the derivatives of both sums by the force.
+        (2, n_positions, 3); and the derivatives of these two sums w.r.t. the force.
         """
         force = self.along(state)
         along_axes = np.einsum('ij,pjt->pit', state.inverse, state.tangents)
@@ -156,8 +156,8 @@ class Equations(Series):
 
     def _combined(self, state: State, base: Base, n_starts: int) -> Floats:
         """
-        Return, as combinations of base series (see `Tangent`): 1 + S s of the scale; the readings'
-        derivatives by kappa, the force along the axis and the initial lag states; the residual.
+        Return, as combinations of base series (see `Tangent`): 1 + S s of the scale; derivatives
+        of samples w.r.t. kappa, force along the axis and initial lag states; the residual.
         """
         force, _, without_bias, (terms, terms_by_t), (slope, slope_by_t) = self._effects(state)
         on_bias, on_scale = state.weights[:, :, base.columns]
@@ -178,10 +178,11 @@ class Equations(Series):
         self, state: State, layout: Layout, base: Base, scaled: int
     ) -> tuple[Ints, Floats | float]:
         """
-        Return place and factor, see `Tangent`, of each active nonlinear coefficient.
+        Return `place` and `factor` of the `Tangent` for each active nonlinear coefficient.
 
         The factor 1 + S s of the scale multiplies the nonlinear terms at the reference
-        temperature, but not their changes per kelvin, where its effect is negligible.
+        temperature. The changes per kelvin of these terms lack this factor, whose effect on them
+        is negligible.
         """
         active = np.flatnonzero(layout.nonlinear[0] >= 0)
         if self.forces is None or not len(active):
@@ -192,7 +193,7 @@ class Equations(Series):
         return place, state.kappa[:, None] * value[..., active % k]
 
     def _by_misalignment(self, state: State) -> Floats:
-        """Return the derivatives of kappa times the force by the elements of M^-1, (n, 3, 3)."""
+        """Return derivatives of kappa times the force w.r.t. the elements of M^-1, (n, 3, 3)."""
         result = np.zeros((len(state.up), 3, 3))
         # Rows and columns of the three elements below the diagonal of the inverse of M.
         rows, columns = [1, 2, 2], [0, 0, 1]
@@ -215,14 +216,14 @@ class Equations(Series):
         return result
 
     def residual(self, state: State, layout: Layout) -> Floats:
-        """Measured minus predicted readings of all windows, shape (n, 3) [m/s^2]."""
+        """Measured minus predicted mean samples of all windows, shape (n, 3) [m/s^2]."""
         base, position = self.products(layout.used).base, self.windows.position
         series = self.of(base)
         series[:, 1 + base.lagged] += self.starts(state, base)[position] * series[:, base.at_start]
         return np.asarray(np.einsum('nb,nib->ni', series, self.misfit(state, base)[position]))
 
     def force(self, state: State, rows: slice = slice(None)) -> Floats:
-        """Return the force of windows, corrected as by the compensator, (n, 3) [m/s^2]."""
+        """Return the specific force of windows as the compensator corrects it, (n, 3) [m/s^2]."""
         active = np.flatnonzero(state.weights.any(axis=(0, 1)))
         columns, (on_bias, on_scale) = self.columns[rows, active], state.weights[:, :, active]
         along = self.measured[rows] - state.bias - columns @ on_bias.T
@@ -237,7 +238,7 @@ class Equations(Series):
         return np.asarray(np.linalg.norm(means, axis=1) - self.norms(state))
 
     def weight_sd(self, prior: Prior) -> Floats:
-        """Return the prior sd of weights by bias and scale, axis, and column, (2, 3, m)."""
+        """Return prior sds of the m columns' weights in bias and scale of each axis, (2, 3, m)."""
         return np.asarray(prior.column_sd[:, None] * self.windows.share)
 
     def precision(self, prior: Prior, layout: Layout) -> Floats:
@@ -319,5 +320,4 @@ def with_step(state: State, step: Floats, layout: Layout) -> State:
 
 
 def _unit_vector(vector: Floats) -> Floats:
-    """Scale vectors to length 1, shape (..., 3)."""
     return np.asarray(vector / np.linalg.norm(vector, axis=-1, keepdims=True))

@@ -58,7 +58,7 @@ class Inactive:
     Q: Floats
 
     def _in_prior_sd(self, column_sd: Floats, wanted: Bools) -> tuple[Floats, Floats, Ints]:
-        """Return S and Q of `wanted` columns for weights in prior sds; each weight's column."""
+        """Return S, Q and column of each weight of `wanted` columns, for weights in prior sds."""
         sd = np.repeat(column_sd[self.part, self.column] * wanted[self.column], 3)
         at = np.flatnonzero(sd > 0.0)
         S = self.S[np.ix_(at, at)] * np.outer(sd[at], sd[at])
@@ -79,8 +79,8 @@ class Inactive:
         """
         Choose up to `most` columns from the mask `wanted`, (m,), by forward selection.
 
-        The next column is that with the largest gain in log evidence given the columns already
-        chosen; the selection ends when this gain is below `least`.
+        Each step chooses the column with the largest gain in log evidence, given the columns
+        already chosen; the selection ends when the largest gain is below `least`.
         """
         S, Q, column = self._in_prior_sd(column_sd, wanted)
         result = np.zeros_like(wanted)

@@ -4,12 +4,12 @@
 Owns the estimation of prior sds and noises, and the removal of columns of small log Bayes factor.
 
 Each column has one prior standard deviation of its weights in the bias of all axes and one in the
-scale. All bends (changes of slope at knees) have one sd of the change of slope in the bias and one
-in the scale, which set the smoothness of the curves. Newton's steps move each sd, unless fixed,
-to the mode of the log evidence [1]_ plus the log density of a hyperprior, which is log-normal with
-centre sd0 and variance tau^2 of log sd. At this mode
+scale. All bends (changes of slope at knees) share one prior sd of the change of slope of the bias,
+and one for the scale; these sds set the smoothness of the curves. Newton's steps move each sd that
+is not fixed to the mode of the log evidence [1]_ plus the log density of a hyperprior. The
+hyperprior is log-normal with centre sd0 and variance tau^2 of log sd. At the mode of a prior sd
 ``effective parameters + log(sd / sd0) / tau^2 = sum w^2 / sd^2``, w being the weights of the
-column on the three axes. Without information about a column its prior sd stays at sd0.
+column on the three axes. The prior sd of a column without information stays at sd0.
 
 References
 ----------
@@ -43,7 +43,7 @@ STUDENT_NU = 4.0
 LEAST_GAIN = 1.0
 #: Gain in log evidence that makes a model clearly more likely than another: odds of 55 : 1.
 CLEAR_GAIN = 4.0
-#: Variance of the natural log of a prior sd in the hyperprior: 1 sd is a factor of ten.
+#: Variance of the natural log of a prior sd in its hyperprior: one sd is a factor of ten.
 LOG_VARIANCE = float(np.log(10.0)) ** 2
 _Value = Floats | float
 
@@ -68,7 +68,7 @@ class Candidates:
 def settle(
     regression: Regression, state: State, prior: Prior, candidates: Candidates, rounds: int = 25
 ) -> PosteriorMode:
-    """Update prior sds and noises up to `rounds` times, until all change by less than some 5 %."""
+    """Update prior sds and noises, at most `rounds` times, until changes are below about 5 %."""
     posterior = regression.solve(state, prior, n_steps=3)
     for _ in range(rounds):
         prior, change = _updated(regression, posterior, candidates)
@@ -81,7 +81,7 @@ def settle(
 def _updated(
     regression: Regression, posterior: PosteriorMode, candidates: Candidates
 ) -> tuple[Prior, float]:
-    """Move prior sds and noises towards their modes; return also the largest |log(new / old)|."""
+    """Move prior sds and noises towards their modes; also return the largest |log(new / old)|."""
     prior, layout, determined = posterior.prior, posterior.layout, posterior.determined
     sd, power = prior.column_sd, np.sum(posterior.state.weights**2, axis=1)
     moves = (sd > 0.0) & ~candidates.fixed
@@ -121,11 +121,10 @@ def _updated(
 
     return moved, max(
         change('column_sd', moves & (effective > 0.3)),
-        # A change of `offset_sd` delays convergence only if the data determine more than one
-        # offset.
+        # The sd of offsets counts for convergence if the data determine more than one offset.
         change('offset_sd') * bool(determined[layout.offset].sum() > 1.0),
         change('turn_on_sd') * bool(determined[layout.turn_on].sum() > 1.0),
-        # A change of the sd of tilts by 15 % hardly changes the fit.
+        # A change of the sd of the supports' tilts by 15 % hardly changes the fit.
         change('tilt_sd') / 3.0,
         change('pose_sd'),
         change('start_variance_ratio') / 4.0,
@@ -142,18 +141,18 @@ def _misalignment_sd(posterior: PosteriorMode) -> float:
     gamma = float(posterior.determined[posterior.layout.misalignment].sum())
     share = 1.5 * max(1.0 - 1.0 / max(gamma, 1.0), 0.0)
     square = share * np.sum(misalignment**2) + prior.misalignment_scale**2
-    # Limit of the misalignment sd: 0.03 rad, for separate sensors on a printed bracket. Larger
-    # misalignments would, to second order, explain any error of |f| on six faces.
+    # Upper bound of the sd of M: 0.03 rad, for separate sensors on a printed bracket. A larger M
+    # would, by its second-order effect, explain any error of |f| on six faces.
     return min(float(np.sqrt(square / (share * gamma + 1.0))), 0.03)
 
 
 def _start_variance_ratio(posterior: PosteriorMode) -> float:
-    """Move the prior variance ratio of the initial lag states to its mode."""
+    """Return the mode of the variance of the initial lag states / variance in the node's prior."""
     start, places = posterior.state.start, posterior.layout.start
     if not places.size:
         return posterior.prior.start_variance_ratio
     # The node's prior (a variance ratio of 1) counts as one more lag state, so that the lag states
-    # of a single bag cannot make `start_variance_ratio` very small.
+    # of a single bag cannot make the ratio very small.
     gamma = float(posterior.determined[places].sum())
     if gamma <= -1.0:
         raise np.linalg.LinAlgError('rounding errors exceed the information about lag states')
@@ -161,7 +160,7 @@ def _start_variance_ratio(posterior: PosteriorMode) -> float:
 
 
 def _tilt_sd(posterior: PosteriorMode, kelvins: float) -> float:
-    """Move the prior sd of tilts towards its mode; `kelvins`: RMS of T_board - T_reference [K]."""
+    """Move the sd of supports' tilts to its mode; `kelvins`: RMS of T_board - T_reference [K]."""
     sd, tilt = posterior.prior.tilt_sd, posterior.state.tilt
     if not tilt.size:
         return sd
@@ -188,7 +187,7 @@ def _toward(effective: _Value, power: _Value, sd: _Value, slope: _Value, rise: _
     """
     Return Newton's step of log sd, within +-2, to solve ``power / sd^2 = effective + slope``.
 
-    `slope`, `rise`: minus the first and second derivative of the log hyperprior by log sd
+    `slope`, `rise`: minus the first and second derivative of the log hyperprior w.r.t. log sd
     """
     ratio = power / (sd * sd)
     gradient = ratio - effective - slope
@@ -207,7 +206,7 @@ def _offset_sd(posterior: PosteriorMode, sd: float, places: Ints) -> float:
     slope = (STUDENT_NU + 1.0) * square / (STUDENT_NU + square)
     rise = 2.0 * (STUDENT_NU + 1.0) * STUDENT_NU * square / (STUDENT_NU + square) ** 2
     step = _toward(effective, power, sd, slope, rise + 0.1)
-    # Bounds of the offset sd: 1e-4 times the prior's scale, and 5 mg (0.05 m/s^2), of cheap MEMS.
+    # Bounds of the offset sd: 1e-4 times the prior's scale; 5 mg (0.05 m/s^2), as in cheap MEMS.
     return float(np.clip(sd * np.exp(step), 1e-4 * scale, 0.05))
 
 
@@ -230,7 +229,7 @@ def log_student(x: Floats) -> Floats:
 
 
 def white_noise(regression: Regression, posterior: PosteriorMode) -> Floats:
-    """Return the white noise of each axis from residuals and effective parameters, (3,)."""
+    """Return the sd of white noise of each axis from residuals and effective parameters, (3,)."""
     n = len(regression.weight)
     determined, layout = posterior.determined, posterior.layout
     of_axis = determined[layout.axis].sum(axis=1) + determined[layout.offset].sum(axis=0)
@@ -240,8 +239,7 @@ def white_noise(regression: Regression, posterior: PosteriorMode) -> Floats:
     common = (layout.shared, layout.up, layout.stretch, layout.tilt, layout.start)
     spent = of_axis + sum(determined[places].sum() for places in common) / 3.0
     sigma = np.sqrt(posterior.square / np.maximum(n - spent, 0.05 * n))
-    # The samples of an axis may be constant: set its noise to at least a hundredth of the noise of
-    # the noisiest axis.
+    # The samples of an axis may be constant: its noise is at least 1 % of the noisiest axis' sd.
     least_sigma = np.full(3, max(posterior.prior.least_sigma, 0.01 * float(sigma.max())))
     if not regression.windows.has_drifts:
         # If no column changes within a position, slow noise may absorb the whole residual. The
@@ -256,7 +254,7 @@ def white_noise(regression: Regression, posterior: PosteriorMode) -> Floats:
 def with_slow_noise(
     regression: Regression, posterior: PosteriorMode, candidates: Candidates
 ) -> PosteriorMode:
-    """Estimate slow noise from the residuals, then by log evidence; refit with this noise."""
+    """Estimate slow noise from the residuals, then by log evidence; refit with the slow noise."""
     prior, whitener = posterior.prior, regression.whitener
     residual = regression.residual(posterior.state, posterior.layout) / prior.sigma
     estimated = whitener.estimate(residual, regression.weight)
@@ -286,9 +284,9 @@ def with_slow_noise(
             step, best = (step**0.5, best) if better is None else (step, better)
         return best
 
-    # Residuals lack the noise that the parameters absorb; the log evidence accounts for it. All
-    # accelerometers have flicker noise, so a process with one correlation time is chosen only if
-    # its log evidence exceeds the log evidence of flicker noise by `CLEAR_GAIN`.
+    # Residuals lack the noise that the parameters absorb; the log evidence accounts for the
+    # absorbed noise. All accelerometers have flicker noise, so a process with one correlation time
+    # is chosen only if it has more log evidence than flicker noise, by `CLEAR_GAIN`.
     single, best = likeliest(1), likeliest(whitener.n_flicker)
     if single.log_evidence > best.log_evidence + CLEAR_GAIN:
         best = single
@@ -298,7 +296,7 @@ def with_slow_noise(
 def pruned_fit(
     regression: Regression, posterior: PosteriorMode, candidates: Candidates, rounds: int = 25
 ) -> PosteriorMode:
-    """Drop columns as long as each removal lowers the log evidence by less than `LEAST_GAIN`."""
+    """Drop columns in rounds while a round lowers the log evidence by less than `LEAST_GAIN`."""
     while True:
         prior = _pruned(regression, posterior, candidates)
         if np.array_equal(prior.column_sd, posterior.prior.column_sd):
@@ -313,8 +311,8 @@ def _pruned(regression: Regression, posterior: PosteriorMode, candidates: Candid
     """Drop columns with a log Bayes factor below `LEAST_GAIN`, one by one, smallest first."""
     layout, prior, covariance = posterior.layout, posterior.prior, posterior.covariance.copy()
     mode = as_vector(posterior.state, layout)[: layout.n_unit]
-    # A column with a fixed sd in the scale can explain the drift that the same column causes in
-    # the bias, so the column is kept in the bias, too.
+    # A column's weight in the scale can explain drifts that its weight in the bias causes: keep a
+    # column with a fixed sd in the scale also in the bias.
     is_kept = candidates.fixed | candidates.forced | candidates.fixed[1]
     droppable = np.argwhere((prior.column_sd > 0.0) & ~is_kept).tolist()
     column_sd, weight_sd = prior.column_sd.copy(), regression.weight_sd(prior)
@@ -343,9 +341,9 @@ def _pruned(regression: Regression, posterior: PosteriorMode, candidates: Candid
 
 def downweigh(regression: Regression, posterior: PosteriorMode) -> None:
     """
-    If the residual of a window is more than 3 sd from the local median (in a position of up to 6
-    windows: from 0), reduce the window's weight so that the weighted distance becomes 3 sd. Keep
-    all weights if `windows.undisturbed` is given.
+    If the residual of a window differs by more than 3 sd from the median of 7 windows around it
+    (from 0 in a position of up to 6 windows), reduce the window's weight so that the weighted
+    difference is 3 sd. Keep all weights if `windows.undisturbed` is given.
     """
     windows = regression.windows
     if windows.undisturbed is None:
@@ -358,7 +356,6 @@ def undisturbed(residual: Floats, weight: Floats, position: Ints) -> Floats:
     size = residual * np.sqrt(weight)[:, None]
     for part in np.split(size, np.flatnonzero(np.diff(position)) + 1):
         if len(part) > 6:
-            # Subtract a running median over seven windows.
             np.subtract(part, median_filter(part, (7, 1), mode='mirror'), out=part)
     size = np.abs(size)
     # The 80 % quantile of |x| is 1.2816 sd of a normal x. The median of |x| is not used: it can be

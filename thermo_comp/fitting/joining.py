@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the joining of bags that are successive parts of one recording, as split by a recorder, or
-recorded one after the other while the unit is turned to the next attitude.
+Owns the joining of bags that are successive parts of one recording: a recorder split it, or the
+parts were recorded one after the other, and the unit was turned between them.
 
 Between the parts of a recording the unit may have stayed switched on, so the parts count as one
 turn-on: positions of one turn-on do not show how well the bias repeats from turn-on to turn-on.
-Lags do not restart where the recording's next bag begins, and a rest may continue in this bag.
+Lags continue from each part into the next part, and a rest may continue, too.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from .sources import FitSource
 
 
 def joined(bags: Sequence[ReducedBag]) -> list[ReducedBag]:
-    """Join each bag to the bag at whose end it begins; keep the order of the given bags."""
+    """Join each bag that continues another bag to that bag; keep the order of the given bags."""
     recordings: list[list[ReducedBag]] = []
     for bag in sorted(bags, key=lambda bag: bag.start_ns):
         before = [recording for recording in recordings if _continues(recording[-1], bag)]
         if before:
-            # If several (simulated) recordings end here, take the one with the smallest `_step`.
+            # If `bag` continues several (simulated) recordings, the smallest step decides.
             min(before, key=lambda recording: _step(recording[-1], bag)).append(bag)
         else:
             recordings.append([bag])
@@ -61,7 +61,6 @@ def _step(part: ReducedBag, bag: ReducedBag) -> float:
 
 
 def _one_recording(parts: Sequence[ReducedBag]) -> ReducedBag:
-    """Return the recording that consists of successive parts, as one bag."""
     first, last = parts[0], parts[-1]
     sources = [part.source for part in parts]
 
@@ -101,7 +100,7 @@ def _one_recording(parts: Sequence[ReducedBag]) -> ReducedBag:
 
 
 def _readings(parts: Sequence[Readings]) -> Readings:
-    """Join a thermometer's readings in successive parts; drop readings without a rising stamp."""
+    """Join a thermometer's readings in successive parts; keep readings with rising stamps only."""
     stamp_ns = np.concatenate([part.stamp_ns for part in parts])
     value = np.concatenate([part.value for part in parts])
     newest = np.maximum.accumulate(stamp_ns)
@@ -116,7 +115,7 @@ def _intervals(parts: Sequence[ReducedBag]) -> tuple[StillInterval, ...]:
         shift_s = 1e-9 * (part.start_ns - parts[0].start_ns)
         is_alike = abs(part.window_s - parts[0].window_s) < 0.01 * parts[0].window_s
         for number, rest in enumerate(part.intervals):
-            # Windows stay whole if as long, within 1 %, as those of the recording's first bag.
+            # Windows count as whole if they are, within 1 %, as long as the first part's windows.
             n_whole = rest.n_whole if is_alike else 0
             begin_s, time = rest.begin_s + shift_s, rest.time + shift_s
             shifted = replace(rest, begin_s=begin_s, time=time, n_whole=n_whole)
@@ -131,9 +130,9 @@ def _intervals(parts: Sequence[ReducedBag]) -> tuple[StillInterval, ...]:
 def _is_one_rest(before: StillInterval, after: StillInterval, window_s: float) -> bool:
     """
     Whether a rest continues in the next part: the gap is at most three windows long, and on each
-    axis the step over the gap is at most five times the RMS of the steps between successive
-    windows or, as rounding may set most steps to 0, twice the largest of these steps. Up to 20
-    windows on each side of the gap are used; with fewer than 10 steps the result is False.
+    axis the step over the gap is at most five times the RMS, or twice the largest, of the steps
+    between successive windows (rounding may set most of these steps to 0). Up to 20 windows on
+    each side of the gap are used; with fewer than 10 steps the result is False.
     """
     gap_s = 1e-9 * (after.start_ns - before.end_ns)
     means = before.mean[: before.n_whole][-20:], after.mean[:20]

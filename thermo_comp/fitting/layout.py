@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 class Layout:
     """
     Indices of the unknowns of a fit, named as in `State`, in the vector of all unknowns: first the
-    unknowns of the unit, then for each bag those of its positions and those of the bag itself.
+    unknowns of the unit, then for each bag the unknowns of its positions and of the bag itself.
 
     axis: kappa, bias, active weights and active nonlinear coefficients of each axis, shape (3, k)
     weights: weights of each column in the bias and in the scale, -1 if inactive, shape (2, 3, m)
@@ -90,7 +90,7 @@ class Layout:
 
     @cached_property
     def unit(self) -> Ints:
-        """Indices of the unit's unknowns in the equations of each axis; last: residual, (3, k)."""
+        """Indices of the unit's unknowns, then the residual, in each axis' equations, (3, k)."""
         common = np.append(self.shared, self.n_unit)
         return np.hstack((self.axis, np.tile(common, (3, 1))))
 
@@ -205,21 +205,20 @@ class Normal(NamedTuple):
 @dataclass(frozen=True)
 class Tangent:
     """
-    The measurement equations linearised about a state, by the base series (`series.Base`) at the
-    initial lag states of this state.
+    The measurement equations linearised about a state, as sums of base series (`series.Base`).
 
     The derivative of the readings w.r.t. an unknown is a factor times a base series, or times a
     linear combination of base series (one of `combined`). For axis i, position p and unknown u the
     derivative is ``factor[p, i, u]`` times series ``place[u]``: a base series or, from index
-    n_base on, one of `combined`. The order of the unknowns of an axis is: those of the position
-    (2 of the attitude, stretch, offset, tilts), of the bag (initial lag states, turn-on offset),
-    and of the unit (kappa, bias, weights, nonlinear coefficients, radius, 3 of the misalignment, 2
-    of each pose). The last element is for the residual, measured minus predicted.
+    n_base on, one of `combined`. Unknowns of an axis, in this order: of the position (2 of the
+    attitude, stretch, offset, tilts), of the bag (initial lag states, turn-on offset), and of the
+    unit (kappa, bias, weights, nonlinear coefficients, radius, 3 of the misalignment, 2 of each
+    pose). The last element is for the residual, measured minus predicted.
 
     combined: weights of the base series in each combination, (n_positions, 3, n_base, n_combined)
     place: index of each unknown's series, a base series or one of `combined`, shape (k + 1,)
-    factor: factor of this series in the unknown's derivative, shape (n_positions, 3, k + 1)
-    n_local: number of the unknowns of position and bag, which come first in the order above
+    factor: factor of each unknown's series in its derivative, shape (n_positions, 3, k + 1)
+    n_local: number of the unknowns of position and bag, the first unknowns of an axis
     n_bias: number of unknowns after kappa that have the factor 1: the bias and its weights
     n_scale: number of weights in the scale, which follow the weights in the bias
     scale: the factor of the weights in the scale, shape (n_positions, 3)
@@ -280,7 +279,8 @@ class Tangent:
     def of(self, rows: Floats) -> Floats:
         """
         Return the derivatives of m linear functions of the readings, such as the mean, shape
-        (n_positions, 3, m, k + 1); `rows`: the functions of base series, (n_positions, m, n_base).
+        (n_positions, 3, m, k + 1); `rows`: these functions of the base series, (n_positions, m,
+        n_base).
         """
         combined = rows[:, None] @ self.combined
         of_base = np.broadcast_to(rows[:, None], (*combined.shape[:3], rows.shape[2]))

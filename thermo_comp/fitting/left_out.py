@@ -8,12 +8,14 @@ and so is each section and each half of the chamber's program, in all positions 
 halves detect columns that interpolate between sections of one chamber program but would fail in
 another program. The left-out windows are corrected as the node would correct them: with the unit's
 parameters alone, initial lag states at their prior mean, no mounting offsets and no tilts of the
-support. The errors are the drift (the force along each axis less its mean over the position, which
-does not depend on the attitude) and, if the other positions determine |f|, ``|f| - g``.
+support. One error is the drift: the corrected force along each axis less its mean over the
+position. The drift does not depend on the attitude. The other error is ``|f| - g``; it is scored
+if the other positions determine |f|.
 
 Model A is better than B if the error of A is smaller by more than the standard error over folds,
 both for positions and for sections of the program; `gain` lists exceptions. Left-out positions
-detect columns that fit only one recording, left-out sections columns that fit only one program.
+detect columns that fit only one recording; left-out sections detect columns that fit only one
+program.
 
 References
 ----------
@@ -104,7 +106,7 @@ class Folds:
         return max(estimates, key=lambda estimate: abs(estimate[0]) / max(estimate[1], 1e-12))
 
     def is_noise(self, other: Folds, noise: float) -> bool:
-        """Whether white noise explains the errors in the folds that `self` and `other` score."""
+        """Whether white noise explains the errors in the folds that are scored for both models."""
         is_scored = np.isfinite(self.square) & np.isfinite(other.square)
         square = np.average(self.square[is_scored], weights=self.windows[is_scored])
         return bool(square <= (_NOISE_RATIO * noise) ** 2)
@@ -117,10 +119,10 @@ class Score:
 
     positions, sections: drift of left-out positions, and of left-out sections of the program
     norms: ``|f| - g`` of left-out positions in which the other positions determine |f|
-    force: force in each window by a fit without its position, (n, 3); NaN if |f| is not scored
+    force: specific force in windows, by fits without their position, (n, 3); NaN if not scored
     drift: drift of each window, (n, 3), by a fit without its position; if that fit does not
         determine the drift, by a fit without its section
-    halves: drift in each half of the program by a fit without it, at temperatures of both halves
+    halves: drift of each left-out half of the program, at temperatures that both halves contain
     noise: white noise of a window, RMS of the axes [m/s^2]
     by_thermometer: error of a window due to a coarse board thermometer, RMS of the axes [m/s^2]
     settled: expected error of the bias at settled temperatures [m/s^2] (`settled_error`), or 0
@@ -167,21 +169,21 @@ class Score:
 
 
 def is_better(before: Score, after: Score, *, by_halves: bool = True) -> bool:
-    """Whether the model of `after` is better on left-out data than that of `before` (`gain`)."""
+    """Whether the model of `after` is better on left-out data than the model of `before`."""
     return gain(before, after, by_halves=by_halves) > 0.0
 
 
 def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     """
-    Return the gain of the model of `after` over that of `before` if it is significant, else 0.
+    Return the gain of the model of `after` over the model of `before`, 0 if it is insignificant.
 
     The gain is the sum of the log ratios (`Folds.gain_of`) of the drift of positions and of
-    sections. If the drifts of both models agree to 5 %, the gain is the log ratio of the errors of
-    left-out |f|, if this ratio exceeds two standard errors. There is no gain if `after` has a
-    larger error of left-out |f|; if it has a larger expected error of the bias at settled
-    temperatures, unless noise explains the drift; or if, with `by_halves`, it has a larger drift
-    of left-out halves of the program, a sign of too many columns. A drift that noise explains need
-    not decrease for a gain, because the drift of left-out soaks contains no effects of ramps.
+    sections. For drifts that agree to 5 %, the gain is the log ratio of the errors of left-out
+    |f|, or 0 if this ratio is below two standard errors. The gain is 0 if `after` has a larger
+    error of left-out |f|; a larger drift of left-out halves of the program (with `by_halves`), a
+    sign of too many columns; or a drift above the noise and a larger expected error of the bias at
+    settled temperatures. A drift that noise explains need not decrease for a gain, because the
+    drift of left-out soaks contains no effects of ramps.
     """
     *drifts, norms = _beyond_thermometer(before, after)
     drift = [ratio for ratio in drifts if ratio]
@@ -207,8 +209,8 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
 
 def is_worse_by_norms(before: Score, after: Score) -> bool:
     """
-    Whether errors of left-out |f| are larger in `after` by more than a standard error, and stated
-    mounting offsets do not explain them.
+    Whether errors of left-out |f| are larger in `after` by more than a standard error, and the
+    stated sd of the mounting offsets does not explain these errors.
     """
     norms = before.norms.gain_of(after.norms)
     is_explained = after.norms.rms <= _NOISE_RATIO * after.by_offsets
@@ -218,8 +220,8 @@ def is_worse_by_norms(before: Score, after: Score) -> bool:
 def is_undecided(before: Score, after: Score) -> bool:
     """
     Whether left-out data do not decide between `before` and a model `after` that is not better:
-    their drifts agree to 5 %, and the errors of |f| are smaller in `after` by more than a standard
-    error or cannot be compared (no fold scored for both, or a coarse thermometer explains them).
+    the two drifts agree to 5 %, and the errors of |f| are either smaller in `after` by more than a
+    standard error, or not scored, or explained by a coarse thermometer or by mounting offsets.
     """
     *drift, norms = _beyond_thermometer(before, after)
     is_equal = all(abs(gain[0]) < _NEGLIGIBLE_LOG_RATIO for gain in drift if gain)
@@ -235,9 +237,9 @@ def is_near(chosen: Score, other: Score) -> bool:
 def _beyond_thermometer(before: Score, after: Score) -> list[tuple[float, float] | None]:
     """
     Return the log ratio of mean square errors, `before` / `after` (`Folds.gain_of`), for each kind
-    of folds; None if a coarse thermometer or stated offsets explain the errors. Errors of a
-    thermometer repeat in all bags of one chamber program: a model that fits these errors is better
-    on left-out bags, but fails in another program.
+    of folds; None if a coarse thermometer, or the stated sd of mounting offsets, explains the
+    errors. Errors of a thermometer repeat in all bags of one chamber program: a model that fits
+    these errors is better on left-out bags, but fails in another program.
     """
     explained = float(np.hypot(before.by_thermometer, before.by_offsets))
     is_norm_kept = before.norms.rms > _NOISE_RATIO * explained
@@ -301,8 +303,8 @@ def settled_error(
 
 def _variance(layout: Layout, columns: Floats, force: Floats, root: Floats) -> float:
     """
-    Return the variance of the readings less their mean over k windows, summed over windows and
-    axes, by the covariance ``root @ root.T``; `columns`: (k, m); `force`: along the axes, (3,)
+    Return the variance of the predicted samples less their mean over k windows, summed over
+    windows and axes; ``root @ root.T``: covariance of the unknowns; `columns`: (k, m)
     """
     parts = layout.by_weights(columns - columns.mean(axis=0), force)
     return sum(float(np.sum((along @ root[at]) ** 2)) for along, at in parts)
@@ -346,8 +348,9 @@ def _by_positions(
 
 def _determines_drift(point: Point, posterior: PosteriorMode, root: Floats, rows: slice) -> bool:
     """
-    Whether the fit without a position, of covariance ``root @ root.T``, determines the drift in
-    `rows`: the variance of the drift is below 10 times (variance by the fit to all data + noise).
+    Whether the fit without a position, with the covariance ``root @ root.T``, determines the drift
+    in the position's windows `rows`: the variance of the drift is below 10 times (variance by the
+    fit to all data + noise).
     """
     regression, sigma = point.regression, point.prior.sigma
     if not point.layout.used[0].any():
@@ -363,9 +366,9 @@ def _determines_drift(point: Point, posterior: PosteriorMode, root: Floats, rows
 
 def _norm_variance(point: Point, posterior: PosteriorMode, root: Floats, p: int) -> float:
     """
-    Return the variance of |f| in position `p` by the fit without it, of covariance
-    ``root @ root.T``, plus the offset variance; NaN if the fit does not determine |f| in `p`: its
-    variance is not below 10 times (variance by the fit to all data + offset variance).
+    Return the variance of |f| in position `p` by the fit without `p`, of covariance
+    ``root @ root.T``, plus the variance of bias offsets. The result is NaN unless the variance of
+    |f| by this fit is below 10 times (variance by the fit to all data + variance of offsets).
     """
     if not point.regression.gravity:
         return np.nan

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the correlation of the columns of two terms in the bags, and the advice of a further bag in
+Owns the correlation of the columns of two terms in the bags, and the advice to record a bag in
 which these columns are less correlated.
 
 In one environment the board follows the case in the same way in all bags. A lag of the board
@@ -25,14 +25,14 @@ from .selection import Fit
 from .windows import CURVE, PART
 
 # Largest variance inflation 1 / (1 - r^2) at which the bags count as separating two columns of
-# correlation r. The other column leaves sqrt(1 - r^2) of a column's RMS undescribed, which is a
-# tenth at an inflation of 100. Errors of temperatures may be as large: a thermometer that lags by
-# 60 s changes a lag of 600 s by a tenth.
+# correlation r. One column leaves sqrt(1 - r^2) of the other column's RMS undescribed, a tenth at
+# an inflation of 100. Errors of thermometers may have as large an effect on a column: a
+# thermometer that lags by 60 s changes a lag of 600 s by a tenth.
 _LARGEST_INFLATION = 100.0
 
 
 class _Pair(NamedTuple):
-    """The group, the part and the name in messages of two terms; the bag that separates them."""
+    """Groups, parts and names (in messages) of two terms, and the bag that would separate them."""
 
     groups: tuple[str, str]
     parts: tuple[str, str]
@@ -76,7 +76,7 @@ class Likeness:
 
 
 def likenesses(fit: Fit) -> tuple[Likeness, ...]:
-    """Return the correlation of each pair of terms if the chosen model has one or both of them."""
+    """Return correlations for all pairs of terms with at least one term in the chosen model."""
     trials = [trial for trial in fit.selected.trials if trial.is_chosen]
     if fit.typical is None or not trials:
         # With a prior calibration, or for Golovach's model, the fit selects no columns.
@@ -97,7 +97,7 @@ def likenesses(fit: Fit) -> tuple[Likeness, ...]:
     try:
         pairs = [_likeness(point, groups, pair) for pair in _PAIRS if used & {*pair.groups}]
     except np.linalg.LinAlgError:
-        # The fit has succeeded: a rounding error in this table of correlations must not end it.
+        # The fit has succeeded: a rounding error in this table must not turn it into a failure.
         return ()
     return tuple(likeness for likeness in pairs if likeness is not None)
 
@@ -142,6 +142,6 @@ def judge_likeness(pairs: Sequence[Likeness], n_directions: int) -> Iterator[Fin
     yield advice(
         'alike',
         f'on axis {worst.axis} the bags do not tell {texts.names[0]} from {texts.names[1]} '
-        f'(correlation {worst.correlation:.5f}; a model with both gives each weight an sd '
-        f'{worst.inflation**0.5:.0f} times that of a model with one): record a bag {texts.bag}',
+        f'(correlation {worst.correlation:.5f}; in a model with both, the sd of a weight is '
+        f'{worst.inflation**0.5:.0f} times its sd in a model with one): record a bag {texts.bag}',
     )

@@ -206,7 +206,7 @@ class _TermFits:
         return self.posterior(used).log_evidence - self.posterior(used - dropped).log_evidence
 
     def left_out_gain(self, used: _Active, dropped: _Active) -> tuple[float, float]:
-        """Return the log ratio of mean square errors of |f| without / with `dropped`; its sd."""
+        """Return the log of (mean square error of |f| without / with `dropped`), and its sd."""
         return self.score(used - dropped).norms.gain_of(self.score(used).norms) or (0.0, 0.0)
 
     def is_determined(self, used: _Active, at: int) -> bool:
@@ -263,7 +263,6 @@ def choose(
 
 
 def _blank_term(kind: Kind, sd: float, *evidence: float) -> NonlinearTerm:
-    """Return a nonlinear term with all coefficients 0."""
     return NonlinearTerm(kind, (0.0,) * 3, (0.0,) * 3, sd, *evidence)
 
 

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the prior of a type of unit (`population`): a calibration with the mean parameters of several
-units, relative to the scale factors. Its covariance is the scatter of these parameters over the
-units plus the mean of the units' covariances.
+units, relative to the scale factors. The covariance of this calibration is the scatter of the
+parameters over the units plus the mean of the units' covariances.
 
 References
 ----------
@@ -47,7 +47,7 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     Raises FitError for fewer than three calibrations, two of the same unit, a calibration without
     covariance, or different input units, reference temperatures, sensors or forms of the curves.
     """
-    # Leave out nonlinear terms: few units have such terms, which need |f| above 1 g.
+    # Leave out nonlinear terms: few units have them, as a fit of them needs |f| above 1 g.
     calibrations = [without_terms(each) for each in calibrations]
     _check_alike(calibrations)
     keys: dict[Column, list[Column]] = {}
@@ -164,14 +164,13 @@ def _without_range(column: Column) -> Column:
 
 
 def _in_one_stage(column: Column, tau_s: float) -> Column:
-    """Return a column whose lag has one stage, no share of the gradient, and no lead."""
     return replace(column, tau_s=tau_s, second_tau_s=0.0, sensor_share=0.0, lead_s=0.0)
 
 
 def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
     """
-    Return columns with lags of the bank (`FINE_TAUS`), and factors of a sum that approximates
-    `column`.
+    Return columns with lags of the bank (`FINE_TAUS`), and the factor of each column in a sum that
+    approximates `column`.
 
     Parts of two units of a type have different time constants, so a lag is interpolated between
     the lags of the bank, which is common to all units; a lag of 0 s is always 0 K. A lag of two

@@ -5,7 +5,7 @@ Owns the informative prior of a fit, from a calibration of the unit or its type 
 
 The mean and the covariance of the Gaussian prior of the regression are the parameters of the
 calibration and their covariance, increased by the ageing of the unit since the calibration. The
-regression has the columns of the calibration, without a selection.
+fit uses exactly the columns of the calibration.
 """
 
 from __future__ import annotations
@@ -77,13 +77,13 @@ def constants_of(calibration: Calibration) -> ConstantCalibration:
 
 
 def offset_sd_of(calibration: Calibration) -> float:
-    """Return the sd of the bias offset of a mounting or turn-on, smallest of axes [m/s^2]."""
+    """Return the smallest of the axes' sds of the bias offset of a mounting or turn-on [m/s^2]."""
     axes = [axis for part in calibration.regime_sets() for axis in part.axes()]
     return min(axis.residual_sd_m_s2 for axis in axes)
 
 
 def with_calibration(calibration: Calibration, regression: Regression, state: State) -> State:
-    """Return a state with bias and weights of a calibration with scale factors `nominal_scale`."""
+    """Return `state` with bias and weights of a calibration that has the nominal scale factors."""
     layout, values = parameter_layout(calibration), parameters_of(calibration)
     if len({(b - a, d - a) for a, b, _, d in (*layout.bias, *layout.scale)}) > 1:
         raise FitError(
@@ -107,16 +107,16 @@ def informative_priors(
 ) -> Iterator[InformativePrior]:
     """
     Yield priors from a calibration for several amounts of ageing, the widest last. A fit compares
-    these by log evidence plus log density of the ageing: half-Student of scale `usual_ageing`
-    [m/s^2]. A calibration without covariance raises FitError.
+    these priors by their log evidence plus the log density of the ageing, a half-Student density
+    of scale `usual_ageing` [m/s^2]. A calibration without covariance raises FitError.
     """
     if calibration.posterior is None:
         raise FitError(
             'the prior has no covariance: use a calibration that was fitted to bags; an imported '
             'calibration cannot be a prior'
         )
-    # Pairs to try: `ageing`, the sd of the changes of bias [g] and scale factor (0: as the user
-    # states); `share`, the uncorrelated variance added to a parameter / the parameter's variance.
+    # Pairs to try: `ageing`, the sd of the changes of bias [g] and scale factor (0: the sds that
+    # the user states); `share`, uncorrelated variance added to each parameter / its variance.
     tried = [(0.0, share) for share in (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)]
     # The fit begins with the last, widest prior: in a first fit with a narrow prior, the
     # estimated noise would absorb changes of the unit.
@@ -178,7 +178,7 @@ def _root(covariance: Floats, share: float, sizes: Floats, to_file: Floats) -> F
     Return the upper triangular root of the inverse covariance of the unit's unknowns.
 
     `covariance`: covariance of the file's parameters; ``min(share * v, max(v, size^2))`` is added
-    to each variance v; `sizes`: size of each parameter; `to_file`: derivatives by the unknowns
+    to each variance v; `sizes`: sizes of the parameters; `to_file`: derivatives w.r.t. unknowns
     """
     diagonal = np.diag(covariance)
     floor = np.where(diagonal > 0.0, diagonal, np.min(diagonal[diagonal > 0.0], initial=1.0))

@@ -30,8 +30,8 @@ _FEWEST_NORMS = 6
 
 def extrapolates(fit: Fit) -> bool:
     """
-    Whether the left-out drift of the chosen model exceeds the noise, and its bias at settled
-    temperatures has a larger expected error (`settled_error`) than that of a smaller model.
+    Whether the left-out drift of the chosen model exceeds the noise, and the expected error of its
+    bias at settled temperatures exceeds the expected error by a smaller model (`settled_error`).
     """
     settled, trials = fit.windows.data.settled, fit.selected.trials
     chosen = next(trial for trial in trials if trial.is_chosen)
@@ -49,9 +49,9 @@ def extrapolates(fit: Fit) -> bool:
 
 def may_have_slow_tilts(fit: Fit) -> bool:
     """
-    Whether the hourly mean drift (RMS) of left-out positions exceeds 6 times its noise and a tenth
-    of the error of left-out |f|, which must be known in `_FEWEST_NORMS` positions. Slow tilts
-    change the readings of axes across gravity, but hardly change |f|.
+    Whether the RMS of hourly mean drifts in left-out positions exceeds 6 times the noise of an
+    hourly mean, and a tenth of the error of left-out |f|, known in `_FEWEST_NORMS` positions. Slow
+    tilts change the specific force along axes across gravity, but hardly change |f|.
     """
     score, data = fit.selected.score, fit.windows.data
     if np.isfinite(score.norms.square).sum() < _FEWEST_NORMS:
@@ -114,8 +114,8 @@ def of_whole_rests(
     pieces: Sequence[PositionReport], bags: Sequence[ReducedBag]
 ) -> tuple[PositionReport, ...]:
     """
-    Make one report per rest from the reports of its pieces: mean attitude, RMS residuals. A piece
-    without a known temperature has no report, so a rest of such pieces has none either.
+    Make one report per rest from the reports of its pieces: mean attitude, RMS residuals. Pieces
+    without a known temperature have no report; a rest of such pieces alone has no report either.
     """
     result, left = [], deque(pieces)
     for bag in bags:
@@ -127,7 +127,7 @@ def of_whole_rests(
                     parts.append(left.popleft())
             if not parts:
                 continue
-            # Weight of a piece: its duration (0 s if it has one cell), at least a window's length.
+            # Weight of a piece: its duration, or the length of a window if this is longer.
             share = np.array([max(part.duration_s, bag.window_s) for part in parts])
             up = share @ np.array([part.up for part in parts])
             x, y, z = (up / np.linalg.norm(up)).tolist()

@@ -3,9 +3,10 @@
 """
 Owns the regression: the posterior of all unknowns under a given prior, by Gauss-Newton.
 
-All unknowns have Gaussian priors, except attitudes, whose prior is flat. Gauss-Newton finds the
-mode; the inverse of the Hessian is the covariance. The unknowns of positions and bags are
-eliminated first. A position is left out by subtracting its part of the unit's normal equations.
+All unknowns have Gaussian priors, except attitudes without a pose, whose prior is flat. Gauss-
+Newton finds the mode; the inverse of the Hessian is the covariance. The unknowns of positions and
+bags are eliminated first. A position is left out by subtracting its part of the unit's normal
+equations.
 
 References
 ----------
@@ -39,7 +40,7 @@ class PosteriorMode:
     root: root of the covariance of the unit's unknowns, ``root @ root.T``, (n_unit, n_unit)
     variance: variances of all unknowns, shape (n,)
     square: sum of squares of the whitened residuals of each axis, shape (3,) [(m/s^2)^2]
-    log_evidence: logarithm of the marginal likelihood, up to a constant that depends on the data
+    log_evidence: log marginal likelihood plus a constant that depends only on the data
     """
 
     prior: Prior
@@ -157,8 +158,8 @@ class Point:
 
     def without_each(self) -> Iterator[tuple[Ints, Floats]]:
         """
-        Yield, for each mounting, its positions and the normal equations of the unit without them;
-        nothing if there is a single mounting.
+        Yield, for each mounting, its positions and the unit's normal equations without these
+        positions; yield nothing if there is a single mounting.
         """
         base = self.regression.products(self.layout.used).base
         at_state = self.regression.products_at(self.grams, self.state, base)
@@ -233,8 +234,8 @@ class Point:
         If the step increases the energy, fractions of the step of the nonlinear unknowns (those
         that multiply other unknowns) are tried, each with a new step of the linear unknowns.
         """
-        # Compute energy and step of this state before those of the next: `Regression.linearised`
-        # keeps only one linearisation, the last.
+        # Compute energy and step of this state before the next state is linearised:
+        # `Regression.linearised` keeps only the last linearisation.
         energy, (step, _) = self.energy, self.solution
         result = self.with_step(step)
         if result.energy <= energy:
@@ -282,13 +283,13 @@ class Regression(Equations):
     _linearised: tuple[State, Layout, Floats, Tangent, Normal] | None = None
 
     def at(self, state: State, prior: Prior, grams: Floats | None = None) -> Point:
-        """Linearise about `state`, inactive weights set to 0; default `grams`: of all windows."""
+        """Linearise about `state`, inactive weights set to 0; `grams`: None for all windows."""
         layout = self.layout(prior.column_sd > 0.0, prior.nonlinear_sd > 0.0)
         grams = self.products(layout.used).of_positions if grams is None else grams
         return Point(self, without_inactive(state, layout), prior, layout, grams)
 
     def linearised(self, state: State, layout: Layout, grams: Floats) -> tuple[Tangent, Normal]:
-        """Return the equations linearised about a state, and their normal equations (`Point`)."""
+        """Return the equations linearised about a state, and their normal equations."""
         last = self._linearised
         if last is None or last[0] is not state or last[1] is not layout or last[2] is not grams:
             base = self.products(layout.used).base
@@ -327,7 +328,7 @@ class Regression(Equations):
         base = self.products(layout.used).base
         columns, at = np.unique(column, return_inverse=True)
         of_columns, with_base = self.products_of(columns, base, state)
-        # Derivatives of the reading w.r.t. a column's contribution to the bias, and to the scale.
+        # Derivatives of the sample w.r.t. a column's contribution to the bias, and to the scale.
         acts = np.stack((np.ones_like(state.up), state.kappa * self.along(state)))
         acts /= sigma
         rows = point.tangent.of(self.at_starts(with_base, state, base))[:, :, at]

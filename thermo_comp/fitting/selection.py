@@ -30,8 +30,8 @@ from .regression import PosteriorMode, Regression
 from .unknowns import POSE_SD, InformativePrior, Prior, State
 from .windows import BEND, CURVE, LAGS, PART, PRODUCTS, SET, ThermalWindows
 
-#: Ratio of a large initial sd of mounting offsets to `Prior.offset_scale`. In data sheets the bias
-#: of tactical triads repeats to 0.3 .. 1 mg over turn-ons, 10 to 20 times `Prior.offset_scale`.
+#: Ratio of a large initial sd of mounting offsets to the scale of their prior. In data sheets the
+#: bias of tactical triads repeats to 0.3 .. 1 mg over turn-ons, 10 to 20 times the prior's scale.
 LARGE_OFFSETS = 10.0
 
 
@@ -44,7 +44,7 @@ class Trial:
     score: left-out errors of the model
     posterior: fit of the model
     typical: typical prior sd of the model's columns, shape (2, m)
-    is_near: whether the score is at most one standard error worse than that of the chosen model
+    is_near: whether the chosen model has a score better by at most one standard error
     """
 
     groups: tuple[str, ...]
@@ -56,7 +56,7 @@ class Trial:
 
     @property
     def is_complete(self) -> bool:
-        """Whether noise or the errors of a coarse thermometer explain the left-out drift."""
+        """Whether noise, or the error of a coarse thermometer, explains the left-out drift."""
         is_noise = self.score.rms <= 2.0 * float(self.posterior.prior.sigma.mean())
         return is_noise or self.score.is_by_thermometer
 
@@ -81,8 +81,8 @@ class Fit(NamedTuple):
 
     typical: typical prior sd of all columns that the selection could have chosen, shape (2, m), or
         None if there was no selection of columns
-    of_means: state of the fit to the means of the positions, if no bag contains a ramp
-        (`rests.only_warms_up`), and this fit has a curve, but is worse on left-out data; else None
+    of_means: state of the fit of a curve to the means of the positions, if that fit is worse on
+        left-out data than the chosen model and no bag contains a ramp; else None
     """
 
     windows: ThermalWindows
@@ -99,8 +99,8 @@ class Fit(NamedTuple):
     @property
     def offset_sd(self) -> float:
         """
-        Sd, fitted to the bags, of the bias offset of a mounting after a new turn-on [m/s^2]. The
-        published sd also allows for larger values that the bags do not exclude.
+        Sd, fitted to the bags, of the bias offset of a mounting after a new turn-on [m/s^2]. A
+        calibration has a larger sd, to allow for larger offsets that the bags do not exclude.
         """
         prior = self.posterior.prior
         return float(np.hypot(prior.offset_sd, self.regression.has_turn_ons * prior.turn_on_sd))
@@ -110,7 +110,6 @@ _Model = TypeVar('_Model', Trial, Selected)
 
 
 def _best(chosen: Trial, trials: Sequence[Trial]) -> Trial:
-    """Return the best model: each trial that is better than the chosen model replaces it."""
     for trial in trials:
         if is_better(chosen.score, trial.score):
             chosen = trial
@@ -129,18 +128,18 @@ class Growth:
         names = dict.fromkeys(self._names[may].tolist())
         #: Groups of columns that may be added to a model.
         self.free = [group for group in names if group not in self.forced]
-        #: Models to report, see `Selected.trials`.
+        #: The fitted models, for the report of the fit.
         self.tried: list[Trial] = []
 
     def fit(self, groups: tuple[str, ...], state: State, prior: Prior, typical: Floats) -> Trial:
-        """Fit all columns of `groups`, also those that were removed from a smaller model."""
+        """Fit all columns of `groups`, also columns that the fit of a smaller model dropped."""
         candidates = replace(self._candidates, typical=typical)
         initial_sd = np.where(prior.column_sd > 0.0, prior.column_sd, typical)
         is_wanted = np.isin(self._names, groups)
         prior = replace(prior, column_sd=np.where(is_wanted, initial_sd, 0.0))
         if self.regression.windows.n_poses:
-            # Attitudes and mounting offsets with a large prior sd would absorb the effect of new
-            # columns: begin with a small sd of attitudes and, unless stated, of mounting offsets.
+            # With a large prior sd, attitudes and mounting offsets would absorb the effect of new
+            # columns. Begin with small sds; keep the sd of the mounting offsets if it is constant.
             prior = replace(prior, pose_sd=0.1 * POSE_SD)
             if prior.offset_scale > 0.0:
                 small_sd = float(min(prior.offset_sd, prior.sigma.mean()))
@@ -154,17 +153,18 @@ class Growth:
     ) -> Trial:
         """
         Fit the model `before` plus groups of columns, beginning from the fit of `before`.
-        `largest_sd`: largest typical prior sd of new columns, (2, m); None: as in `before`
+        `largest_sd`: upper bound of the new columns' typical prior sd, shape (2, m); None: keep
+        the typical prior sds of `before`
         """
         regression, posterior, typical = self.regression, before.posterior, before.typical
         if largest_sd is not None:
             kelvins, state = regression.windows.kelvins, posterior.state
             square = float(np.mean(regression.residual(state, posterior.layout) ** 2))
             if state.pose.size:
-                # Add mean squares of offsets and deviations from poses, which absorb model errors.
+                # Mounting offsets and tilts from poses absorb model errors: add their squares.
                 by_attitude = regression.gravity * state.from_pose
                 square += float(np.mean(state.offset**2) + np.mean(by_attitude**2))
-            # Typical sd of a new column: the weight with which this column explains the residual.
+            # Typical sd of a new column: the weight for which the column explains the residual.
             slope = np.sqrt(square) / (float(kelvins[0]) or 1.0)
             units = np.array([[1.0], [1.0 / (regression.gravity or 1.0)]])
             new = np.minimum(slope * units * kelvins, largest_sd)
@@ -182,13 +182,13 @@ class Growth:
             progress(1.0 - part)
             if not better:
                 return chosen
-            # Choose the smallest model not significantly worse than the model of the largest gain.
+            # Choose the smallest model that is not significantly worse than the best model.
             best = max(better, key=lambda trial: gain(chosen.score, trial.score))
             better.sort(key=lambda trial: len(trial.groups))
             chosen = next(t for t in better if t is best or not is_better(t.score, best.score))
 
     def with_bends(self, before: Trial, groups: Sequence[str]) -> list[Trial]:
-        """Fit `before` plus `groups`, and this model plus columns of `BEND`; return all fits."""
+        """Fit the model `before` plus `groups` without bends, and with bends; return the fits."""
         added = tuple(group for group in groups if group in self.free)
         smooth = self.extended(before, added, self._candidates.typical)
         return [smooth, *self.trials(smooth, [BEND])]
@@ -203,14 +203,14 @@ class Growth:
             self.fit(groups, state, prior, self._candidates.typical * (number <= degree))
             for degree in range(1, int(number[-1]) + 1)
         )
-        # Curves of high degree fit |f| in few positions exactly.
+        # A curve of high degree fits |f| in few positions exactly, so the evidence decides.
         for curve in larger:
             if log_density(curve.posterior) - log_density(chosen.posterior) > CLEAR_GAIN:
                 chosen = curve
         return chosen
 
     def trials(self, chosen: Trial, groups: Sequence[str]) -> list[Trial]:
-        """Fit the chosen model plus a set of groups, for each of up to 4 sets with large gains."""
+        """Fit the chosen model plus each of up to 4 sets of groups that have large gains."""
         absent = [group for group in groups if group in self.free and group not in chosen.groups]
         if not absent:
             return []
@@ -218,7 +218,7 @@ class Growth:
         columns = np.isin(self._names, absent) & typical.any(axis=0)
         inactive = self.regression.inactive(chosen.posterior, columns)
         if BEND in absent:
-            # Select up to 60 bends (changes of slope): a bump in an axis' bias needs 20 bends.
+            # Select up to 60 bends: a bump in the bias of one axis over temperature needs 20.
             is_bend = self._names == BEND
             knees = inactive.chosen(typical, is_bend, CLEAR_GAIN, 60)
             typical = np.where(is_bend & ~knees, 0.0, typical)
@@ -241,11 +241,11 @@ class Growth:
 
 def better_start(fits: Sequence[_Model]) -> _Model:
     """
-    Choose by left-out data between a fit begun with a small prior sd of mounting offsets or of the
-    misalignment, the first, and one begun with a large sd, the last. If left-out data do not
-    decide, the last is chosen if its log density is larger by `CLEAR_GAIN`. Mounting offsets and
-    misalignments explain |f| in few positions equally well, but only misalignments predict |f| in
-    a new position.
+    Choose by left-out data between the first fit, begun with a small prior sd of mounting offsets
+    or of the misalignment, and the last fit, begun with a large sd. If left-out data do not
+    decide, the last fit is chosen only for a log density larger by `CLEAR_GAIN`. Mounting offsets
+    and misalignments explain |f| in few positions equally well, but only misalignments predict |f|
+    in a new position.
     """
     small, large = fits[0], fits[-1]
     evidence_gain = log_density(large.posterior) - log_density(small.posterior)
@@ -328,7 +328,7 @@ def fit_all(
 ) -> Selected:
     """Fit all columns, with the prior of `informative` whose fit has the largest log density."""
     # Mounting offsets and ageing of the unit explain |f| in few positions equally well, so the sd
-    # of these offsets is constant until an informative prior is chosen.
+    # of the mounting offsets is not fitted until an informative prior is chosen.
     scale = prior.offset_scale
     prior = replace(prior, offset_scale=0.0 if informative else scale)
     posterior = settle(regression, state, prior, candidates)
@@ -363,9 +363,9 @@ def finish(
     large = LARGE_OFFSETS * prior.offset_scale
     is_noise = score.rms <= 4.0 * float(np.hypot(score.noise, score.by_thermometer))
     if prior.offset_sd < prior.offset_scale and is_noise:
-        # Nine constants explain |f| in nine positions with any mounting offsets. The drift of a
-        # reading due to its scale factor is proportional to the specific force along the axis, so
-        # a model that explains the drifts determines these forces, and with them the offsets.
+        # Nine constants explain |f| in nine positions with any mounting offsets. The drift of an
+        # axis due to its scale factor is proportional to the specific force along the axis, so a
+        # model that explains the drifts determines the forces and thus the mounting offsets.
         prior = replace(prior, offset_sd=large, turn_on_sd=large)
         posterior = settle(regression, posterior.state, prior, candidates)
         score = score_of(regression, posterior)

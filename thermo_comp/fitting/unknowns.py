@@ -16,7 +16,7 @@ from ..typing import Bools, Floats, Ints
 if TYPE_CHECKING:
     from .nonlinear import Forces
 
-#: Built-in prior sd of a bias [m/s^2]: 100 mg, above the data sheets of consumer MEMS.
+#: Built-in prior sd of a bias [m/s^2]: 100 mg, more than data sheets of consumer MEMS state.
 BIAS_SD = 1.0
 #: Built-in prior sd of an axis' scale factor, relative to the mean of the axes.
 SCALE_SD = 0.05
@@ -28,9 +28,9 @@ MISALIGNMENT_SD = 1e-3
 
 def misalignment_scale(noise: float) -> float:
     """
-    Return the built-in prior sd of an element of the misalignment [rad], by the noise in a 1 Hz
-    bandwidth [m/s^2]. The prior sd is 1 mrad for noise up to 10 ug (navigation grade, machined
-    faces), and rises with the noise up to 10 mrad (cross-axis sensitivity of consumer MEMS).
+    Return the built-in prior sd of an element of the misalignment [rad]. The sd is 1 mrad for a
+    `noise` up to 10 ug in a bandwidth of 1 Hz (navigation grade, machined faces), and rises with
+    the noise [m/s^2] up to 10 mrad (cross-axis sensitivity of consumer MEMS).
     """
     return float(np.clip(10.0 * noise, MISALIGNMENT_SD, 1e-2))
 
@@ -38,25 +38,25 @@ def misalignment_scale(noise: float) -> float:
 @dataclass(frozen=True)
 class Windows:
     """
-    The data of a fit: the mean readings of n windows, sorted by position and time, and the values
+    The data of a fit: the mean samples of n windows, sorted by position and time, and the values
     of all m columns in these windows.
 
-    position, bag: index of each window's position (within one bag), and of its bag, shape (n,)
-    section: index of each window's section of its position, see `windows.N_SECTIONS`, shape (n,)
+    position, bag: indices, over all bags, of each window's position and of its bag, shape (n,)
+    section: index, 0 to 5, of the sixth of its position in which each window lies, shape (n,)
     time: time since the bag's first sample [s], shape (n,)
     weight: number of samples of each window, divided by the median of these numbers, shape (n,)
     mean: mean raw samples, in input units, shape (n, 3)
-    columns: columns in their physical units, for initial lag states at the prior mean, (n, m)
+    columns: values of the columns, for initial lag states at the prior mean, (n, m)
     groups: name of each column's group, m names
-    kelvins: RMS of each column / its largest slope over temperature [K]; 0: constant, shape (m,)
+    kelvins: RMS / largest slope over temperature of each column [K], 0 if constant, shape (m,)
     lag: index of each column's lag; -1 for a column without lag, shape (m,)
     start: derivative of each column w.r.t. the initial state of its lag, shape (n, m)
     start_covariance: prior covariance of the initial lag states [K^2], shape (n_lags, n_lags)
     in_scale: whether each column may act on the scale as well as on the bias, shape (m,)
-    tilt: k functions of temperature, of RMS 1, whose weighted sum is a support's tilt, (n, k)
+    tilt: k functions of temperature, of RMS 1; a support's tilt is a weighted sum of them, (n, k)
     forces: known |f| and nonlinear terms, or None if |f| is gravity in all positions
     undisturbed: factors of `weight`, < 1 for an outlier, (n,); None: the fit estimates the factors
-    acts_on: axes on which each column acts, shape (m, 3); None if on all axes
+    acts_on: axes on which each column acts, shape (m, 3); None if each acts on all axes
     pose: index of each position's pose, -1 without a pose, shape (n_positions,); None: no poses
     has_prior: whether the fit has a prior calibration
     board: board temperature [degC] and the variance of its estimate [K^2], (n, 2); None: unknown
@@ -95,7 +95,7 @@ class Windows:
 
     @cached_property
     def share(self) -> Floats:
-        """Ratio of a weight's prior sd to `column_sd`: 1e-6 on axes not in `acts_on`, else 1."""
+        """Factor of each weight's prior sd: 1e-6 on an axis on which its column does not act."""
         acts = np.ones((len(self.groups), 3), bool) if self.acts_on is None else self.acts_on
         return np.where(acts.T, 1.0, 1e-6)
 
@@ -112,7 +112,7 @@ class Windows:
 
     @cached_property
     def edges(self) -> Ints:
-        """Index of each position's first window; last: number of windows, (n_positions + 1,)."""
+        """Index of each position's first window, then the number of windows, (n_positions+1,)."""
         return np.searchsorted(self.position, np.arange(self.n_positions + 1))
 
     @cached_property
@@ -120,8 +120,8 @@ class Windows:
         """
         Index of each position's mounting, from 0, shape (n_positions,).
 
-        Successive positions of a bag whose mean readings differ in direction by less than 2
-        degrees are rests of one mounting, interrupted by a knock or a gap.
+        Successive positions of a bag whose mean samples differ by less than 2 degrees (3.5 % of
+        the norm) are rests of one mounting, interrupted by a knock or a gap.
         """
         first, bag = self.edges[:-1], self.bag_of_position
         means = np.add.reduceat(self.mean, first, axis=0) / np.diff(self.edges)[:, None]
@@ -147,9 +147,9 @@ class Windows:
     @cached_property
     def has_turn_ons(self) -> bool:
         """
-        Whether turn-on offsets are unknowns of the fit. Turn-ons with, on average, two or more
-        mountings separate turn-on offsets from mounting offsets. Without a prior calibration the
-        offset of a single turn-on is part of the bias.
+        Whether turn-on offsets are unknowns of the fit. The fit can separate turn-on offsets from
+        mounting offsets if the turn-ons have on average two or more mountings. Without a prior
+        calibration the offset of a single turn-on is part of the bias.
         """
         fewest = 1 if self.has_prior else 2
         return fewest <= self.n_turn_ons <= (int(self.mounting[-1]) + 1) / 2
@@ -187,7 +187,7 @@ class Noise(NamedTuple):
 
     @property
     def rate(self) -> float:
-        """Random walk of slow noise at short times / white-noise sd of a window [1/sqrt(s)]."""
+        """Sd of slow noise's change in a short time t / (sqrt(t) white-noise sd) [1/sqrt(s)]."""
         return math.sqrt(sum(2.0 * self.ratio / time_s for time_s in self.times_s))
 
 
@@ -198,8 +198,7 @@ class InformativePrior:
 
     mean: prior mean of the unknowns, shape (n_unit,)
     root: upper triangular R with ``R.T @ R`` the inverse covariance, shape (n_unit, n_unit)
-    log_density: log prior density of the ageing, since the prior calibration, that this prior
-        assumes
+    log_density: log prior density of the amount of ageing that this prior assumes
     is_changed: whether the covariance is far larger than the prior calibration's covariance
     """
 
@@ -215,24 +214,24 @@ class Prior:
     Standard deviations of the prior of the unknowns, and the noises of the windows.
 
     bias_sd: sd of the bias [m/s^2], about a mean of 0, shape (3,)
-    scale_mean, scale_sd: mean of the scale ratio kappa of each axis, shape (3,), and its sd
-    misalignment_sd: sd of the elements of M [rad]
-    column_sd: sd of the weights of the columns, each divided by its RMS, in the bias [m/s^2] and
-        in the scale (relative); 0 for an inactive column, shape (2, m)
+    scale_mean, scale_sd: mean, shape (3,), and sd of each axis' scale factor / nominal scale
+    misalignment_sd: sd of the elements of the misalignment matrix M [rad]
+    column_sd: sd of the weights of columns divided by their RMS, in the bias [m/s^2] and in the
+        scale (relative); 0 for an inactive column, shape (2, m)
     offset_sd: sd of the bias offset of a position on each axis [m/s^2], due to its mounting and,
         if turn-on offsets are no unknowns, to its turn-on
     turn_on_sd: sd of the bias offset of a turn-on, common to the positions of a bag [m/s^2]
     sigma: sd of the white noise of a window of weight 1 [m/s^2], shape (3,)
-    least_sigma: lower bound of sigma [m/s^2]; by default it is below the noise of any sensor
-    noise: slow noise of the readings
+    least_sigma: lower bound of sigma [m/s^2]; the default is below the noise of any sensor
+    noise: slow noise of the samples
     offset_scale: scale of the half-Student priors of offset_sd and turn_on_sd [m/s^2]; 0: both sds
         are constant
     misalignment_scale: built-in prior sd of the elements of M, see `misalignment_scale` [rad]
-    unseen_misalignment_sd: sd of the elements of M [rad] in the published covariance, if positions
-        near the faces do not determine M and the fit has a smaller `misalignment_sd`; else 0
+    unseen_misalignment_sd: sd of the elements of M [rad] in the calibration; 0 unless positions
+        near the faces of a cube do not determine M and `misalignment_sd` is smaller
     tilt_sd: sd of the coefficients of the tilts of a support [rad], see `Windows.tilt`
     pose_sd: sd of attitudes about their pose [rad]; attitudes without a pose have a flat prior
-    start_variance_ratio: variance of the initial lag states, divided by that in the node's prior
+    start_variance_ratio: variance of the initial lag states / their variance in the node's prior
     nonlinear_sd: sds of the k nonlinear coefficients of an axis, then of their changes per kelvin;
         0 for an inactive coefficient, shape (2 k,)
     informative: prior that replaces all sds of the unit's unknowns, or None; with such a prior
@@ -266,7 +265,7 @@ class State:
 
     kappa: scale factor of each axis divided by its nominal scale factor, shape (3,)
     bias: bias of each axis [m/s^2], shape (3,)
-    weights: weights of the columns, each divided by its RMS, in the bias [m/s^2] and in the scale
+    weights: weights of the columns divided by their RMS, in the bias [m/s^2] and in the scale
         (relative), shape (2, 3, m)
     misalignment: elements of the inverse of M below the diagonal, shape (3,)
     up: upward unit vector of each position, its attitude, shape (n_positions, 3)
