@@ -50,7 +50,7 @@ class RateSet:
 
 @dataclass(frozen=True)
 class RateTerm(Column):
-    """A column (regressor) of the thermal response, with its weights on the three axes."""
+    """A column (regressor) of the thermal response, with its weights on the angular rates."""
 
     bias: Annotated[Vector, 'Weights on the bias, rad/s per unit of the column.'] = field(
         kw_only=True
@@ -62,7 +62,8 @@ class Gyroscope:
     """
     Bias of the angular rate over temperature: ``w = measured - bias``. The scale factor is 1.
 
-    Parameters of `posterior`, for each axis: coefficients of each regime, then column weights.
+    The order of parameters in `posterior` is, for each axis: coefficients of the static curve, of
+    the dynamic curve, weights of the columns.
     """
 
     bias_rad_s: Annotated[
