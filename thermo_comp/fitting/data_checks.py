@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from .evidence import ResidualRow
     from .selection import Fit
 
-#: Smallest numbers of positions that determine biases and scale factors (6 constants), these and
-#: the misalignment (9 constants), and the 9 constants and the sd of mounting offsets.
+#: Smallest numbers of positions that determine 6 constants (biases and scale factors), 9 constants
+#: (also the misalignment), and 9 constants and the sd of mounting offsets.
 POSITIONS_NEEDED, POSITIONS_FOR_MISALIGNMENT, POSITIONS_FOR_MOUNTINGS = 6, 9, 12
 #: Span of the board temperature below which no temperature dependence is visible [K].
 LEAST_SPAN_K = 3.0
@@ -74,8 +74,8 @@ def judge_windows(
     """
     Check temperatures, ramps and directions `up`, shape (n, 3), of the windows at rest.
 
-    A prior calibration of the unit contains the effects of temperature and of ramps. With it, the
-    check of span and ramps is replaced by a check for temperatures beyond the prior's range.
+    A prior calibration of the unit contains the effects of temperature and of ramps: if a prior is
+    given, temperatures beyond its range are checked instead of the span and the ramps.
     """
     yield _judge_positions(up)
     if not windows.has_temperature:

@@ -183,7 +183,7 @@ def find_offset(bags: Sequence[ReducedBag], options: FitOptions) -> Floats:
         return np.zeros(3)
     if options.prior is not None:
         constants = constants_of(options.prior)
-        # Biases of which one exceeds 0.5 g are the codes at zero force of a converter.
+        # If one bias exceeds 0.5 g, all three biases are taken as the codes at zero force.
         is_far = np.abs(constants.bias / constants.scale).max() > 0.5 * options.gravity
         return np.asarray(np.rint(constants.bias) * is_far)
     middle = max(bag.middle for bag in bags)
@@ -377,7 +377,7 @@ def _judged(
 
 def _unusable(error: ValueError, up: Floats) -> FitError:
     if 'misalignment' in str(error):
-        # In positions that determine the misalignment, such an angle is due to wrong data.
+        # If the positions determine the misalignment, 60 degrees between axes are a data error.
         kind = FitError if data_checks.determines_misalignment(up) else UndeterminedError
         return kind(
             'in the fit the angle between two of the axes is some 60 degrees or less, which no '

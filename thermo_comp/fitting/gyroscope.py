@@ -81,7 +81,7 @@ def add_gyroscope(
         offset_scale=earth_sd,
     )
     fit = Fit(windows, regression, select(regression, state, prior, _candidates(data, options)))
-    # The positions determine the sd of the offsets well, so `claim_of` need not marginalise it.
+    # The positions determine the sd of the offsets well, so `claim_of` may take the sd as known.
     chosen = replace(fit.posterior, prior=replace(fit.posterior.prior, offset_scale=0.0))
     claim = claim_of(fit._replace(selected=replace(fit.selected, posterior=chosen)))
     # The offsets contain the Earth's rate, which is no error: subtract its variance.

@@ -70,8 +70,8 @@ def constant_calibration(
             f'an axis ({axes}) reads the same in all positions: the axis is dead, or the unit was '
             'never turned about another axis'
         )
-    # Samples of an axis that was not held both up and down range over less than 2 g: begin the fit
-    # from half the range as the samples of 1 g, and from 1.3 times half the range.
+    # An axis that was not held both up and down has samples that range over less than 2 g. The fit
+    # therefore begins from two scale factors: half the range / g, and 1.3 times this value.
     scales = (float(np.max(half)) * spread / gravity for spread in (1.0, 1.3))
     starts = (np.where(half * 4.0 > np.max(half), scale, half / gravity) for scale in scales)
     tried = (_refine(means, gravity, bias, scale, misalignment_sd) for scale in starts)
@@ -139,8 +139,9 @@ def white_noise_of(windows: Windows, scale: Floats) -> Floats:
     Return the sd of the white noise of a window's mean on each axis [m/s^2], shape (3,).
 
     The sd is computed from second differences of windows, which contain no linear drift; it is 0
-    if no position has three windows. In fast ramps second differences contain a part of the drift:
-    if fourth or sixth differences give a noise below 70 % of it, the smallest noise is used.
+    if no position has three windows. In fast ramps second differences contain a part of the drift.
+    The smallest noise by second, fourth and sixth differences is used if it is below 70 % of the
+    noise by second differences.
     """
     position, noises = windows.position, []
     for order in (2, 4, 6):

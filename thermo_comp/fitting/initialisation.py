@@ -81,8 +81,8 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
         windows = replace(windows, data=rests.constant_in(data, is_steady, is_settled))
     if problem.has_pieces or not rests.is_constant(windows, windows.data.position):
         return _regress(windows, problem)
-    # In a soak the effect of an unknown lag is about as large as that effect of temperature which
-    # the curve describes, so only differences of |f| between positions determine the curve.
+    # In a soak the effect of an unknown lag is about as large as the effect of the remaining
+    # temperature drift, so only differences of |f| between positions determine the curve.
     everywhere = np.ones(windows.data.n_positions, dtype=bool)
     at_rest = replace(windows, data=rests.constant_in(windows.data, everywhere, everywhere))
     # Each regression reports progress from 0.7 to 0.95: map it to half of this range.
@@ -102,7 +102,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     """Fit the windows; `is_at_rest`: whether the columns are set constant in each position."""
     data, options, start = windows.data, problem.options, problem.start
     earlier, n_directions = options.prior, problem.n_directions
-    # A heated bench separates bias and scale if a prior calibration is given.
+    # If a prior calibration is given, the drifts in one heated attitude separate bias and scale.
     is_bench = earlier is None and rests.is_bench(windows, problem.up)
     has_poses = n_directions < POSITIONS_NEEDED and rests.is_constant(windows, data.position)
     if (has_poses or n_directions == 1) and earlier is None and data.forces is None:
@@ -140,7 +140,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     chosen = selected.posterior
     full_prior = replace(chosen.prior, bias_sd=prior.bias_sd, scale_sd=prior.scale_sd)
     selected = replace(selected, posterior=replace(chosen, prior=full_prior))
-    # The covariance takes the prior sd of the scale factor's slope without halving (`_steepest`).
+    # In the covariance, the prior sd of the scale factor's slope is not halved as in `_steepest`.
     limits = STEEPEST, _steepest(n_directions)
     full, used = (_typical_slopes(steepness, limit, options.gravity) for limit in limits)
     claimed = candidates.typical * (full / used)[:, np.newaxis]
@@ -243,7 +243,7 @@ def _with_faces(prior: Prior, up: Floats) -> Prior:
     The published covariance keeps the sd of `prior`.
     """
     by_element = up[:, [1, 2, 2]] * up[:, [0, 0, 1]]
-    # Reduced sd of an element of M [rad]: the cross-axis sensitivity of good consumer MEMS.
+    # Reduced sd of a misalignment [rad]: the cross-axis sensitivity of good consumer MEMS.
     reduced_sd, sd = 2.5e-3, prior.misalignment_scale
     # The RMS product of two components of `up` is below 0.1 if one axis is near the vertical in
     # each position, and 0.3 if each vertical is in the middle between two axes.
@@ -254,11 +254,9 @@ def _with_faces(prior: Prior, up: Floats) -> Prior:
 
 def _narrowed(prior: Prior, regression: Regression, state: State) -> Prior:
     """
-    Return `prior` with smaller sds of bias and scale, for the selection of columns.
-
-    The sds are five times the largest error of |f|, within 5 to 100 % of the sds of `prior`. Few
-    attitudes do not separate bias and scale: with larger prior sds a model that lacks columns
-    would have large biases and scale errors.
+    Return `prior` with smaller sds of bias and scale, for the selection of columns: five times the
+    largest error of |f|, within 5 to 100 % of the sds of `prior`. Few attitudes do not separate
+    bias and scale, which would be large, with larger sds, in a model that lacks columns.
     """
     norms = np.linalg.norm(position_means(regression.windows) / regression.nominal_scale, axis=1)
     limit = 5.0 * float(np.abs(norms - regression.norms(state)).max())

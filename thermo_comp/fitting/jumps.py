@@ -59,10 +59,9 @@ class Jump:
 
 def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     """
-    Find the jumps between successive rests of a bag, which may need a second reading of the bag.
-
-    Two rests are compared if the gap between them is at most 30 s or 250 samples, whichever is
-    longer, and their attitudes differ by less than 10 degrees.
+    Find the jumps between successive rests of a bag. Two rests are compared if the gap between
+    them is at most 30 s or 250 samples, whichever is longer, and their attitudes differ by less
+    than 10 degrees.
     """
     # A rest has whole cells of usually 30 samples, so gaps are long at a low sample rate.
     longest_ns = 1e9 * max(30.0, 250.0 * bag.cycle_s)
@@ -167,10 +166,9 @@ def _is_gradual(
     time: Floats, accel: Floats, step: tuple[int, float], sd: Floats, bag: ReducedBag
 ) -> bool:
     """
-    Whether a gradual change of the bias, by a steep curve over temperature in a ramp, explains the
-    samples better than a step, by a factor of e^2 in likelihood. The gradual change is linear, and
-    lasts while the board temperature changes by 0.1 K or more. `step`: first sample after the
-    step, and lag-1 correlation
+    Whether a gradual change, due to a steep curve over temperature, explains the samples e^2 times
+    better (likelihood) than a step. The change is linear in time while the board temperature
+    changes by 0.1 K or more. `step`: first sample after the step, and lag-1 correlation
     """
     (at, r), sd = step, np.maximum(sd, 1e-9)
     board_s, board = _readings(bag, time[0], time[-1])
@@ -189,7 +187,7 @@ def _is_gradual(
 
 
 def _sd_growth(residual: Floats, sd: Floats) -> Floats:
-    """Return the sd of the mean of `residual`, / that of white noise of sd `sd`; >= 1, (3,)."""
+    """Return sd of the mean of `residual` / sd for white noise of sd `sd`, at least 1, (3,)."""
     # If the means of 40 pieces have the lag-1 correlation r, the variance of the mean of all
     # pieces is (1 + r) / (1 - r) times the variance for uncorrelated pieces.
     size = max(len(residual) // 40, 1)

@@ -58,14 +58,14 @@ class FitOptions:
     model: 'response' selects from all columns; 'golovach' is the model of Golovach's paper with a
         linear static set, a quadratic dynamic set and no thermal response
     static_curve, dynamic_curve: families of static and dynamic curve; None: default of `model`
-    groups: groups of columns that the model may have, or None for all; forced: that it must have
+    groups, forced: groups of columns that the model may have (None: all); groups it must have
     prior: calibration of this unit or of its type; the fit uses all its columns, with no selection
     ageing_bias, ageing_scale: sd of the change of bias [m/s^2] and relative scale [1] since the
         prior calibration; if both are 0, the fit estimates them from the bags
     mounting_sd: sd of the bias offset of a mounting or turn-on [m/s^2], or None to estimate it
     gravity_sd: standard deviation of `gravity` [m/s^2]
     k2_sd, k3_sd: prior sd of the nonlinear terms K2 [g/g^2] and K3 [g/g^3], from a data sheet;
-        None: 100 ug/g^2 and 10 ug/g^3, without nonlinear terms if all bags are at 1 g
+        None: 100 ug/g^2, 10 ug/g^3; if both are None, bags at 1 g give no nonlinear terms
     serial: serial of the unit, or None for the serial of the sources
     input: unit of the samples
     full_scale: magnitude of a saturated sample [input units]; None: 32767 counts, or in m/s^2 the

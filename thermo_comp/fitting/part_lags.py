@@ -173,10 +173,9 @@ class _PartCurves:
 
     def lags(self, noise: Floats) -> list[Part] | None:
         """
-        Return the lag of each axis, or None if a lag is useless or longer than the bags can show.
-
-        None, too, if the data determine the lag of no axis. They may determine the lags of some
-        axes only: a bias may hardly depend on temperature, a lag may be shorter than a window.
+        Return the lag of each axis; None if a lag is useless or longer than the bags show, or if
+        the data determine the lag of no axis. The lag of a single axis may be undetermined if its
+        bias hardly depends on temperature, or if the lag is shorter than a window.
         """
         lags, is_determined = [], False
         longest_s = float(self._age.max()) / np.log(10.0)
@@ -197,10 +196,9 @@ class _PartCurves:
 
     def _lag(self, axis: int, noise: float) -> Part:
         """
-        Return the lag with the smallest RMS residual; 0 s if no lag reduces the residual.
-
-        If the residual exceeds the noise, a second stage of the lag, another share of the gradient
-        and the combination of both are tried; they must reduce the RMS residual by over 5 %.
+        Return the lag with the smallest RMS residual; 0 s if no lag reduces the residual. If the
+        residual exceeds the noise, a second stage of the lag, another share of the gradient and
+        the combination of the two are tried; they must reduce the RMS residual by over 5 %.
         """
         one_stage = self.one_stage(axis)
         best = self._with_lead(one_stage, axis)
@@ -346,9 +344,9 @@ class _PartCurves:
         square /= max(1.0 - n_unknowns / len(residual), 0.05)
         ratio = float(np.sqrt((square / noise**2).max()))
         x, y, z = (Part(*map(round, lag, (1, 1, 4, 1))) for lag in lags)
-        # Other models are tried if the left-out drift exceeds `most_drift`: 2 sd of the noise, or
-        # 10 sd if noise explains the residual of a shape without stress, as curves that fit all
-        # data well may extrapolate badly to left-out data.
+        # Curves that fit all data well may extrapolate badly to left-out data. If the left-out
+        # drift exceeds `most_drift`, other models are tried: at 2 sd of the noise, or at 10 sd if
+        # noise explains the residual of a shape without stress.
         is_complete = ratio <= self._shape.most_noise and not self._shape.has_stress
         most_drift = (10.0 if is_complete else 2.0) * float(noise.mean())
         return Parts((x, y, z), factors, most_drift), ratio

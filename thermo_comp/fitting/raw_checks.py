@@ -44,7 +44,7 @@ def full_scale_of(bags: Sequence[ReducedBag], options: FitOptions) -> float:
         return widened(full_scale, np.array([[largest]]))
     if full_scale is None:
         # Take the smallest usual full scale 10 % above all samples, else twice the largest sample.
-        # The user may have stated the full scale of the prior, so it is the least that is taken.
+        # The result is at least the full scale of the prior, which the user may have stated.
         ranges = (STANDARD_GRAVITY * g for g in (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0))
         full_scale = next((top for top in ranges if top > 1.1 * largest), 2.0 * largest)
         full_scale = max(full_scale, options.prior.unit.full_scale if options.prior else 0.0)

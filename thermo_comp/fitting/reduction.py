@@ -86,7 +86,7 @@ class ReducedBag:
     is_integer: whether all samples are integers
     middle: sample at zero force of a converter with unsigned codes, else 0
     step: resolution of the coarsest axis [input units], or 0 if the samples do not show it
-    max_abs: largest magnitude of a sample in the cells without the largest 1 % [input units]
+    max_abs: 99 % quantile, over cells, of the largest magnitude of a sample [input units]
     since_s: time from the bag's first sample to the part of the bag that was read [s]
     restless: reason why the bag cannot be used, such as no rests; '' if the bag can be used
     angular_rate: 'whole' if all samples have a finite angular rate, 'part' if some, else 'none'
@@ -304,7 +304,7 @@ def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
     use &= stamp_ns > np.maximum.accumulate(before[: len(stamp_ns)])
     stamp_ns, value = stamp_ns[use], value[use]
     span_s = np.ptp(stamp_ns) * 1e-9 if len(stamp_ns) else 0.0
-    # Means over 0.2 s lose nothing, as thermometers respond slower, and save computing time.
+    # No thermometer responds within 0.2 s, so means over 0.2 s lose nothing and save time.
     size = int(0.2 * (len(stamp_ns) - 1) / span_s) if span_s else 1
     n = len(stamp_ns) // size * size if size > 1 else 0
     if n:
@@ -363,7 +363,6 @@ def _rests(cells: Cells, min_rest_s: float | None, still_sd: float) -> list[tupl
 def _joined(cells: Cells, ranges: list[tuple[int, int]], still_sd: float) -> list[tuple[int, int]]:
     """
     Join rests that are separated by a vibration without motion, as from a compressor that cycles.
-
     There is no motion if on each axis a parabola fits the means of the cells, from four before to
     four after the vibration, with a mean square residual below 4 variances of a cell's mean. Bags
     with fewer than six of these vibrations keep their separate rests.
@@ -375,7 +374,7 @@ def _joined(cells: Cells, ranges: list[tuple[int, int]], still_sd: float) -> lis
         around = slice(max(first, last - 4), min(stop, start + 4))
         time, mean = cells.time[around], cells.mean[around]
         variance = np.maximum(cells.variance[around], cells.quantum**2 / 12.0)
-        # Equal samples have no variance: their means differ by rounding, by 1e-12 of a reading.
+        # Equal samples have no variance: their means differ by rounding, by 1e-12 of a sample.
         variance = np.maximum(variance, (1e-12 * np.abs(mean).max()) ** 2 + 1e-300)
         root = np.sqrt(np.maximum(cells.count[around, None], 1) / variance)
         is_same = is_calm[last:start].all() and np.all(np.diff(cells.index[around]) == 1)

@@ -64,10 +64,9 @@ def _is_heated(windows: ThermalWindows) -> Bools:
 
 def is_steady(windows: ThermalWindows) -> Bools:
     """
-    Return whether each position has constant temperatures, shape (n_positions,): the board
-    temperature and the lags change (RMS) by less than three sd of the estimated board temperature.
-    Noise is a ninth of the mean square of a change of three sd, and makes a slope fitted to the
-    change too small by a ninth.
+    Return whether each position has constant temperatures, shape (n_positions,): the RMS change of
+    the board temperature and of the lags is below three sd of the error of the board temperature.
+    A ninth of a mean square of (3 sd)^2 is noise, so a slope would be too small by a ninth.
     """
     data, model = windows.data, windows.model
     lags = [column.group in LAGS and not column.power for column in model.columns]

@@ -104,7 +104,7 @@ class Whitener:
             covariance = covariance - gain[..., None] * shared[..., None, :]
 
     def filter(self, series: Floats, weight: Floats, noise: Noise) -> Floats:
-        """Return series, shape (n, m), divided by `noise`: their normalised innovations."""
+        """Return series whitened for `noise`, which are innovations / their sd, (n, m)."""
         if noise.ratio <= 0.0:
             return np.asarray(series * (1.0 / np.sqrt(1.0 / weight))[:, None])
         result = np.empty_like(series)
@@ -171,7 +171,7 @@ class Base:
     the functions `Windows.tilt`; the mean samples of three axes less their mean in the position.
 
     columns: indices of the active columns among all columns
-    lagged: indices, within `columns`, of the columns with a lag; lag: number of each column's lag
+    lagged: indices, within `columns`, of the columns with a lag; lag: index of each one's lag
     at_start, t, tilts, measured: indices, among the base series, of the derivatives w.r.t. initial
         lag states, of t (shape (1,) or (0,)), of `Windows.tilt`, and of the mean samples
     """
@@ -186,7 +186,7 @@ class Base:
 
     @classmethod
     def of(cls, columns: Ints, lags: Ints, n_t: int, n_tilts: int) -> Base:
-        """Assign indices to base series; `lags`: number of each column's lag, -1 if no lag."""
+        """Assign indices to base series; `lags`: index of each column's lag, -1 if it has none."""
         lagged = np.flatnonzero(lags[columns] >= 0)
         counts = 1 + len(columns), len(lagged), n_t, n_tilts, 3
         _, *places = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
@@ -273,7 +273,7 @@ class Series:
         self._products: Products | None = None
 
     def whiten(self, noise: Noise) -> None:
-        """Set the noise of which the series are whitened."""
+        """Set the noise for which the series are whitened."""
         if noise == self.noise:
             return
         self.noise, self._products = noise, None

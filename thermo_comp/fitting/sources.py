@@ -36,7 +36,7 @@ RADIUS, RADIUS_SD = 'rotation_radius_m', 'rotation_radius_sd_m'
 
 
 class Section(NamedTuple):
-    """A time section of a bag, since its first sample; `size`, `sd`: |f| and its sd [m/s^2]."""
+    """Times since a bag's first sample [s], with |f| between them (`size`) and its sd [m/s^2]."""
 
     begin_s: float
     end_s: float
@@ -193,7 +193,7 @@ def recording_source(
     """
     Make a source of a recording; each iteration over its blocks opens the recording again.
 
-    `require`: roles whose topics must exist; `force`: options for |f|, used before the metadata
+    `require`: roles whose topics must exist; `force`: options for |f|, instead of the metadata
     """
     path = Path(path)
     with open_recording(path, topics, require=require) as reader:

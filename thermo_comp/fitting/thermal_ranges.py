@@ -122,8 +122,8 @@ def with_unseen_axes(
     (lower, upper), (new_lower, new_upper) = _determined_ranges(fit, earlier), _seen(fit, None)
     slope = _unknown_slope(fit) * fit.regression.gravity
     ends = _ends(fit, earlier)
-    # The variance of an extrapolated scale factor is quadratic in temperature. The calibration is
-    # interpolated linearly between points, so the lack of fit is stated at five temperatures.
+    # A calibration interpolates variances of the lack of fit linearly, but the variance of an
+    # extrapolated scale factor is quadratic in temperature: state it at five temperatures.
     between = [
         np.linspace(edge, end, 5)
         for edge, end in zip((lower.max(), upper.min()), ends, strict=True)
@@ -202,7 +202,7 @@ def _ends(fit: Fit, earlier: Calibration | None) -> Range:
 
 
 def _unknown_slope(fit: Fit) -> float:
-    """Return the sd of the slope of an extrapolated scale factor [1/K]: half the fitted slope."""
+    """Return the sd of an extrapolated scale factor's slope [1/K]: half the RMS fitted slope."""
     windows, state = fit.windows.data, fit.posterior.state
     is_curve = np.isin(windows.groups, (CURVE, PART)) & (windows.kelvins > 0.0)
     slopes = state.weights[1][:, is_curve] / windows.kelvins[is_curve]

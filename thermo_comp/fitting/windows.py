@@ -36,9 +36,9 @@ from .unknowns import Windows
 #: Groups of columns: the static curve, its difference from the dynamic curve, changes of the slope
 #: of the curve at one temperature, and the curves over the temperatures of parts.
 CURVE, SET, BEND, PART = 'curve', 'set', 'bend', 'part'
-#: `LAGS`: groups of columns linear in a difference of temperatures [K]. `PRODUCTS`: groups of the
-#: columns lag times powers of the temperature, and of the square and cube of the lag. A curve over
-#: a part's temperature is a sum of columns of the groups `CURVE`, 'board' and `PRODUCTS`.
+#: `LAGS`: groups of columns linear in a difference of temperatures. `PRODUCTS`: groups of products
+#: of a lag and powers of the temperature, and of squares and cubes of a lag. A curve over a part's
+#: temperature is a sum of columns of the groups `CURVE`, 'board' and `PRODUCTS`.
 LAGS, PRODUCTS = ('gradient', 'board', 'gradient_lag'), ('product', 'square')
 #: Number of windows into which a short rest is divided, to determine the noise of the rest.
 FEWEST_WINDOWS = 20

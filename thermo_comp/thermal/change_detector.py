@@ -7,8 +7,8 @@ Two Kalman filters of temperature and rate, with a long and a short memory, mode
 noise. A rate departs if its excess over the baseline, away from 0, is larger than the swing (the
 rate's amplitude in a soak), plus the error of the baseline, plus h times the sd of the rate's
 noise. h is computed from the permitted false alarms per hour (Rice's formula [1]_,
-docs/regime.md). A quantized sensor whose reading noise cannot change has no filters: its mean rate
-is computed from two successive crossings of edges between intervals of equal readings.
+docs/regime.md). If noise cannot change the reading of a quantized sensor, no filter is used: the
+mean rate is computed from successive crossings of edges between intervals of equal readings.
 
 References
 ----------
@@ -77,7 +77,7 @@ class ChangeDetector:
         self._peak = self._peak_before = 0.0  # largest distances of the rate from its trend [K/s]
 
     def settle(self, sensor: Thermometer, least_error: float = 0.0) -> None:
-        """Begin a soak: the rate becomes the baseline; `least_error`: least error of it [K/s]."""
+        """Begin a soak: the rate becomes the baseline, with an error of `least_error` or more."""
         self._baseline = self.rate
         self._baseline_error = max(self.swing, least_error, 2.0 * sqrt(sensor.var_rate))
         self._edge = nan  # last edge of a cell crossed in the soak: none yet

@@ -33,7 +33,7 @@ START_TAU_S: Final = 3600.0
 
 
 class Quantity:
-    """A quantity of the thermal state; `input`: name of its thermometer, or of a gradient's."""
+    """A quantity of the thermal state; `input`: its thermometer, for a gradient the sensor."""
 
     input: str
     #: Largest magnitude of the quantity that a calibration may contain.
@@ -45,7 +45,7 @@ class Quantity:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Names of the thermometers; for a gradient (sensor less board) only the sensor's."""
+        """Names of the thermometers; for a gradient (sensor less board) the sensor alone."""
         return (self.input,)
 
     @property

@@ -143,7 +143,7 @@ class ThermalMemory:
             bank.forget()
         self._held: list[float] = []  # output of each play; empty before the first temperature
         #: Estimated board rate in a ramp in which the unit may have been switched on [K/s];
-        #: `sure_rate`: lower bound of it, the largest measured board rate less 2 sd [K/s].
+        #: `sure_rate`: lower bound of this rate, the largest estimate of the board rate less 2 sd.
         self.start_rate = self.sure_rate = 0.0
 
     def forget_input(self, name: str) -> None:
@@ -260,7 +260,7 @@ def memory_on_grid(
 
 
 def _recursion(decay: float, driven: Floats) -> Floats:
-    """Compute ``m[k] = decay m[k - 1] + driven[k]`` in log2(n) passes; pass j adds 2^j steps."""
+    """Compute ``m[k] = decay m[k - 1] + driven[k]`` in log2(n) passes: pass j spans 2^j steps."""
     result: Floats = driven.copy()
     shift, factor = 1, decay
     while shift < len(result) and factor > _LEAST_WEIGHT:

@@ -3,11 +3,11 @@
 """
 Owns the plausibility checks of temperature readings before an estimator uses the readings.
 
-A board has a heat capacity, so its temperature cannot step. A thermometer has noise, so its
-readings are not constant for long. Constant readings of the board's thermometer are implausible if
-the case temperature changes, and those of the case's if the board temperature does. The case is
-nearer to the surroundings than the board, so in a ramp the case temperature changes first.
-Implausible readings are not used, or get a variance larger by the square of their possible error.
+A board has a heat capacity, so its temperature cannot step. A thermometer has noise, so constant
+readings are implausible, above all while the temperature of the other thermometer (case or board)
+changes. The case is nearer to the surroundings than the board, so in a ramp the case temperature
+changes first. Implausible readings are not used, or their variance is increased by the square of
+their possible error.
 """
 
 from enum import Enum
@@ -24,7 +24,7 @@ LARGEST_RATE: Final = 0.2
 #: Number of used readings of a sensor after which readings are checked for steps.
 SETTLED_READINGS: Final = 5
 #: A sensor's first reading is wrong if the step to the second reading is impossible, and the step
-#: from the second to the third reading is less than this share of it, in K and in K/s.
+#: from the second to the third reading is less than this share of the first, in K and in K/s.
 CONTINUED_SHARE: Final = 0.25
 #: A sensor stands still after `STILL_S` [s] with this number of equal readings or, if larger, the
 #: number of equal readings that noise gives with the probability `STILL_PROBABILITY`.

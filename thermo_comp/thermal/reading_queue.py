@@ -14,8 +14,8 @@ Entry = tuple[int, bool, str, int, float]
 #: Number of waiting readings at which the oldest half is dropped: readings and samples have
 #: different clocks, or no samples arrive.
 PENDING_LIMIT: Final = 4096
-#: After a larger backward step between consecutive stamps of one sensor [ns], its earlier readings
-#: are taken to be from another clock.
+#: If consecutive stamps of a sensor step back by more than this time [ns], the sensor's earlier
+#: readings are taken to be from another clock.
 DISORDER_NS: Final = 5_000_000_000
 NEVER_NS: Final = 1 << 62  # a stamp later than any real stamp [ns]
 

@@ -80,7 +80,7 @@ class RegimeDetector:
         is_calm = self._board.is_calm(stamp_ns, board, change.swing) and is_calm
         if is_dynamic and not self._is_grown:
             # The onset of a ramp is detected while the rate is still low. Before the rate has
-            # exceeded 1.5 times the relaxed rate, only a rate near the baseline is calm.
+            # exceeded 1.5 times the relaxed rate, only a rate near the baseline is taken as low.
             self._is_grown = abs(lead.rate) > OBVIOUS_SHARE * self._relaxed_rate
             is_calm = is_calm and change.is_back()
         if not is_calm:
@@ -152,8 +152,8 @@ class _Watch:
         self._relaxed = settings.relaxed_rate_k_min / 60.0
         self._memory_s = 0.25 * sensor.lag_s
         self._stale_ns = round(0.5e9 * sensor.lag_s)
-        # A reading unchanged for `still_s` proves a low rate: by then the reading changes at the
-        # relaxed rate, and also at a second derivative `bend` [K/s^2].
+        # At the relaxed rate, or at a second derivative `bend` [K/s^2], a reading changes within
+        # `still_s`: a reading that is unchanged for longer proves a low rate.
         quantum, bend = sensor.quantum_c, settings.smallest_ramp_k_min / 60.0 / sensor.lag_s
         still_s = max(quantum / self._relaxed, 2.0 * sqrt(2.0 * quantum / bend))
         self._still_ns = round(1e9 * still_s)

@@ -27,7 +27,7 @@ from typing import Final
 from .settings import ThermometerSettings
 
 OUTLIER_SIGMAS: Final = 6.0  # innovation / its sd above which a reading is down-weighted
-OUTLIER_LIMITS: Final = 5.0  # innovation / smallest innovation of an outlier, to reject a reading
+OUTLIER_LIMITS: Final = 5.0  # innovation / limit of outliers, above which a reading is rejected
 RESTART_READINGS: Final = 4  # consecutive outliers of equal sign after which the filter restarts
 # Mean time in the quiet mode [s]; the mean time in the bending mode is the lag of the sensor.
 SOAK_S: Final = 900.0
@@ -294,7 +294,7 @@ class Thermometer:
 
 
 def mix(state: State, other: State, share: float) -> State:
-    """Return mean and covariance of a mixture of `state` and `other`; `share`: that of `other`."""
+    """Return mean and covariance of a mixture of two states; `share`: weight of `other`."""
     t, v, a, p00, p01, p02, p11, p12, p22 = state
     u, w, b, r00, r01, r02, r11, r12, r22 = other
     dt, dv, da = u - t, w - v, b - a

@@ -134,7 +134,7 @@ class ThermalTracker:
             memory.board_step(stamp_ns, board.temperature, error)
             age_s = (stamp_ns - (memory.board.start_ns or 0)) * 1e-9
             if age_s <= max(self._board_lag_s, board.settings.lag_s):
-                # For the longer one of the two lags, a rate may be due to a ramp before the start.
+                # Within the longer of the two lags, a rate may be due to a ramp before the start.
                 rate = abs(board.rate)
                 memory.sure_rate = max(memory.sure_rate, rate - 2.0 * sqrt(board.var_rate))
                 memory.start_rate = max(memory.sure_rate, rate)
@@ -157,7 +157,7 @@ class ThermalTracker:
     def _use(
         self, name: str, sensor: Thermometer, check: SensorCheck, stamp_ns: int, celsius: float
     ) -> bool:
-        """Use a plausible reading, and adjust lags after a jump or gap; False: not plausible."""
+        """Use a plausible reading, adjust lags after a jump or gap; return whether it was used."""
         if check.has_wrong_start(stamp_ns, celsius):
             self._begin_again(name, sensor)
         before_ns, before, n_restarts = sensor.stamp_ns, sensor.temperature, sensor.n_restarts
@@ -230,7 +230,7 @@ class ThermalTracker:
         """
         Return the thermal state at a stamp, in the order of `StateLayout`; the board must have a
         reading. The variance of a gradient is the variance of the sensor's temperature, without
-        the board's; the variance of a lag is for a known initial state.
+        that of the board; the variance of a lag is its variance for a known initial state.
         """
         board, rate, var_board = self.board.at(stamp_ns)
         decided_ns = self._decided_ns
@@ -265,7 +265,7 @@ class ThermalTracker:
     def _board_error(self, gradient: float) -> float:
         """
         Return the variance of the board temperature [K^2] due to an impossible gradient of the
-        leading sensor, as of a loose thermometer or with swapped topics.
+        leading sensor, as with a loose thermometer or swapped topics.
         """
         loose, lead = self.loose_k(gradient), self.lead
         # If the board leads the case in a ramp, the topics of case and board may be swapped.

@@ -43,9 +43,8 @@ PLAY_WIDTHS: Final = (0.4, 0.8, 1.6, 3.2, 6.4)
 PLAY_TAUS: Final[tuple[float, ...]] = (0.0, 450.0, 900.0, 1800.0)
 #: Time constants of kind bend [s].
 BEND_TAUS: Final = (0.0, *FINE_TAUS[4:11])
-#: Smallest span of board temperatures per knee [K] (knee: a temperature at which the slope of a
-#: bend changes), and largest number of knees per lag; largest number of knees with `bank(parts=)`,
-#: for which a third of the span suffices per knee.
+#: At its knee [K] the slope of a bend changes: smallest span of board temperatures per knee [K];
+#: largest number of knees per lag, and with the argument `parts` of `bank` (a third of the span).
 LEAST_KNEE_K, MOST_KNEES, MOST_PART_KNEES = 1.0, 20, 60
 
 
@@ -177,7 +176,7 @@ def bank(
     """
     Return all candidate columns, with ranges that exclude no value.
 
-    at_rest: gradient of each sensor in a soak [K]
+    at_rest: gradient g_s of each sensor in a soak [K]
     span_k: lowest and highest board temperature in the data, less the reference [K]
     parts: lag of each axis's part: the only lags of the columns; None: lags of all time constants
     """

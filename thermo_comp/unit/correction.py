@@ -34,7 +34,7 @@ GENTLE_RATE = MICRO_G
 LONGEST_TRANSITION = 10.0
 #: Number of board temperatures for which slopes, and the difference of the sets, are evaluated.
 _GAP_TEMPERATURES = 33
-#: Rounding variance of a count: twice 1/12, as the converter adds the remainder to the next cycle.
+#: Rounding variance [counts^2]: 2/12, as the converter adds the remainder to the next cycle.
 ROUNDING_VARIANCE = 1.0 / 6.0
 #: Smallest noise variance of a sample / largest variance of any axis. This minimum keeps the
 #: covariance positive definite in spite of rounding, and is far below the noise of any instrument.

@@ -69,7 +69,7 @@ class CovarianceMap:
         factors = sums[:, u, w]
         # Row b of an axis is twice the covariance of the axis' constant error and scale error.
         factors[:, 1:9:3] /= 2.0
-        # Few rows of the covariance of u have a factor other than 0 in a coefficient.
+        # Each coefficient has nonzero factors of only a few rows of the covariance of u.
         n = int((factors != 0.0).sum(axis=1).max())
         self._places = np.argsort(factors == 0.0, axis=1, kind='stable')[:, :n]
         self._factors = np.take_along_axis(factors, self._places, axis=1)[:, :, np.newaxis]

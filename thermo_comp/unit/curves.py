@@ -20,7 +20,7 @@ class Curves:
 
     At a temperature in the range of one set only, the curves of the other set run parallel to the
     curves of that set. Beyond both ranges the set whose range extends farther follows tangents for
-    `TANGENT_SPANS` times the width of its range, and then is constant; the other runs parallel.
+    `TANGENT_SPANS` times the width of its range, then is constant; the other set runs parallel.
     """
 
     def __init__(self, calibration: Calibration) -> None:

@@ -28,8 +28,8 @@ from .schema import broken
 #: A temperature difference [K], or an array of temperature differences.
 Kelvins: TypeAlias = float | Floats
 
-#: Length of the tangent that continues a curve beyond its range / width of the range. At the end
-#: of the tangent a parabola is 1/16 as far from it as at the distance of a whole range.
+#: Length of the tangent that continues a curve beyond its range / width of the range. Over this
+#: length a parabola departs from the tangent by 1/16 of its departure over a whole range.
 TANGENT_SPANS = 0.25
 #: Largest accepted error of a function's value (0 or 1) at the reference temperature.
 NORMALISATION_TOLERANCE = 1e-9
@@ -116,9 +116,8 @@ class Polynomial(_Family):
 @dataclass(frozen=True)
 class CubicSpline(_Family):
     """
-    Natural cubic spline through values at rising knots of t, the board less the reference
-    temperature [K]. The knot t = 0 has the value 0 (bias) or 1 (scale). Beyond the outer knots the
-    spline is constant.
+    Natural cubic spline through values at rising knots of t = T_board - T_ref [K]. The knot t = 0
+    has the value 0 (bias) or 1 (scale). Beyond the outer knots the spline is constant.
     """
 
     knots_k: Annotated[tuple[float, ...], QUANTITIES['knots']]

@@ -3,9 +3,9 @@
 """
 Owns the limits of a calibration's bias and scale over its temperatures.
 
-The bias at the reference temperature is at most twice the full scale, and so is its change over
-temperature. The effect of a column on the bias is at most a million times this limit, and so are
-the effects of a parameter's sd on bias and scale: no instrument needs more, no float overflows.
+The bias at the reference temperature, and its change over temperature, are each at most twice the
+full scale. The effect of a column on the bias, and of a parameter's sd on bias or scale, is at
+most a million times the limit of bias or scale: no instrument needs more, and no float overflows.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 SMALLEST_RELATIVE_SCALE, LARGEST_RELATIVE_SCALE = 0.1, 10.0
 #: Largest bias / full scale. (Samples in an offset code have a bias of half of their range.)
 FULL_SCALES = 2.0
-#: Largest effect of a column, or of a parameter's sd / limit of the bias or scale.
+#: Largest effect of a column, or of a parameter's sd, divided by the limit of bias or scale.
 WORST = 1e6
 #: Number of temperatures at which a function of temperature is checked.
 _GRID = 513

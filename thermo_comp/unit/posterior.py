@@ -114,11 +114,9 @@ def lay_out(
 
 class ParameterLayout(NamedTuple):
     """
-    The order of a calibration's parameters in its posterior.
-
-    First come, for each axis, bias [input units] and scale [relative]. From index `nonlinear` on,
-    each axis has nonlinear coefficients, then their changes per kelvin. From index `misalignment`
-    on follow the elements M[1][0], M[2][0], M[2][1] of the misalignment matrix.
+    The order of a calibration's parameters in its posterior: bias [input units] and relative scale
+    of each axis. From index `nonlinear` on, each axis has nonlinear coefficients, then their
+    changes per kelvin. From index `misalignment` on, there are M[1][0], M[2][0], M[2][1].
     """
 
     bias: list[Block]
