@@ -3,8 +3,8 @@
 """
 Owns the checks of the windows of a fit, and of the fitted calibration, with advice to the user.
 
-Data that contradict themselves or the model are refused; missing data increase the posterior
-uncertainty. A refusal stops the fit unless the user allows its name; advice stops no fit.
+Data that contradict themselves or the model are refused. A refusal stops the fit unless the user
+allows it by its name; advice stops no fit.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from .evidence import ResidualRow
     from .selection import Fit
 
-#: Smallest numbers of positions that determine 6 constants (bias and scale factor of the axes), 9
-#: constants (misalignment, too), and the 9 constants and, by |f|, the sd of mounting offsets.
+#: Smallest numbers of positions that determine 6 constants (biases and scale factors), 9 constants
+#: (also the misalignment), and 9 constants and the sd of mounting offsets.
 POSITIONS_NEEDED, POSITIONS_FOR_MISALIGNMENT, POSITIONS_FOR_MOUNTINGS = 6, 9, 12
 #: Span of the board temperature below which no temperature dependence is visible [K].
 LEAST_SPAN_K = 3.0
@@ -40,7 +40,7 @@ LEAST_SPAN_K = 3.0
 
 @dataclass(frozen=True)
 class Finding:
-    """A finding of the checks: the name by which a user can allow a refusal, and the message."""
+    """A finding of a check; `name`: word by which a user allows a refusal (--allow swapped)."""
 
     name: str
     level: Literal['refusal', 'advice', 'good']
@@ -51,7 +51,7 @@ class Finding:
 
 
 def advice(name: str, message: str) -> Finding:
-    """Return a finding that advises the user."""
+    """Return a finding of the level 'advice'."""
     return Finding(name, 'advice', message)
 
 
@@ -74,8 +74,8 @@ def judge_windows(
     """
     Check temperatures, ramps and directions `up`, shape (n, 3), of the windows at rest.
 
-    With a prior calibration of the unit, which contains the effects of temperature and of ramps,
-    temperatures beyond the range of the prior are judged instead of the span and the ramps.
+    A prior calibration of the unit contains the effects of temperature and of ramps: if a prior is
+    given, temperatures beyond its range are checked instead of the span and the ramps.
     """
     yield _judge_positions(up)
     if not windows.has_temperature:
@@ -103,7 +103,7 @@ def judge_windows(
 
 
 def _judge_order(windows: ThermalWindows) -> Iterator[Finding]:
-    """Refuse bags if T_board leads T_case in the ramps of all bags together, or of some bags."""
+    """Refuse bags if in their ramps the temperature of the board leads that of the case."""
     moving, bag = np.abs(_ramp_rates(windows)) > RAMP_K_MIN, windows.data.bag
     least, where = _correlation(windows, moving), ''
     numbers, first = np.unique(bag, return_index=True)
@@ -124,7 +124,7 @@ def _judge_order(windows: ThermalWindows) -> Iterator[Finding]:
 
 
 def _correlation(windows: ThermalWindows, rows: Bools) -> float:
-    """Return the correlation of gradient and rate; 0 if the samples fill less than 30 windows."""
+    """Return the correlation of gradient and board rate; 0 if `rows` are less than 30 windows."""
     if windows.data.weight[rows].sum() < 30.0 * windows.data.weight.max():
         return 0.0
     # The case leads the board in a ramp, so the gradient has the sign of the board's rate.
@@ -169,7 +169,7 @@ def _has_drift(windows: ThermalWindows) -> bool:
 
 
 def _ramp_rates(windows: ThermalWindows) -> Floats:
-    """Return `windows.rate` [K/min], (n,); 0 where T_board's slope is less than half this rate."""
+    """Return board rates [K/min], (n,); 0 where the windows' slope is below half the rate."""
     rate, edges = windows.rate * 60.0, windows.data.edges
     for rows in map(slice, edges[:-1], edges[1:]):
         if rows.stop - rows.start > 1:
@@ -193,7 +193,7 @@ def _judge_ramps(windows: ThermalWindows) -> Iterator[Finding]:
         least = max(1.0, 0.1 * steps.sum())
         is_gap = steps > least
         n = 1 + int(is_gap.sum())
-        # If the temperature drifts slowly through its range, there are no soaks to count.
+        # A bag whose temperature drifts slowly through its range has no soaks to count.
         has_soaks = steps[~is_gap].sum() < n * least
         # Five temperatures determine a cubic, and show whether the cubic fits.
         if has_soaks and n < 5:
@@ -245,7 +245,7 @@ def _judge_positions(up: Floats) -> Finding:
 
 
 def judge_coverage(axis: LeastKnown | None) -> Iterator[Finding]:
-    """Advise a position if the sd of |f| in an attitude is >= 3 times the positions' median."""
+    """Advise a position if the sd of |f| in an attitude is >= 3 times its median at positions."""
     if axis is not None and axis.sd_m_s2 >= 3.0 * axis.seen_sd_m_s2:
         yield advice(
             'unseen',
@@ -260,8 +260,7 @@ def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator
     Report the sd of mounting and turn-on offsets if the fit had to assume this sd.
 
     `offset_sd`: published sd of the bias offset of a mounting [m/s^2]. In nine positions the nine
-    constants of a triad explain |f| whatever the mounting offsets are, and drifts show only large
-    mounting offsets.
+    constants of a triad explain the values of |f|, whatever the mounting offsets are.
     """
     prior = fit.posterior.prior
     n, n_turn_ons = int(fit.windows.data.mounting[-1]) + 1, fit.windows.data.n_turn_ons
@@ -287,7 +286,7 @@ def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator
 
 
 def judge_groups(fit: Fit, options: FitOptions) -> Iterator[Finding]:
-    """Report the groups that `options` name but that have no column in the chosen model."""
+    """Report groups of columns named in `options` of which the chosen model has no column."""
     wanted = dict.fromkeys((*(options.groups or ()), *options.forced))
     absent = [group for group in wanted if group not in fit.windows.data.groups]
     if absent and options.prior is None:
@@ -301,11 +300,11 @@ def judge_groups(fit: Fit, options: FitOptions) -> Iterator[Finding]:
 
 def determines_misalignment(up: Floats) -> bool:
     """
-    Whether the number and the spread of positions are sufficient to estimate the misalignment M.
+    Whether the number and the spread of positions are sufficient to estimate the misalignment.
 
-    The ratio of the largest sd of a constant to the noise of one position must be at most 6. This
-    ratio is 1 for 18 well spread positions, 3 for nine, and 4.5 to 8 for the six faces held three
-    times each by hand.
+    The ratio of the largest sd of a constant to the noise of one position must be at most 6. The
+    ratio is 1 for 18 well spread positions, 3 for nine, and 4.5 to 8 if each of the six faces is
+    held up by hand three times.
     """
     distinct = distinct_directions(up)
     is_enough = len(distinct) >= POSITIONS_FOR_MISALIGNMENT
@@ -316,9 +315,9 @@ def judge_constants(fit: Fit, raw: float, options: FitOptions) -> Iterator[Findi
     """
     Refuse data that appear to be compensated already.
 
-    `raw`: RMS of |f| - g, corrected only with the constants at reference temperature [m/s^2].
-    No uncompensated triad has biases [g], relative errors of the scale and misalignments [rad] all
-    below 1e-4, and an RMS of |f| - g below 2e-5 g over 20 K.
+    `raw`: RMS of |f| - g of samples corrected by the constants at the reference temperature only
+    [m/s^2]. No uncompensated triad has biases [g], relative errors of the scale and misalignments
+    [rad] that are all below 1e-4, and a `raw` below 2e-5 g over 20 K.
     """
     state, K = fit.posterior.state, fit.posterior.state.kappa * fit.regression.nominal_scale
     span = float(np.ptp(fit.windows.temperature))
@@ -339,8 +338,8 @@ def judge_constants(fit: Fit, raw: float, options: FitOptions) -> Iterator[Findi
 
 def check_scale(fit: Fit) -> None:
     """
-    Refuse a scale factor that, in a fit of few attitudes, deviates by more than six sd from the
-    prior mean: drifts, steps or motions in the bags then appear as an error of the scale factor.
+    Refuse a scale factor that deviates by more than six sd from its prior mean, if attitudes are
+    few: a drift, step or motion in the bags then looks like an error of the scale factor.
     """
     state, prior = fit.posterior.state, fit.posterior.prior
     if prior.informative or len(distinct_directions(state.up)) >= POSITIONS_NEEDED:
@@ -391,8 +390,8 @@ def judge_result(
     else:
         yield Finding('residual', 'good', text)
     alone = overall.two_sets.rms
-    # A large residual that is due to bias shifts of up to 2 `slow`, or to initial lag states, does
-    # not contradict the prior: the fit estimates both, so neither increases its noise `sigma`.
+    # A large residual due to bias offsets of up to 2 `slow`, or to initial lag states, does not
+    # contradict the prior: the fit estimates them, so they do not increase its noise `sigma`.
     contradiction, sigma = '', float(np.mean(prior.sigma))
     is_above = overall.fitted.rms > np.hypot(1.5 * alone, 2.0 * slow) and sigma > 1.5 * alone
     if options.prior is not None and is_above:

@@ -3,8 +3,8 @@
 """
 Owns the sequence of a fit, from sources to a calibration with its residuals and findings.
 
-Directions and norms cannot be computed from codes with an offset, as in offset binary, so the code
-at zero force is subtracted before the fit and added to the bias after the fit.
+Converters with offset-binary samples output a large code at zero force. This code is subtracted
+before the fit, which needs directions and norms, and added to the bias after the fit.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def fit(
     """
     Fit a calibration to bags of a thermal test.
 
-    Raises FitError if the data do not allow a fit, such as a recording without still interval.
+    Raises FitError if the data do not allow a fit, for example if a recording has no rest.
     """
     check_serial(sources, options)
     if not sources:
@@ -96,7 +96,7 @@ def fit(
 
 
 def reduce_bag(source: FitSource, options: FitOptions) -> ReducedBag:
-    """Compute the statistics of a source; FitError without samples or still intervals."""
+    """Compute the statistics of a source; FitError if it has no samples or no rest."""
     return _checked(_reduced(source, options))
 
 
@@ -122,8 +122,8 @@ def _checked(bag: ReducedBag) -> ReducedBag:
 def fit_bags(
     bags: Sequence[ReducedBag], options: FitOptions, progress: Progress = lambda _part: None
 ) -> FitResult:
-    """Fit a calibration to the statistics of bags; FitError if these do not allow a fit."""
-    # One bag of a split recording may have no rest, so the bags are joined before the check.
+    """Fit a calibration to the statistics of bags; FitError if the data do not allow a fit."""
+    # One bag of a split recording may have no rest: join its bags before the check for rests.
     recordings = [_checked(bag) for bag in joined(bags)]
     # Threads would slow down the products of small matrices in the fit.
     with threadpool_limits(1, 'blas'):
@@ -183,7 +183,7 @@ def find_offset(bags: Sequence[ReducedBag], options: FitOptions) -> Floats:
         return np.zeros(3)
     if options.prior is not None:
         constants = constants_of(options.prior)
-        # If a bias exceeds 0.5 g, the three biases are taken for the codes at zero force.
+        # If one bias exceeds 0.5 g, all three biases are taken as the codes at zero force.
         is_far = np.abs(constants.bias / constants.scale).max() > 0.5 * options.gravity
         return np.asarray(np.rint(constants.bias) * is_far)
     middle = max(bag.middle for bag in bags)
@@ -205,11 +205,11 @@ def without_code_offset(bag: ReducedBag, offset: Floats) -> ReducedBag:
 
 
 def with_code_offset(calibration: Calibration, offset: Floats) -> Calibration:
-    """Return a calibration for codes larger than the codes of `calibration` by `offset`, (3,)."""
+    """Add `offset`, shape (3,), to the biases of a calibration [counts]."""
     unit = calibration.unit
     full_scale = unit.full_scale
     if full_scale == COUNTS_FULL_SCALE and offset.max() > 0.0:
-        # Full scale of unsigned codes of 16 bits, the default length.
+        # The largest unsigned code of 16 bits, the default length of a code.
         full_scale = 2.0 * COUNTS_FULL_SCALE + 1.0
     axes = (
         AxisReference(axis.scale_factor, axis.bias + by)
@@ -221,7 +221,7 @@ def with_code_offset(calibration: Calibration, offset: Floats) -> Calibration:
 def _fit_one_environment(
     bags: Sequence[ReducedBag], options: FitOptions, progress: Progress
 ) -> FitResult:
-    """Fit the bags, without bags recorded in another thermal environment, see `environments`."""
+    """Fit the bags except those of another thermal environment (see `environments`)."""
     first = _fit(bags, options, progress)
     earlier = options.prior
     excluded, may_update = [], False
@@ -242,8 +242,8 @@ def _fit_one_environment(
             return _refined(first, bags, options, progress)
         refit = _refined(refit, kept, options, progress)
     elif earlier is not None and not is_updated:
-        # All bags contradict the prior's effects of temperature and cannot update them: the bags
-        # count as recorded in another environment, and the prior is kept.
+        # All bags contradict the prior's effects of temperature and cannot update them: keep the
+        # prior, and take the bags as recorded in another environment.
         refit = replace(first, calibration=earlier)
     others = 'the other bags' if earlier is None else 'the prior'
     left_out = [bags[k] for k in excluded]
@@ -299,7 +299,7 @@ def _fit(
     is_by_settled: bool = False,
     has_pieces: bool = False,
 ) -> FitResult:
-    """Fit a calibration to bags whose readings at zero force are near 0; flags: see `Problem`."""
+    """Fit a calibration to bags whose samples at zero force are near 0; flags: see `Problem`."""
     bags, findings = _judged(bags, options)
     windows = windows_of(bags, model_of(bags, options), options)
     if options.prior and windows.data.forces and options.prior.nonlinearity is None:
@@ -376,7 +376,7 @@ def _judged(
 
 def _unusable(error: ValueError, up: Floats) -> FitError:
     if 'misalignment' in str(error):
-        # If the positions determine M, an angle of 60 degrees between axes is a data error.
+        # If the positions determine the misalignment, 60 degrees between axes are a data error.
         kind = FitError if data_checks.determines_misalignment(up) else UndeterminedError
         return kind(
             'in the fit the angle between two of the axes is some 60 degrees or less, which no '
@@ -387,7 +387,7 @@ def _unusable(error: ValueError, up: Floats) -> FitError:
 
 
 def check_serial(sources: Sequence[FitSource], options: FitOptions) -> str:
-    """Return the serial of `options` or bags; FitError if the serial is ambiguous or invalid."""
+    """Return the serial of `options`, else of the bags; FitError if ambiguous or invalid."""
     serials = {source.serial: source.name for source in sources if source.serial}
     if options.serial is None and len(serials) > 1:
         names = ', '.join(f'{name} of {serial}' for serial, name in sorted(serials.items()))

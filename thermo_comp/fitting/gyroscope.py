@@ -6,8 +6,8 @@ Owns the fit of a gyroscope's bias to the angular rate at rest, with the acceler
 Each axis of a gyroscope at rest measures a component of the Earth's rate, plus a bias that
 changes at each turn-on, so the regression has a constant offset of the rate as an unknown of each
 position. Changes of the rate within a position determine the effect of temperature; the mean rate
-over the positions determines the constant bias. The equations are those of the accelerometer with
-gravity 0, in rad/s instead of m/s^2.
+over the positions determines the constant bias. The equations of the accelerometer are used with
+gravity 0, and with rad/s instead of m/s^2.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from .windows import ThermalWindows
 
 @dataclass(frozen=True)
 class RateRow:
-    """Statistics of the rate less its mean in each position: raw, corrected, and left out."""
+    """Statistics of the angular rate less its mean in each position, in a regime [rad/s]."""
 
     section: str
     raw: ResidualStatistics
@@ -50,8 +50,8 @@ def add_gyroscope(
     options: FitOptions,
 ) -> tuple[Calibration, tuple[RateRow, ...]]:
     """
-    Add to a calibration the gyroscope of the prior calibration or, without a prior, a gyroscope
-    fitted to the bags, if the bags have angular rates and temperatures.
+    Add a gyroscope to a calibration: the gyroscope of the prior calibration or, without a prior,
+    one fitted to the bags, if the bags have angular rates and temperatures.
     """
     if options.prior is not None:
         known = options.prior.gyroscope
@@ -81,7 +81,7 @@ def add_gyroscope(
         offset_scale=earth_sd,
     )
     fit = Fit(windows, regression, select(regression, state, prior, _candidates(data, options)))
-    # The positions determine the sd of the offsets well: `claim_of` need not marginalise this sd.
+    # The positions determine the sd of the offsets well, so `claim_of` may take the sd as known.
     chosen = replace(fit.posterior, prior=replace(fit.posterior.prior, offset_scale=0.0))
     claim = claim_of(fit._replace(selected=replace(fit.selected, posterior=chosen)))
     # The offsets contain the Earth's rate, which is no error: subtract its variance.
@@ -94,7 +94,7 @@ def add_gyroscope(
 
 
 def _candidates(data: Windows, options: FitOptions) -> Candidates:
-    """Return the columns that the bias of the angular rate may have."""
+    """Return prior sds of the columns' weights; 0 for columns that the rate cannot have."""
     allowed = data.groups if options.groups is None else options.groups
     is_candidate = np.isin(data.groups, allowed) & (data.kelvins > 0.0)
     kelvins = np.outer((1.0, 0.0), is_candidate * data.kelvins)

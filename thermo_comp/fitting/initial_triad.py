@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the initial triad: constant bias, scale and misalignment from the mean readings of positions.
+Owns the initial triad: constant bias, scale and misalignment from the mean samples of positions.
 
-Without thermal effects the mean readings of the positions lie on an ellipsoid, which is fitted by
+Without thermal effects the mean samples of the positions lie on an ellipsoid, which is fitted by
 robust least squares on ``|f| - g``. If |f| is the same in all positions, the fit begins with the
-bias and scale that follow from the extremes of the mean readings on each axis.
+bias and scale computed from the extremes of the mean samples on each axis.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class ConstantCalibration:
     misalignment: Floats
 
     def force(self, measured: Floats) -> Floats:
-        """Return the specific force for measured readings, shape (n, 3)."""
+        """Return the specific force [m/s^2] for samples `measured`, shape (n, 3)."""
         return np.asarray(((measured - self.bias) / self.scale) @ self.misalignment.T)
 
     def directions(self, windows: Windows) -> Floats:
@@ -48,7 +48,7 @@ def constant_calibration(
     Fit the triad to position means, (n, 3); FitError if the means do not lie on an ellipsoid.
 
     `gravity`: |f| of all positions, or of each position, shape (n,) [m/s^2];
-    `misalignment_sd`: prior sd of the elements of M [rad]; 0 for axes at right angles
+    `misalignment_sd`: prior sd of the misalignments [rad]; 0 for axes at right angles
     """
     # Largest RMS distance from the ellipsoid [m/s^2]: 5 % of |f|, which is above the drift of a
     # cheap sensor over 60 K, and below the error for a unit in motion.
@@ -70,13 +70,13 @@ def constant_calibration(
             f'an axis ({axes}) reads the same in all positions: the axis is dead, or the unit was '
             'never turned about another axis'
         )
-    # If no axis was held both up and down, half the range of the readings is below 1 g. The fit
-    # therefore also begins from a scale factor 1.3 times as large.
+    # An axis that was not held both up and down has samples that range over less than 2 g. The fit
+    # therefore begins from two scale factors: half the range / g, and 1.3 times this value.
     scales = (float(np.max(half)) * spread / gravity for spread in (1.0, 1.3))
     starts = (np.where(half * 4.0 > np.max(half), scale, half / gravity) for scale in scales)
     tried = (_refine(means, gravity, bias, scale, misalignment_sd) for scale in starts)
     calibration, rms = min(tried, key=lambda fitted: fitted[1])
-    # Readings that lie on no ellipsoid may fit a large one with a far centre, which is refused.
+    # Samples that lie on no ellipsoid may fit a large ellipsoid with a far centre: refuse it.
     is_around = np.all(np.abs(calibration.bias - bias) < 2.0 * np.max(half))
     if not (is_around and rms < largest_rms):
         raise FitError(
@@ -104,8 +104,8 @@ def _refine(
         return np.asarray(np.linalg.norm(calibration.force(means), axis=1) / gravity - 1.0)
 
     def residual(parameters: Floats) -> Floats:
-        # |f| of few positions hardly determines some constants, so the built-in prior of the
-        # constants is added, weighted as if |f| had an error of 0.1 %.
+        # |f| of few positions hardly determines some constants, so their built-in prior is added,
+        # with the weight for an error of |f| of 0.1 %.
         calibration = unpack(parameters)
         bias_sd = BIAS_SD / STANDARD_GRAVITY * one_g
         log_scale = np.log(np.abs(calibration.scale))
@@ -124,7 +124,7 @@ def _refine(
 
 
 def position_means(windows: Windows) -> Floats:
-    """Return the mean raw vector of each position, shape (n_positions, 3)."""
+    """Return the mean of the samples of each position, shape (n_positions, 3)."""
     return block_means(windows.mean, windows.weight, windows.edges[:-1])
 
 
@@ -136,11 +136,12 @@ def block_means(values: Floats, weight: Floats, first: Ints) -> Floats:
 
 def white_noise_of(windows: Windows, scale: Floats) -> Floats:
     """
-    Return the sd of the white noise of a window's mean on each axis [m/s^2], shape (3,), from
-    second differences, which contain no linear drift; 0 if no position has three windows.
+    Return the sd of the white noise of a window's mean on each axis [m/s^2], shape (3,).
 
-    In fast ramps second differences contain a part of the drift. If fourth or sixth differences
-    give less than 70 % of the noise that second differences give, the smallest noise is used.
+    The sd is computed from second differences of windows, which contain no linear drift; it is 0
+    if no position has three windows. In fast ramps second differences contain a part of the drift.
+    The smallest noise by second, fourth and sixth differences is used if it is below 70 % of the
+    noise by second differences.
     """
     position, noises = windows.position, []
     for order in (2, 4, 6):
@@ -158,10 +159,10 @@ def white_noise_of(windows: Windows, scale: Floats) -> Floats:
 def thermometer_error_of(windows: Windows, scale: Floats, *, beyond_noise: bool = False) -> Floats:
     """
     Return the sd of a window's error on each axis due to errors of the board temperature [m/s^2],
-    shape (3,): sd of these errors times slope of the samples over temperature in a position.
+    shape (3,): sd of the temperature error times slope of the samples over temperature.
 
-    `beyond_noise`: subtract the noise variance of a reading from the variance of these errors; the
-    remaining error is due to coarse steps of the readings, or to long intervals between readings
+    `beyond_noise`: subtract the noise variance of a reading from the variance of the temperature
+    error; the rest is due to coarse steps of the readings, or long intervals between readings
     """
     if windows.board is None:
         return np.zeros(3)
@@ -170,7 +171,7 @@ def thermometer_error_of(windows: Windows, scale: Floats, *, beyond_noise: bool 
     change = within_positions(windows.board[:, :1], windows.position)
     power = np.maximum(np.add.reduceat(change**2, first), 1e-12)
     along = np.add.reduceat(change * drift, first)
-    # White noise adds its variance to the sum of squares that a position's slope explains.
+    # Subtract the part of the explained sum of squares that is due to white noise.
     square = along**2 / power - white_noise_of(windows, scale) ** 2
     slope = np.sqrt(np.maximum(square.sum(axis=0), 0.0) / power.sum())
     variance = float(windows.board[:, 1].mean()) - beyond_noise * windows.board_noise**2
@@ -178,6 +179,6 @@ def thermometer_error_of(windows: Windows, scale: Floats, *, beyond_noise: bool 
 
 
 def within_positions(values: Floats, position: Ints) -> Floats:
-    """Subtract the mean over each position from values of windows, shape (n, k)."""
+    """Return values of windows, shape (n, k), less their mean over the position."""
     _, where = np.unique(position, return_inverse=True)
     return np.asarray(values - means_by(position, values)[where])

@@ -34,8 +34,8 @@ from .selection import LARGE_OFFSETS, Fit, Selected, better_start, fit_all, sele
 from .unknowns import BIAS_SD, SCALE_SD, InformativePrior, Prior, State, misalignment_scale
 from .windows import CURVE, PART, SET, ThermalWindows
 
-#: Largest prior sd of a slope over temperature: of the bias [m/s^2 per K] (500 ug/K), and of the
-#: relative scale factor [1/K] (200 ppm/K), the limits in data sheets of consumer MEMS triads.
+#: Largest prior sd of the slope over temperature of the bias [m/s^2 per K] (500 ug/K) and of the
+#: relative scale factor [1/K] (200 ppm/K): the limits in data sheets of consumer MEMS triads.
 STEEPEST = np.array([5e-3, 2e-4])
 
 
@@ -46,8 +46,8 @@ class Problem:
 
     start: initial bias, scale and misalignment, without effects of temperature
     up: attitudes of the positions, upward unit vectors, shape (n_positions, 3)
-    is_by_settled: whether the selection rejects a model with a larger `left_out.settled_error`
-    has_pieces: whether each position is a piece of a rest, about an hour long (`refit_checks`)
+    is_by_settled: whether the model selection refuses to increase `left_out.settled_error`
+    has_pieces: whether long rests are cut into positions of about an hour (`refit_checks`)
     """
 
     bags: Sequence[ReducedBag]
@@ -60,7 +60,7 @@ class Problem:
 
     @cached_property
     def n_directions(self) -> int:
-        """Number of distinct attitudes."""
+        """Number of different attitudes."""
         return len(distinct_directions(self.up))
 
 
@@ -68,9 +68,9 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     """
     Fit the windows, with or without a prior calibration.
 
-    Without a prior, whole rests whose temperature changes more from position to position than
-    within a position are fitted twice: first the means of the positions, then all windows. The
-    fit to all windows is returned if it has a smaller error on left-out data.
+    If no prior is given and the temperature changes more between positions than within them, two
+    fits are made: to the means of the positions, and to all windows. The fit to all windows is
+    returned if its error on left-out data is smaller.
     """
     if problem.options.prior is not None:
         return _regress(windows, problem)
@@ -81,11 +81,11 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
         windows = replace(windows, data=rests.constant_in(data, is_steady, is_settled))
     if problem.has_pieces or not rests.is_constant(windows, windows.data.position):
         return _regress(windows, problem)
-    # In a soak the effects of an unknown lag and of the remaining drift of the temperature are of
-    # similar size, so only the differences of |f| between positions determine the curve.
+    # In a soak the effect of an unknown lag is about as large as the effect of the remaining
+    # temperature drift, so only differences of |f| between positions determine the curve.
     everywhere = np.ones(windows.data.n_positions, dtype=bool)
     at_rest = replace(windows, data=rests.constant_in(windows.data, everywhere, everywhere))
-    # Both regressions report progress from 0.7 to 0.95: map each to its half of this range.
+    # Each regression reports progress from 0.7 to 0.95: map it to half of this range.
     first = replace(problem, progress=lambda part: problem.progress(0.35 + 0.5 * part))
     second = replace(problem, progress=lambda part: problem.progress(0.475 + 0.5 * part))
     of_means, fit = _regress(at_rest, first, is_at_rest=True), _regress(windows, second)
@@ -102,15 +102,15 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     """Fit the windows; `is_at_rest`: whether the columns are set constant in each position."""
     data, options, start = windows.data, problem.options, problem.start
     earlier, n_directions = options.prior, problem.n_directions
-    # With a prior calibration, the drifts in one heated attitude separate bias and scale.
+    # If a prior calibration is given, the drifts in one heated attitude separate bias and scale.
     is_bench = earlier is None and rests.is_bench(windows, problem.up)
     has_poses = n_directions < POSITIONS_NEEDED and rests.is_constant(windows, data.position)
     if (has_poses or n_directions == 1) and earlier is None and data.forces is None:
         data = replace(data, pose=rests.poses_of(windows, problem.up))
     if options.model == 'golovach' or is_bench or n_directions == 1 or data.n_poses:
-        # No tilts are fitted: a tilt of the support is not separable from a drift of the unit in
-        # one attitude, nor from a change of the attitude in a pose. In Golovach's model tilts
-        # would absorb errors of the static and the dynamic set.
+        # Omit support tilts, as a tilt is not separable from a drift of the unit in one attitude,
+        # nor from a change of the attitude in a pose. In Golovach's model tilts would absorb the
+        # errors of the static and the dynamic set.
         data = replace(data, tilt=data.tilt[:, :0])
     settled = data.settled if problem.is_by_settled else None
     data = replace(data, has_prior=earlier is not None, settled=settled)
@@ -118,7 +118,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     state = initial_state(regression, start, problem.up)
     prior = _initial_prior(windows, problem)
     if n_directions >= POSITIONS_NEEDED and not data.has_turn_ons:
-        # M would explain turn-on offsets, which are no unknowns here: reduce the prior sd of M.
+        # The misalignment would absorb turn-on offsets, which are no unknowns of this regression.
         prior = _with_faces(prior, problem.up)
     steepness = _steepness(windows, problem, is_at_rest=is_at_rest)
     candidates = _candidates(windows, problem, steepness, is_bench=is_bench)
@@ -140,7 +140,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     chosen = selected.posterior
     full_prior = replace(chosen.prior, bias_sd=prior.bias_sd, scale_sd=prior.scale_sd)
     selected = replace(selected, posterior=replace(chosen, prior=full_prior))
-    # For the covariance, undo `_steepest`'s halving of the prior sd of the scale factor's slope.
+    # In the covariance, the prior sd of the scale factor's slope is not halved as in `_steepest`.
     limits = STEEPEST, _steepest(n_directions)
     full, used = (_typical_slopes(steepness, limit, options.gravity) for limit in limits)
     claimed = candidates.typical * (full / used)[:, np.newaxis]
@@ -155,8 +155,8 @@ def _selected(
     progress: Callable[[float], None],
 ) -> Selected:
     """
-    Select the model. If `_with_faces` reduced the prior sd of the misalignment, also select a
-    model with the sd that was not reduced, and choose between both models by `better_start`.
+    Select the model. After a reduction of the prior sd of the misalignment by `_with_faces`, a
+    second model is selected with the full sd, and `better_start` chooses one of the two models.
     """
     selected = select(regression, state, prior, candidates, progress)
     if not prior.unseen_misalignment_sd:
@@ -174,14 +174,14 @@ def _updating_priors(
     prior: Prior,
 ) -> tuple[Prior, list[InformativePrior]]:
     """
-    Return `prior` with the informative prior, from the calibration `earlier`, for the largest
-    amount of ageing; and the informative priors for smaller amounts of ageing.
+    Return `prior` plus an informative prior that allows for the largest ageing since the
+    calibration `earlier`, and a list of informative priors for smaller ageing.
     """
     data, noise = regression.windows, _noise_in_1_hz(windows, regression.nominal_scale)
     *others, widest = informative_priors(
         earlier, regression, state, windows.model, options, LARGE_OFFSETS * _mounting_scale(noise)
     )
-    # A fit of few windows may have no residual: assume at least half of the calibration's noise.
+    # A fit of few windows may have no residual: assume at least half the noise of `earlier`.
     window_s = windows.typical_count * earlier.unit.cycle_time_s
     least_sigma = 0.5 * float(np.min(earlier.noise_density_m_s2_sqrt_hz)) / window_s**0.5
     prior = replace(
@@ -191,8 +191,8 @@ def _updating_priors(
         least_sigma=max(least_sigma, prior.least_sigma),
     )
     if prior.offset_scale and (repeated_sd := offset_sd_of(earlier)):
-        # The scale of the prior of offset sds is at most twice the offset sd of the prior
-        # calibration, so that larger changes of |f| count as ageing of the unit.
+        # The prior scale of the offset sd is at most twice the offset sd of `earlier`, so that the
+        # fit explains larger changes of |f| by ageing of the unit.
         scale = min(prior.offset_scale, 2.0 * repeated_sd)
         offset_sd = prior.offset_sd if data.has_turn_ons else repeated_sd
         prior = replace(prior, offset_sd=offset_sd, turn_on_sd=repeated_sd, offset_scale=scale)
@@ -207,14 +207,14 @@ def initial_state(regression: Regression, start: ConstantCalibration, up: Floats
 
 
 def _initial_prior(windows: ThermalWindows, problem: Problem) -> Prior:
-    """Return the prior of the constants and of the noises, without columns."""
+    """Return the prior of constants, noise and offsets; the prior sd of each column is 0."""
     data, start, options = windows.data, problem.start, problem.options
     drift = within_positions(data.mean / start.scale, data.position)
-    # Smallest initial sd of mounting offsets, and of white noise [m/s^2]: 1 ug.
+    # Smallest initial sd of mounting offsets and of white noise [m/s^2] (1 ug).
     small_sd = 1e-5
     sigma = max(float(np.sqrt(np.mean(drift**2))), small_sd)
     noise = _noise_in_1_hz(windows, start.scale)
-    # If samples have no noise, rounding shifts the mean of a position as a mounting offset does.
+    # Rounding of samples without noise shifts the mean of a position as a mounting offset does.
     roundings = [interval.rounding_sd / start.scale for _, interval in windows.rests]
     rounding_sd = float(np.sqrt(np.mean(np.square(roundings))))
     misalignment_sd = misalignment_scale(noise)
@@ -238,15 +238,15 @@ def _initial_prior(windows: ThermalWindows, problem: Problem) -> Prior:
 
 def _with_faces(prior: Prior, up: Floats) -> Prior:
     """
-    Return the prior with a smaller misalignment sd if a noisy sensor is only held on its faces,
-    where misalignments of some degrees would, to second order, explain any errors of |f|. In
-    the published covariance the misalignment has the sd of `prior`.
+    Return `prior` with a smaller sd of the misalignment for a noisy sensor that rests only on its
+    faces: there misalignments of some degrees, to second order, would explain any errors of |f|.
+    The published covariance keeps the sd of `prior`.
     """
     by_element = up[:, [1, 2, 2]] * up[:, [0, 0, 1]]
-    # Reduced sd of an element of M [rad]: the cross-axis sensitivity of good consumer MEMS.
+    # Reduced sd of a misalignment [rad]: the cross-axis sensitivity of good consumer MEMS.
     reduced_sd, sd = 2.5e-3, prior.misalignment_scale
-    # The RMS product of two components of `up` is below 0.1 if an axis is near the vertical in all
-    # positions, and 0.3 if the vertical is in the middle between two axes.
+    # The RMS product of two components of `up` is below 0.1 if one axis is near the vertical in
+    # each position, and 0.3 if each vertical is in the middle between two axes.
     if float(np.sqrt(np.mean(by_element**2))) >= 0.1 or sd <= reduced_sd:
         return prior
     return replace(prior, misalignment_sd=reduced_sd, unseen_misalignment_sd=sd)
@@ -254,9 +254,9 @@ def _with_faces(prior: Prior, up: Floats) -> Prior:
 
 def _narrowed(prior: Prior, regression: Regression, state: State) -> Prior:
     """
-    Return the prior for the selection of the columns: the sds of bias and scale are five times the
-    largest error of |f|, within 5..100 % of the sds of `prior`. With larger prior sds, bias and
-    scale, which few attitudes do not separate, would be large in a model that lacks columns.
+    Return `prior` with smaller sds of bias and scale, for the selection of columns: five times the
+    largest error of |f|, within 5 to 100 % of the sds of `prior`. Few attitudes do not separate
+    bias and scale, which would be large, with larger sds, in a model that lacks columns.
     """
     norms = np.linalg.norm(position_means(regression.windows) / regression.nominal_scale, axis=1)
     limit = 5.0 * float(np.abs(norms - regression.norms(state)).max())
@@ -267,8 +267,8 @@ def _narrowed(prior: Prior, regression: Regression, state: State) -> Prior:
 
 def _is_slow(windows: ThermalWindows) -> Bools:
     """
-    Return which columns, (m,), have lags that settle by less than 90 % in the longest bag: such a
-    column is nearly collinear with the curve, so `select` does not use it, but `claim` does.
+    Return whether the lag of each column settles by less than 90 % in the longest bag, (m,). Slow
+    columns are nearly collinear with the curve: `select` does not use them, but `claim` does.
     """
     model, longest_s = windows.model, float(windows.data.age.max())
     taus = np.array([0.0] * len(model.sets.groups) + [column.tau_s for column in model.columns])
@@ -289,9 +289,9 @@ def _noise_in_1_hz(windows: ThermalWindows, scale: Floats) -> float:
 def _mounting_scale(noise: float) -> float:
     """Return the prior scale of mounting offsets [m/s^2], from the noise in a 1 Hz bandwidth."""
     # The prior scale of offsets is at least 30 ug, typical of navigation grade, and at most 0.5
-    # mg, of consumer MEMS; the tail of the Student prior allows for larger offsets. For noise
-    # below 0.3 ug the smallest prior scale is 100 times the noise, because an offset 1e6 times as
-    # large as the noise cannot be estimated in double precision.
+    # mg, typical of consumer MEMS; the tail of the Student prior allows for larger offsets. For
+    # noise below 0.3 ug the smallest prior scale is 100 times the noise: double precision does not
+    # suffice to estimate an offset 1e6 times as large as the noise.
     least, most = max(min(3e-4, 100.0 * noise), 1e-7), 5e-3
     return float(np.clip(3.0 * noise, least, most))
 
@@ -299,14 +299,14 @@ def _mounting_scale(noise: float) -> float:
 def _candidates(
     windows: ThermalWindows, problem: Problem, steepness: float, *, is_bench: bool
 ) -> Candidates:
-    """Return the columns that the model may have, and typical and largest prior sds of weights."""
+    """Return typical and largest prior sds of the columns' weights; 0 for excluded columns."""
     data, options = windows.data, problem.options
     groups = np.array(data.groups)
     allowed = {*data.groups} if options.groups is None else {*options.groups, *options.forced}
     is_candidate = np.isin(groups, list(allowed)) & (data.kelvins > 0.0)
     is_candidate &= windows.has_temperature
-    # Without soaks at several temperatures the static set is unknown: the difference of the sets
-    # would describe any effect in the dynamic windows, and be wrong in a soak.
+    # Bags without soaks at several temperatures do not determine the static set: the difference of
+    # the sets would describe any effect in the dynamic windows, and be wrong in a soak.
     is_forced = SET in options.forced or options.model == 'golovach'
     is_candidate &= (groups != SET) | windows.has_soaks | is_forced
     parts = np.stack((is_candidate, is_candidate & data.in_scale))
@@ -314,7 +314,7 @@ def _candidates(
     slopes = _typical_slopes(steepness, steepest, options.gravity)
     fixed = np.zeros(parts.shape, dtype=bool)
     if is_bench:
-        # One attitude cannot separate scale and bias: the curve of the scale keeps its prior sd.
+        # One attitude cannot separate scale and bias: fix the prior sd of the scale's curve.
         fixed[1] = parts[1] & np.isin(groups, (CURVE, PART))
     forced = np.isin(groups, options.forced)
     if options.model == 'golovach':
@@ -329,7 +329,7 @@ def _candidates(
 
 
 def _steepest(n_directions: int) -> Floats:
-    """Return the largest prior sd of slopes of bias and scale, given the number of attitudes."""
+    """Return largest prior sds of the slopes of bias and scale for a number of attitudes, (2,)."""
     # For two to eight attitudes the prior sd of the scale factor's slope is halved. The drift of a
     # nearly level axis is more often a tilt of the support than a slope of several hundred ppm/K.
     is_few = 1 < n_directions < POSITIONS_FOR_MISALIGNMENT
@@ -344,7 +344,7 @@ def _typical_slopes(steepness: float, steepest: Floats, gravity: float) -> Float
 
 
 def _steepness(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool) -> float:
-    """Return the RMS change of a reading per kelvin, attributed to the bias [m/s^2 per K]."""
+    """Return the RMS change of a sample per kelvin, taken as a change of the bias [m/s^2 / K]."""
     data, start = windows.data, problem.start
     within = within_positions(data.mean / start.scale, data.position)
     drift = float(np.sqrt(np.mean(within**2, axis=0)).max())
@@ -357,13 +357,12 @@ def _steepness(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool) -
     sizes, norms = sizes_of(windows, problem.options), np.linalg.norm(force, axis=1)
     errors = norms - sizes
     if np.ptp(sizes) > 0.0:
-        # Nonlinearity over |f| is not a thermal drift: subtract a cubic of |f| from the errors.
+        # A cubic of |f| describes errors due to nonlinearity, which are no thermal drift.
         powers = np.vander(sizes / sizes.max(), 4)
         errors -= powers @ np.linalg.lstsq(powers, errors, rcond=None)[0]
     if is_at_rest:
         # Divide the sd of the errors of |f| by the RMS effect on |f| of unit slopes of bias and
-        # scale. The part of this effect that a constant bias and scale explain is subtracted
-        # first.
+        # scale, less the part of this effect that a constant bias and scale explain.
         constants = norm_columns(force / norms[:, None])[:, :6]
         celsius = windows.temperature[data.edges[:-1]]
         of_slopes = (celsius - celsius.mean())[:, None] * constants
@@ -380,7 +379,7 @@ def sizes_of(windows: ThermalWindows, options: FitOptions) -> Floats:
 
 
 def initial_triad(windows: ThermalWindows, options: FitOptions) -> ConstantCalibration:
-    """Fit constant bias, scale and M; for few attitudes only one scale, which is 1 for m/s^2."""
+    """Fit constant bias, scale, misalignment; with few attitudes one scale only (1 for m/s^2)."""
     means, gravity = position_means(windows.data), sizes_of(windows, options)
     norms = np.linalg.norm(means, axis=1)
     if not norms.all() or (len(means) > 1 and not means.any(axis=0).all()):

@@ -1,18 +1,18 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the detection of jumps: steps in the reading of an accelerometer at rest.
+Owns the detection of jumps: steps in the samples of an accelerometer at rest.
 
-The reading of a sensor can step within one sample, if stress in its die relaxes or a joint slips.
+The output of a sensor can step within one sample, if stress in its die relaxes or a joint slips.
 The temperature does not step, so no function of temperature describes a jump, and a fit to data
-across a jump gives a wrong curve. A jump differs from a rotation of the unit in two ways: the
-samples before and after a jump scatter no more than at rest; and either the norm of the reading
-changes (a rotation hardly changes the norm), or a gyroscope measures no rotation during the jump.
-A steep curve over temperature changes the reading more slowly than a jump.
+across a jump gives a wrong curve. A jump differs from a rotation of the unit in two ways: samples
+before and after a jump scatter no more than at rest; and the norm of the sample changes (a
+rotation hardly changes the norm), or a gyroscope measures no rotation during the jump. A steep
+curve over temperature changes the samples more slowly than a jump.
 
-If a sensor has a low-pass filter, neighbouring samples have a correlation r, and the slow noise of
+Neighbouring samples of a sensor with a low-pass filter have a correlation r, and the slow noise of
 the samples hides a step. The noise of the differences ``a_i - r a_(i-1)`` is white (generalised
-least squares for first-order noise), so these show a step within one sample. The differences also
+least squares for first-order noise), so they show a step within one sample. The differences also
 show a decaying shock, so the mean levels before and after a jump must differ as well.
 """
 
@@ -28,23 +28,23 @@ from ..typing import Floats
 from .reduction import ReducedBag
 from .sources import angular_velocity
 
-# Shortest time over which the level before or after a gap is averaged [s].
+# Shortest time over which samples before or after a gap between rests are averaged [s].
 _MARGIN_S = 10.0
 # Smallest number of samples before a step, and after it, for a test of the step.
 _FEWEST_SAMPLES = 8
-# Smallest significant ratio of a step to its sd; noise alone gives ratios of up to about 5.
+# Smallest significant ratio of a step to its sd; noise causes ratios of up to about 5.
 _STEP_SDS = 8.0
 
 
 @dataclass(frozen=True)
 class Jump:
     """
-    A step in the reading of a sensor at rest that is not a rotation of the unit.
+    A step in the samples of a sensor at rest that is not a rotation of the unit.
 
     time: time of the step since the bag's first sample [s]
-    duration_s: interval between the samples before and after the step [s]
-    step: change of the reading of each axis [input units]
-    along: change of the norm of the reading, that is, along the specific force [input units]
+    duration_s: interval between the last sample before and the first sample after the step [s]
+    step: step of each axis [input units]
+    along: step of the norm of the samples, which is the step along gravity [input units]
     temperature_change, temperature_change_sd: step of the board temperature at the time of the
         jump, fitted with a linear drift, and sd of this step [K]; NaN with too few readings
     """
@@ -59,12 +59,11 @@ class Jump:
 
 def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     """
-    Find the jumps between successive rests of a bag; the bag is read again if rests are compared.
-
-    Two rests are compared if the gap between them is at most 30 s or 250 samples, whichever is
-    longer, and their directions differ by less than 10 degrees.
+    Find the jumps between successive rests of a bag. Two rests are compared if the gap between
+    them is at most 30 s or 250 samples, whichever is longer, and their attitudes differ by less
+    than 10 degrees.
     """
-    # A rest consists of whole cells, usually of 30 samples, so gaps are long at a low sample rate.
+    # A rest has whole cells of usually 30 samples, so gaps are long at a low sample rate.
     longest_ns = 1e9 * max(30.0, 250.0 * bag.cycle_s)
     margin_s = max(_MARGIN_S, 120.0 * bag.cycle_s)  # at least 120 samples
     means = [np.average(rest.mean, axis=0, weights=rest.count) for rest in bag.intervals]
@@ -79,7 +78,7 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     rounding_sd = np.median([interval.rounding_sd for interval in bag.intervals], axis=0)
     sds = np.maximum(quiet_sd, np.maximum(rounding_sd, 1e-9)), rounding_sd
     beside = _beside_gaps(bag, gaps, [margin_s] * len(gaps))
-    # Correlated noise needs more samples than white noise for a mean level beside a gap.
+    # A mean level beside a gap needs more samples if their noise is correlated.
     margins = [max(_margin(part, sds[0]), margin_s) for part in beside]
     if max(margins, default=0.0) > margin_s:
         beside = _beside_gaps(bag, gaps, margins)
@@ -90,7 +89,7 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
 def _beside_gaps(
     bag: ReducedBag, gaps: Sequence[tuple[float, float]], margins: Sequence[float]
 ) -> list[Floats]:
-    """Collect the samples in and around each gap: time, reading, angular rate or NaN, (n, 7)."""
+    """Collect the samples in and around each gap: time, sample, angular rate or NaN, (n, 7)."""
     parts = [[np.zeros((0, 7))] for _ in gaps]
     for block in bag.source.blocks() if gaps else ():
         time, rate = (block.accel_stamp_ns - bag.start_ns) * 1e-9, angular_velocity(block)
@@ -103,7 +102,7 @@ def _beside_gaps(
 
 
 def _margin(samples: Floats, quiet_sd: Floats) -> float:
-    """Return the time [s] to average beside a gap: 60 correlation times of noise, in 10..100 s."""
+    """Return the time to average beside a gap [s]: 60 correlation times, within 10 to 100 s."""
     time, accel = samples[:, 0], samples[:, 1:4]
     if len(time) < 2 * _FEWEST_SAMPLES:
         return _MARGIN_S
@@ -123,18 +122,18 @@ def _examine(
         return None
     beside = before | after
     at, r = _place_and_correlation(time, accel, quiet_sd)
-    # Fit the change of the mean level to the samples before and after the gap, without the gap.
+    # Fit the change of the mean level to the samples before and after the gap, not to those in it.
     lasting, relative_sd, residual = _step(time[beside], accel[beside], time[at])
     # The step is the difference of two mean levels, each with an error of rounding.
     by_rounding = 2.0**0.5 * rounding_sd
     lasting_sd = np.hypot(quiet_sd * relative_sd * _sd_growth(residual, quiet_sd), by_rounding)
     step, relative_sd, residual = _step(time, accel, time[at], r)
-    # The scatter within half a second underestimates the noise of means if noise is correlated.
+    # For correlated noise, `quiet_sd` (scatter within half a second) is too small: fit the noise.
     sd = np.sqrt(np.mean(residual**2, axis=0)) if r else quiet_sd
     step_sd = np.hypot(sd * relative_sd * _sd_growth(residual, sd), by_rounding)
     if r:
         is_step = np.abs(step) > _STEP_SDS * step_sd
-        # The change of the level must exceed half the step in one sample, and 4 sd of the change.
+        # The change of the mean level must exceed half of the step, and 4 sd of the change.
         is_step &= lasting * np.sign(step) > 0.5 * np.abs(step)
         is_step &= np.abs(lasting) > 4.0 * lasting_sd
     else:
@@ -142,7 +141,7 @@ def _examine(
     if not is_step.any() or _is_gradual(time, accel, (at, r), sd, bag):
         return None
     sides = accel[:at], accel[at:]
-    # Differences of neighbouring samples give the noise without the drift.
+    # Differences of neighbouring samples contain noise, but no drift.
     spread = np.sqrt(0.25 * sum(np.mean(np.diff(side, axis=0) ** 2, axis=0) for side in sides))
     middle = 0.5 * (sides[0].mean(axis=0) + sides[1].mean(axis=0))
     norm = float(np.linalg.norm(middle))
@@ -150,12 +149,13 @@ def _examine(
     size = float(np.linalg.norm(step))
     along_sd = float(np.sqrt((middle / norm) ** 2 @ step_sd**2))
     needed_rad = float(np.sqrt(max(size**2 - along**2, 0.0))) / norm
-    # A step is not a rotation if the gyroscope measured less than a third of the step's angle, or
-    # if |a| changed: a turn by d rad changes |a| by up to 2 d |a| times the sensor's error, 10 %.
+    # A step is no rotation if the gyroscope measured less than a third of the step's angle, or if
+    # the norm |a| changed by over 20 % of the step: a rotation by d rad changes |a| by up to
+    # 2 d |a| times the relative error of the uncalibrated sensor, at most 10 %.
     is_no_turn = _turn(time, gyro, at) < 0.33 * needed_rad or (
         abs(along) > 0.2 * size and abs(along) > _STEP_SDS * along_sd
     )
-    # If someone handled the unit, the samples scatter by far more than twice the quiet noise.
+    # Samples of a unit that is handled scatter by far more than twice the quiet noise.
     if not is_no_turn or np.any(spread > 2.0 * quiet_sd):
         return None
     (x, y, z), of_board = step.tolist(), _temperature_step(bag, time[0], time[at], time[-1])
@@ -166,9 +166,9 @@ def _is_gradual(
     time: Floats, accel: Floats, step: tuple[int, float], sd: Floats, bag: ReducedBag
 ) -> bool:
     """
-    Whether a linear change while the board temperature changes by 0.1 K or more explains the
-    samples better than a step, by a factor of e^2 in likelihood. In a ramp a steep curve over
-    temperature changes the bias gradually. `step`: the result of `_place_and_correlation`
+    Whether a gradual change, due to a steep curve over temperature, explains the samples e^2 times
+    better (likelihood) than a step. The change is linear in time while the board temperature
+    changes by 0.1 K or more. `step`: first sample after the step, and lag-1 correlation
     """
     (at, r), sd = step, np.maximum(sd, 1e-9)
     board_s, board = _readings(bag, time[0], time[-1])
@@ -187,9 +187,9 @@ def _is_gradual(
 
 
 def _sd_growth(residual: Floats, sd: Floats) -> Floats:
-    """Return sd of the mean of `residual` / sd of a mean of white noise of sd `sd`, >= 1, (3,)."""
-    # A lag-1 correlation r of the means of 40 pieces multiplies the variance of the mean of all
-    # pieces by (1 + r) / (1 - r).
+    """Return sd of the mean of `residual` / sd for white noise of sd `sd`, at least 1, (3,)."""
+    # If the means of 40 pieces have the lag-1 correlation r, the variance of the mean of all
+    # pieces is (1 + r) / (1 - r) times the variance for uncorrelated pieces.
     size = max(len(residual) // 40, 1)
     n = len(residual) // size
     means = residual[: n * size].reshape(n, size, 3).mean(axis=1)
@@ -201,7 +201,7 @@ def _sd_growth(residual: Floats, sd: Floats) -> Floats:
 
 
 def _temperature_step(bag: ReducedBag, begin: float, at: float, end: float) -> tuple[float, float]:
-    """Estimate the step of the board temperature at the time `at`, and the sd of the step [K]."""
+    """Return the fitted step of the board temperature at the time `at`, and its sd [K]."""
     time, value = _readings(bag, begin, end)
     if min(np.sum(time < at), np.sum(time >= at)) < _FEWEST_SAMPLES:
         return np.nan, np.nan
@@ -221,8 +221,8 @@ def _place_and_correlation(time: Floats, accel: Floats, quiet_sd: Floats) -> tup
     Find the first sample after a step, and the lag-1 correlation of the noise.
 
     The time of the step and the correlation are estimated alternately, up to three times. Noise
-    with a lag-1 correlation of up to 0.4 counts as white. The correlation is limited to 0.999;
-    noise of a larger correlation is practically a random walk.
+    with a lag-1 correlation of up to 0.4 is taken as white, with the correlation 0. The largest
+    correlation is 0.999, for noise that is practically a random walk.
     """
     at, r = _place_of_step(time, accel, quiet_sd, 0.0), 0.0
     for _ in range(3):
@@ -244,8 +244,8 @@ def _place_of_step(time: Floats, accel: Floats, quiet_sd: Floats, r: float) -> i
     residual = residual - trend @ (trend.T @ residual)
     candidates = np.arange(_FEWEST_SAMPLES, n - _FEWEST_SAMPLES + 1)
     # A unit step at sample k, whitened for the lag-1 correlation r, is 1 at k and 1 - r after k:
-    # its product with a residual is a sum over the residuals from sample k on. Subtraction of
-    # the trend reduces the step's sum of squares by its squared products with `trend`.
+    # its product with a residual is a sum over the residuals from sample k on. Removal of the
+    # trend reduces the sum of squares of the whitened step by its squared products with `trend`.
     tail = _sums_behind(residual, r)[candidates]
     trend_tail = _sums_behind(trend, r)[candidates]
     square = 1.0 + (1.0 - r) ** 2 * (n - candidates - 1) - (trend_tail**2).sum(axis=1)
@@ -269,7 +269,7 @@ def _step(
 ) -> tuple[Floats, float, Floats]:
     """
     Fit a step at the time `at`, or a linear change over `duration_s` about `at`, and a linear
-    drift; return the step, its sd / sd of the noise, and the residuals (n, k).
+    drift. Return the step, its sd / sd of the noise, and the residuals (n, k).
     """
     trend = _trend(time, r)
     part = np.clip((time - at) / duration_s + 0.5, 0.0, 1.0) if duration_s else time >= at
@@ -288,7 +288,7 @@ def _trend(time: Floats, r: float) -> Floats:
 
 
 def _turn(time: Floats, gyro: Floats, at: int) -> float:
-    """Return the angle turned within 1 s of a step [rad], without the median rate of each side."""
+    """Return the angle of rotation [rad] within 1 s of a step, by the rate less its median."""
     rates = [side - np.median(side, axis=0) for side in (gyro[:at], gyro[at:])]
     angles = np.concatenate(rates)[1:] * np.diff(time)[:, None]
     return float(np.linalg.norm(angles[np.abs(time[1:] - time[at]) <= 1.0].sum(axis=0)))

@@ -4,7 +4,7 @@
 Owns the options of a fit and their checks, normal gravity, and the choice of curve families.
 
 An error of the stated gravity changes all three scale factors by the same ratio, without an effect
-on the residuals. A fit cannot estimate gravity, so the user must state it.
+on the residuals. The user must state gravity, as a fit cannot estimate it.
 
 References
 ----------
@@ -35,10 +35,10 @@ from .windows import Sets
 
 #: Largest code of the converter of the unit in Golovach's paper: 16 bits in two's complement.
 COUNTS_FULL_SCALE = 32767.0
-# Families of curves over temperature that are polynomials, of order 1, 2 and 3.
+# Names of the polynomials over temperature of order 1, 2 and 3.
 _POLYNOMIALS = ('linear', 'quadratic', 'cubic')
-#: Groups of columns from which the fit selects: the curve, the difference of the static and the
-#: dynamic set, the curves over the temperatures of parts, the groups of the thermal response.
+#: Names of the groups of columns from which the fit selects: curve over the board temperature,
+#: difference of the two sets, curves over parts' temperatures, groups of the thermal response.
 GROUPS = (
     'curve',
     'set',
@@ -55,27 +55,27 @@ class FitOptions:
     Options of a fit; raises ValueError if an option is outside its range.
 
     gravity: local gravity [m/s^2]; a value that does not occur on Earth raises FitError
-    model: 'response' selects from all columns; 'golovach' is the model of Golovach's paper: a
-        linear static and a quadratic dynamic set, no response
+    model: 'response' selects from all columns; 'golovach' is the model of Golovach's paper with a
+        linear static set, a quadratic dynamic set and no thermal response
     static_curve, dynamic_curve: families of static and dynamic curve; None: default of `model`
-    groups, forced: groups of columns that the model may have (None: all), and that it must have
-    prior: calibration of this unit or of its type, whose columns are used without a selection
-    ageing_bias, ageing_scale: sd of the change of bias [m/s^2] and scale [1] since the prior
-        calibration; if both are 0, these sds are estimated from the bags
+    groups, forced: groups of columns that the model may have (None: all); groups it must have
+    prior: calibration of this unit or of its type; the fit uses all its columns, with no selection
+    ageing_bias, ageing_scale: sd of the change of bias [m/s^2] and relative scale [1] since the
+        prior calibration; if both are 0, the fit estimates them from the bags
     mounting_sd: sd of the bias offset of a mounting or turn-on [m/s^2], or None to estimate it
     gravity_sd: standard deviation of `gravity` [m/s^2]
     k2_sd, k3_sd: prior sd of the nonlinear terms K2 [g/g^2] and K3 [g/g^3], from a data sheet;
-        None: 100 ug/g^2 and 10 ug/g^3; bags at 1 g alone have no such terms if both are None
+        None: 100 ug/g^2, 10 ug/g^3; if both are None, bags at 1 g give no nonlinear terms
     serial: serial of the unit, or None for the serial of the sources
     input: unit of the samples
-    full_scale: magnitude of a saturated sample [input units], or None for 32767 counts or, in
-        m/s^2, for the smallest usual range 10 % above all samples
+    full_scale: magnitude of a saturated sample [input units]; None: 32767 counts, or in m/s^2 the
+        smallest usual range 10 % above all samples
     offset: code at zero force, such as 32768, or None to estimate it from the bags
-    reference_temperature: T_ref [degC], 20 in Golovach's paper
+    reference_temperature: temperature at which bias and scale factor are stated [degC]
     detector: thermometer and detector settings, or None to estimate them from the bags
     min_rest_s: length of the shortest rest [s], or None to choose 1, 2 or 3 s from the data
     still_sd: largest sd of the samples at rest [m/s^2]
-    allow: names of the refusals of data, of `REFUSALS`, that the user overrides
+    allow: names, listed in `REFUSALS`, of the refusals of data that the user overrides
     """
 
     gravity: float
@@ -138,7 +138,7 @@ class FitOptions:
                 )
 
     def nonlinear_sd(self, kind: Kind) -> float:
-        """Return the prior sd of a nonlinear term [g/g^2], or of the cube [g/g^3]."""
+        """Return the prior sd of a nonlinear term: [g/g^3] for the cube, [g/g^2] for others."""
         if kind == 'cube':
             # Limits of K3 in data sheets of quartz pendulums are a few ug/g^3.
             return 1e-5 if self.k3_sd is None else self.k3_sd
@@ -174,8 +174,8 @@ def _family(name: str, lower: float, upper: float) -> TemperatureFunction:
     if name == 'exponential':
         # Exponentials grow e-fold in 15 K (leakage currents, which double in 10 K) or in 30 K.
         return Exponential(-2.0, (1.0, 1.0), (15.0, 30.0))
-    # The spline has a knot at the reference temperature. Of five equidistant knots, it has those
-    # that differ from the reference temperature by more than 0.3 of the spacing of the knots.
+    # The spline has a knot at the reference temperature, and those of five equidistant knots that
+    # are farther from the reference temperature than 0.3 of the knot spacing.
     knots = np.linspace(lower, upper, 5)
     step = max((upper - lower) / 4, 1.0)
     kept = sorted([0.0, *(float(k) for k in knots if abs(k) > 0.3 * step)])
@@ -186,7 +186,7 @@ def normal_gravity(latitude_deg: float, height_m: float) -> float:
     """
     Return the normal gravity [m/s^2] at a height above the WGS 84 ellipsoid (Somigliana).
 
-    Real gravity differs from normal gravity by 30 mGal (30 ug) RMS, in mountains by some 50 mGal.
+    Real gravity differs from normal gravity by 30 mGal (30 ug) RMS, in mountains by about 50 mGal.
     Raises ValueError for a latitude outside -90..90 deg or a height outside -1000..10000 m.
     """
     if not -90.0 <= latitude_deg <= 90.0:

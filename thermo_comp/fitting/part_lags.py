@@ -3,14 +3,14 @@
 """
 Owns the search for the thermal lag of each axis.
 
-The bias and the scale factor of an axis are modelled as functions of ``x = t - m``, the
-temperature of one part of the unit less the reference temperature. t is the board temperature T
-less the reference temperature, and m = T - L(T + v G) is T less the temperature of the part, with
-L the lag operator and G = T_case - T_board the gradient. The part follows a temperature T + v G
-between board and case with a lag of one first-order stage or, if it is heated through another
-part, of two stages in series. Without a case thermometer, the part may follow a temperature
-that leads T by a time, the lead. The time constants, the share v of the gradient and the lead
-minimise the RMS residual of a spline of the bias and a cubic of the scale over x.
+The bias and the scale factor of an axis are functions of ``x = t - m``, the temperature of one
+part of the unit less the reference temperature. t is the board temperature T less the reference
+temperature, and the lag m = T - L(T + v G) is T less the temperature of the part. L is a low-pass
+filter and G = T_case - T_board the gradient. The part follows a temperature T + v G between board
+and case with a lag of one first-order stage or, if it is heated through another part, of two
+stages in series. Without a case thermometer, the part may follow a temperature that leads T by
+a time, the lead. The time constants, the share v of the gradient and the lead minimise the RMS
+residual of a fit of a spline of the bias and a cubic of the scale factor over x.
 """
 
 from __future__ import annotations
@@ -36,17 +36,17 @@ from .initial_triad import (
 )
 from .windows import ThermalWindows
 
-# Ratio of a time constant of the columns to the next smaller time constant: half an octave.
+# Ratio of each time constant of the columns to the next smaller time constant.
 _TAU_RATIO = 2.0**0.5
 
 
 class _Shape(NamedTuple):
     """
-    The shape of the curves over the temperatures of the parts.
+    The shape of the curves of bias and scale factor over x, the temperature of a part.
 
     n_nodes: largest number of nodes of the spline of the bias
     most_noise: largest ratio of the RMS residual to the noise at which noise explains the residual
-    has_stress: whether bias and scale have terms in m and in m x, due to stress, m being the lag
+    has_stress: whether bias and scale have terms in the lag m and in m x, due to thermal stress
     has_gradient: whether the bias also has a term in the gradient T_case - T_board
     """
 
@@ -56,10 +56,10 @@ class _Shape(NamedTuple):
     has_gradient: bool = False
 
 
-# Up to this ratio of RMS residual to noise, no further curve shape or lag is tried.
+# The search for shapes and lags ends at this ratio of the RMS residual to the noise, or below.
 _EXPLAINED_RATIO = 1.1
 # Shapes of curves over part temperature, in the order of trials. A spline of 4 nodes determines a
-# lag best, but cannot describe a kink of the bias, so its limit `most_noise` is low.
+# lag best, but cannot describe a kink of the bias, so it must fit down to a low `most_noise`.
 _SHAPES = (
     _Shape(4, _EXPLAINED_RATIO),
     _Shape(4, _EXPLAINED_RATIO, has_gradient=True),
@@ -74,8 +74,8 @@ class Parts:
     The thermal lags of the axes of a unit.
 
     lags: the lag of each axis; 0 s if the axis follows the board without a lag
-    undisturbed: factors, up to 1, that reduce the weights of outlying windows, shape (n,)
-    most_drift: left-out drift above which models without these lags are tried [m/s^2]
+    undisturbed: factors (0 to 1) that reduce the weights of outlying windows, shape (n,)
+    most_drift: left-out drift above which models without these lags are tried, too [m/s^2]
     """
 
     lags: tuple[Part, Part, Part]
@@ -89,8 +89,8 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> list[Part
 
     Returns [] if the model with one lag per axis does not explain the drift of all axes, or if the
     data determine no axis's time constant. If no shape of the curves reduces the residual to the
-    noise, a second stage may describe slow noise or a tilt of the support. Lags of one stage that
-    more than halve the RMS residual of each axis then come first in the result.
+    noise, the second stage of a lag may only describe slow noise or a tilt of the support: lags of
+    one stage that more than halve the RMS residual of each axis then come first in the result.
     """
     data, columns = windows.data, windows.model.columns
     if not windows.has_temperature or not any(column.group == 'board' for column in columns):
@@ -107,8 +107,8 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> list[Part
         subset = _PartCurves(windows, start, shape, 3000)
         lags = [subset.refined(lag, axis) for axis, lag in enumerate(searched)]
         parts, ratio = _PartCurves(windows, start, shape, len(data.time)).parts(lags, noise)
-        # If the residual is above `most_noise` times the noise, it has a further cause, such as
-        # slow noise: lags must then reduce the RMS residual of each axis to a quarter.
+        # A residual above `most_noise` times the noise has a further cause, such as slow noise:
+        # the lags are then accepted only if they reduce each axis's RMS residual to a quarter.
         is_explained = ratio <= shape.most_noise
         if not is_explained and min(map(subset.reduction, lags, range(3))) < 4.0:
             continue
@@ -128,8 +128,8 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> list[Part
 
 class _PartCurves:
     """
-    Bias and scale factor of an axis, fitted for any lag as functions of x, the temperature of the
-    part, to every k-th window, with the largest k that keeps at least `n_windows` windows.
+    Fits of bias and scale factor of an axis as functions of x, the temperature of its part, for
+    a given lag. To save time, every k-th window is fitted: about `n_windows` windows.
     """
 
     def __init__(
@@ -173,9 +173,9 @@ class _PartCurves:
 
     def lags(self, noise: Floats) -> list[Part] | None:
         """
-        Return the lag of each axis, or None if a lag is not useful or longer than the bags show,
-        or if no axis determines its lag. The lag of a single axis can be undetermined because its
-        bias hardly depends on temperature, or because the lag is shorter than the windows.
+        Return the lag of each axis; None if a lag is useless or longer than the bags show, or if
+        the data determine the lag of no axis. The lag of a single axis may be undetermined if its
+        bias hardly depends on temperature, or if the lag is shorter than a window.
         """
         lags, is_determined = [], False
         longest_s = float(self._age.max()) / np.log(10.0)
@@ -190,15 +190,15 @@ class _PartCurves:
     def _is_useful(
         self, lag: Part, axis: int, noise: float, most_noise: float = 3.0, reduction: float = 4.0
     ) -> bool:
-        """Whether `lag` leaves a residual near the noise, or far smaller than without a lag."""
+        """Whether the residual with `lag` is near the noise, or far smaller than without a lag."""
         typical = 1.4826 * np.median(np.abs(self._weighted(lag, axis) / self._root_weight[:, 0]))
         return bool(typical <= most_noise * noise or self.reduction(lag, axis) >= reduction)
 
     def _lag(self, axis: int, noise: float) -> Part:
         """
-        Return the lag with the smallest RMS residual; 0 s if no lag reduces the residual. If noise
-        does not explain the residual, a second stage or another share of the gradient, then both,
-        are tried, and kept if they reduce the RMS residual by more than 5 %.
+        Return the lag with the smallest RMS residual; 0 s if no lag reduces the residual. If the
+        residual exceeds the noise, a second stage of the lag, another share of the gradient and
+        the combination of the two are tried; they must reduce the RMS residual by over 5 %.
         """
         one_stage = self.one_stage(axis)
         best = self._with_lead(one_stage, axis)
@@ -211,7 +211,7 @@ class _PartCurves:
                 along = [self.one_stage(axis, share) for share in (0.3, 0.6, 0.9)]
                 starts.append(min(along, key=lambda lag: self._square(lag, axis)))
             if not any(self._is_useful(near, axis, noise, 8.0, 1.5) for near in (best, *starts)):
-                # The residual is too large for a second stage, or share of the gradient, to help.
+                # The residual has another cause than a second stage or a share of the gradient.
                 return best
             lags = [self._searched(axis, _in_two_stages(one_stage), (0.2, 0.4, 0.0, 0.0))]
             if best.lead_s:
@@ -233,9 +233,9 @@ class _PartCurves:
         Return `lag` plus a share of the gradient or, without a case thermometer, a positive lead
         time; or `lag` itself if the residual does not become significantly smaller.
 
-        The residual is linearised w.r.t. the time constant and, second, the share of the gradient
-        or the lead. The sum of squares of the linearised residual must decrease by more than white
-        noise explains with a probability of 1e-5.
+        The residual is linearised w.r.t. the time constant and the share (or the lead). The sum of
+        squares of the linearised residual must decrease by more than white noise explains with
+        a probability of 1e-5.
         """
         tau = lag.tau_s
         if not tau:
@@ -273,9 +273,9 @@ class _PartCurves:
         """
         Search the lag with the smallest RMS residual by the simplex method, from the lag `first`.
 
-        The search is over the logarithms of both time constants, the share of the gradient, and
-        lead / first time constant. `steps`: first step in each of these variables, 0 to keep the
-        variable constant; `accuracy`: half of the largest extent of the last simplex
+        The variables are the logarithms of both time constants, the share of the gradient, and
+        lead / first time constant. `steps`: first step in each variable, 0 to keep the variable
+        constant; `accuracy`: half of the simplex's size in a variable at which the search ends
         """
         tau, second, share, lead = first
         start = np.array([np.log(tau), np.log(second or 1.0), share, lead / tau])
@@ -316,8 +316,8 @@ class _PartCurves:
 
     def _is_determined(self, lag: Part, axis: int) -> bool:
         """
-        Whether time constants longer and shorter by `_TAU_RATIO` (for a lag of 0 s: 21 s) increase
-        the RMS residual by over 5 %.
+        Whether other time constants increase the RMS residual by over 5 %: `_TAU_RATIO` times
+        longer and shorter time constants; for a lag of 0 s, a lag of 21 s.
         """
         tau, second, share, lead = lag
         others = [
@@ -330,7 +330,7 @@ class _PartCurves:
         return all(self._square(other, axis) > limit for other in others)
 
     def reduction(self, lag: Part, axis: int) -> float:
-        """Return the ratio of the RMS residual of an axis without a lag to that with `lag`."""
+        """Return RMS residual of an axis without a lag / RMS residual of the axis with `lag`."""
         return float(np.sqrt(self._square(Part(0.0), axis) / self._square(lag, axis)))
 
     def parts(self, lags: Sequence[Part], noise: Floats) -> tuple[Parts, float]:
@@ -339,14 +339,14 @@ class _PartCurves:
         residual = weighted / self._root_weight
         factors = undisturbed(residual, self._weight, self._position)
         square = np.average(residual**2, axis=0, weights=self._weight * factors)
-        # The unknowns of an axis are a coefficient of each regressor, and one level per position.
+        # Unknowns of an axis: the coefficient of each regressor, and one constant per position.
         n_unknowns = self._series(lags[0], 0).shape[1] + len(self._first)
         square /= max(1.0 - n_unknowns / len(residual), 0.05)
         ratio = float(np.sqrt((square / noise**2).max()))
         x, y, z = (Part(*map(round, lag, (1, 1, 4, 1))) for lag in lags)
-        # Other models are tried if the left-out drift is above `most_drift`: 2 sd of the noise, or
-        # 10 sd if noise explains the residual of a shape without stress, because curves that fit
-        # all data well may still extrapolate badly to left-out data.
+        # Curves that fit all data well may extrapolate badly to left-out data. If the left-out
+        # drift exceeds `most_drift`, other models are tried: at 2 sd of the noise, or at 10 sd if
+        # noise explains the residual of a shape without stress.
         is_complete = ratio <= self._shape.most_noise and not self._shape.has_stress
         most_drift = (10.0 if is_complete else 2.0) * float(noise.mean())
         return Parts((x, y, z), factors, most_drift), ratio
@@ -356,7 +356,7 @@ class _PartCurves:
         return max(float(left @ left), 1e-30)
 
     def _weighted(self, lag: Part, axis: int) -> Floats:
-        """Return the residuals of an axis times the roots of the windows' weights, shape (n,)."""
+        """Return an axis's residuals times the square roots of the windows' weights, (n,)."""
         series, measured = self._series(lag, axis), self._measured[:, axis]
         normal, right = series.T @ series, series.T @ measured
         # Regressors are divided by their norms, because their magnitudes differ.
@@ -378,7 +378,7 @@ class _PartCurves:
                     x += of_case * share * self._gradient(at)
         low, high = float(x.min()), float(x.max())
         span = (high - low) or 1.0
-        # If the spline of the bias has more than 4 nodes, they are at least 0.6 K apart.
+        # A spline of the bias with more than 4 nodes has nodes at least 0.6 K apart.
         n_nodes = min(max(int(span / 0.6), 4), self._shape.n_nodes)
         nodes = np.linspace(low, low + span, n_nodes)
         knots = np.concatenate((nodes[[0] * 3], nodes, nodes[[-1] * 3]))
@@ -397,14 +397,14 @@ class _PartCurves:
         return self._centred(np.hstack((*bias, of_scale, begin)))
 
     def _centred(self, values: Floats) -> Floats:
-        """Return columns less their weighted mean in each position, times the root weights."""
+        """Subtract each position's weighted mean from series; multiply by root weights, (n, k)."""
         level = np.add.reduceat(values * self._share, self._first)
         return np.asarray((values - level[self._position]) * self._root_weight)
 
 
 def _in_two_stages(lag: Part) -> Part:
     """Split a lag of one stage into two stages, as the start of a search."""
-    # Two stages leave almost the same residual as one stage with the sum of both time constants.
+    # Two stages fit almost as well as one stage with the sum of their time constants.
     tau, _, share, lead = lag
     return Part(0.8 * tau + 1.0, 0.2 * tau + 1.0, share, lead)
 
@@ -417,5 +417,5 @@ def _in_order(tau_s: float, second_tau_s: float, sensor_share: float, lead_share
 
 
 def _interpolation_place(tau_s: Floats) -> Floats:
-    """Map time constants [s] to 0..1, the abscissa of the interpolation; 200 s become 0.5."""
+    """Map time constants [s] to an interpolation's abscissa in [0, 1): 200 s are mapped to 0.5."""
     return np.asarray(tau_s / (tau_s + 200.0))

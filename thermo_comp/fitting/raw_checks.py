@@ -38,13 +38,13 @@ def judge_prior(serial: str, prior: Calibration | None) -> Iterator[Finding]:
 
 
 def full_scale_of(bags: Sequence[ReducedBag], options: FitOptions) -> float:
-    """Return the full scale [input units]: as stated, by default a value above all samples."""
+    """Return the full scale [input units]: as stated, else a usual value above all samples."""
     full_scale, largest = options.saturated_at, max(bag.max_abs for bag in bags)
     if full_scale == COUNTS_FULL_SCALE:
         return widened(full_scale, np.array([[largest]]))
     if full_scale is None:
         # Take the smallest usual full scale 10 % above all samples, else twice the largest sample.
-        # The user may have stated the prior's full scale, so the result is at least this value.
+        # The result is at least the full scale of the prior, which the user may have stated.
         ranges = (STANDARD_GRAVITY * g for g in (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0))
         full_scale = next((top for top in ranges if top > 1.1 * largest), 2.0 * largest)
         full_scale = max(full_scale, options.prior.unit.full_scale if options.prior else 0.0)
@@ -113,7 +113,7 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
 def _judge_full_scale(
     bags: Sequence[ReducedBag], size: float, options: FitOptions
 ) -> Iterator[Finding]:
-    """Report a full scale that is neither stated nor the default; `size`: median |reading|."""
+    """Report a full scale that is estimated from the samples; `size`: median norm at rest."""
     full_scale = full_scale_of(bags, options)
     if full_scale not in (options.full_scale, COUNTS_FULL_SCALE):
         text = (
@@ -129,7 +129,7 @@ def _rests(bags: Sequence[ReducedBag]) -> list[StillInterval]:
 
 
 def in_kelvins(bag: ReducedBag) -> str:
-    """Describe the thermometer of a bag whose readings look like kelvins; '' if none does."""
+    """Return a message about a thermometer whose readings look like kelvins; '' if none does."""
     for name in sorted(bag.temperatures):
         celsius = bag.readings(name).value
         # 233 K is -40 degC, the lower limit of industrial electronics, which fail at 233 degC.
@@ -182,7 +182,7 @@ def _judge_units(
 
 
 class _DeadAxis(NamedTuple):
-    """An axis that is constant throughout a rest of a bag: its reading, and a description."""
+    """An axis whose samples all equal `value` in a rest of a bag; `text`: its description."""
 
     bag: str
     axis: int
@@ -191,14 +191,14 @@ class _DeadAxis(NamedTuple):
 
 
 def _why_dead(bags: Sequence[ReducedBag], dead: Sequence[_DeadAxis]) -> str:
-    """Return why the readings of axes are constant: clipped at the full scale, or dead."""
+    """Return why the samples of axes are constant: clipped at the full scale, or a dead axis."""
     largest = max(float(np.abs(rest.mean).max()) for rest in _rests(bags))
-    # The limits of a two's complement code, such as -32768 and 32767, differ in size by one count.
+    # The magnitudes of the limits of a two's complement code (-32768, 32767) differ by one count.
     is_at_top = np.isclose([abs(axis.value) for axis in dead], largest, rtol=1e-4, atol=0.0)
     ends = {(axis.axis, axis.value > 0.0) for axis in dead}
     if not largest or not is_at_top.all() or len(ends) == 1:
         return 'the axis is dead; leave out each bag with a dead axis'
-    # Advise a full scale just below the clipped reading, so that this reading is saturated.
+    # The advised full scale is just below the clipped samples, which are then saturated.
     limit = f'--full-scale {largest * (1.0 - 1e-4):.5g}'
     return (
         'the same largest magnitude, with both signs or on several axes, is the full scale: leave '
@@ -208,8 +208,8 @@ def _why_dead(bags: Sequence[ReducedBag], dead: Sequence[_DeadAxis]) -> str:
 
 def _dead_axes(bags: Sequence[ReducedBag]) -> Iterator[_DeadAxis]:
     """
-    Find the axes that are constant throughout a rest but have noise in half or more of the rests;
-    if another axis has noise, also the axes that are constant in all rests, but not 0 in all.
+    Find axes that are constant throughout a rest but have noise in half or more of the rests. An
+    axis that is constant in all rests, but not 0 in all, is dead if another axis has noise.
     """
     rests = _rests(bags)
     alive = np.array([rest.sample_sd > 0.0 for rest in rests])
@@ -221,7 +221,7 @@ def _dead_axes(bags: Sequence[ReducedBag]) -> Iterator[_DeadAxis]:
 
 
 def constant_axes(bags: Sequence[ReducedBag], usual: Bools) -> Iterator[_DeadAxis]:
-    """Find axes of the mask `usual`, (3,), whose samples are constant throughout a rest."""
+    """Find axes with constant samples throughout a rest; `usual`: axes to be checked, (3,)."""
     for bag in bags:
         for rest in bag.intervals:
             is_dead = ~(rest.sample_sd > 0.0) & usual & (np.ptp(rest.mean, axis=0) == 0.0)
@@ -246,7 +246,7 @@ def _judge_jumps(bags: Sequence[ReducedBag], per_mg: float) -> Iterator[Finding]
 
 
 def describe(jump: Jump, per_mg: float, since_s: float = 0.0) -> str:
-    """Describe a jump; `since_s`: start of the part of the bag that was read [s]."""
+    """Return the message for a jump; `since_s`: start of the part of the bag that was read [s]."""
     vector = ', '.join(f'{v / per_mg:+.3g}' for v in jump.step)
     warmed = ''
     if np.isfinite(jump.temperature_change):
@@ -262,13 +262,13 @@ def describe(jump: Jump, per_mg: float, since_s: float = 0.0) -> str:
 
 
 def judge_missing(bags: Sequence[ReducedBag], windows: ThermalWindows) -> Iterator[Finding]:
-    """Report the share of the time at rest left out for lack of a temperature, and why."""
+    """Report a large share of the time at rest that is left out for lack of a temperature."""
     if not windows.has_temperature:
         return
     counts = [_missing(bag, track) for bag, track in zip(bags, windows.tracks, strict=True)]
     n_still, n_unsettled, n_missing, n_between = np.sum(counts, axis=0).tolist()
     unsettled, missing = n_unsettled / n_still, n_missing / n_still
-    reported = 0.1  # largest share of the time at rest without temperature that is not reported
+    reported = 0.1  # a larger share of the time at rest without a temperature is reported
     if missing > reported:
         why = 'do the thermometers and the accelerometer use the same clock?'
         if n_between > 0.5 * n_missing:
@@ -288,9 +288,9 @@ def judge_missing(bags: Sequence[ReducedBag], windows: ThermalWindows) -> Iterat
 
 def _missing(bag: ReducedBag, track: Track) -> tuple[float, float, float, float]:
     """
-    Return four numbers of samples at rest: all samples; the samples before the board temperature
-    is accurate; other samples without a temperature; and those of the latter that were recorded
-    later, between the first and the last readings of all thermometers.
+    Return four numbers of samples at rest: all samples; samples before the board temperature is
+    accurate; other samples without a temperature; samples without a temperature that were recorded
+    after the board temperature was accurate, while all thermometers gave readings.
     """
     read = [readings.stamp_ns for readings in bag.temperatures.values() if len(readings.stamp_ns)]
     begin_s = 1e-9 * (max(stamp_ns[0] for stamp_ns in read) - bag.start_ns)

@@ -7,8 +7,8 @@ The blocks of a bag are read once, in bounded memory. Samples are averaged to ce
 second (see `stillness`), and the cells of a still interval to windows of ten seconds. Windows
 of a short interval, or at the end of an interval, may be shorter than ten seconds. In a window the
 deviation of every thermal regressor from a straight line is far below the noise, so the mean of a
-window is a sufficient statistic. The regression estimates the noise of the means of windows; with
-a charge-balancing converter this noise is smaller than the scatter of the samples implies.
+window is a sufficient statistic. The regression estimates the noise of the windows' means. With a
+charge-balancing converter this noise is smaller than sd of the samples / sqrt(number of samples).
 """
 
 from __future__ import annotations
@@ -49,15 +49,15 @@ class Readings(NamedTuple):
 @dataclass(frozen=True)
 class StillInterval:
     """
-    An interval without motion: a rest of the unit.
+    A rest: an interval in which the unit does not move.
 
     start_ns, end_ns: stamps of the middles of the interval's first and last cell
     begin_s: start of the interval's first window, since the bag's first sample [s]
-    n_whole: number of windows of full length; a shorter last window may follow them
+    n_whole: number of windows of full length; the last window may be shorter and is not counted
     time, count, mean: each window's time since the first sample [s], number and mean of samples
-    sample_sd: root of the median, over the cells, of the variance of the samples, shape (3,)
-    rounding_sd: sd of the error of the mean by rounding; 0 if samples have noise, shape (3,)
-    angular_rate: mean angular rate of each window [rad/s], or None if samples of the bag lack it
+    sample_sd: square root of the median of the cells' variances of samples, shape (3,)
+    rounding_sd: sd of the error of `mean` by rounding of samples; 0 if samples have noise, (3,)
+    angular_rate: mean angular rate of each window [rad/s], or None if a sample of the bag has none
     """
 
     start_ns: int
@@ -80,18 +80,18 @@ class ReducedBag:
     start_ns, end_ns: stamps of the first and last sample used
     n_dropped: number of samples that are not finite, or whose stamps are out of order
     n_saturated: number of samples at the full scale
-    n_cells, n_still_cells: number of cells (about half a second each) in the bag, in its rests
+    n_cells, n_still_cells: number of cells (about half a second each) in the bag and in its rests
     window_s: length of a window [s]; longer than requested if the sample rate is low
     cycle_s: typical interval between samples [s]
     is_integer: whether all samples are integers
-    middle: code at zero force if the samples are unsigned codes, else 0
-    step: resolution of the samples of the coarsest axis, or 0 if it is not visible [input units]
-    max_abs: largest magnitude of a sample, without the largest 1 % of the cells [input units]
+    middle: sample at zero force of a converter with unsigned codes, else 0
+    step: resolution of the coarsest axis [input units], or 0 if the samples do not show it
+    max_abs: 99 % quantile, over cells, of the largest magnitude of a sample [input units]
     since_s: time from the bag's first sample to the part of the bag that was read [s]
     restless: reason why the bag cannot be used, such as no rests; '' if the bag can be used
-    angular_rate: whether none, a part or all of the bag's samples have a finite angular rate
-    n_spikes: number of left-out readings of each thermometer, over 10 K from their neighbours
-    n_glitches: number of single samples far from their neighbours, which are left out
+    angular_rate: 'whole' if all samples have a finite angular rate, 'part' if some, else 'none'
+    n_spikes: number of dropped readings of each thermometer, over 10 K from their neighbours
+    n_glitches: number of dropped single samples that are far from their neighbours
     n_repeated: number of dropped samples with the same stamp as the preceding sample
     parts: the bags that were joined to this recording, see `joining`; () for a single bag
     """
@@ -128,7 +128,7 @@ class ReducedBag:
         return self.parts or (Source(name, sha256, self.n_samples),)
 
     def readings(self, name: str) -> Readings:
-        """Return the readings of a thermometer, no readings if the bag lacks the thermometer."""
+        """Return the readings of a thermometer; an empty table if the bag lacks it."""
         return self.temperatures.get(name, Readings())
 
     @property
@@ -143,7 +143,7 @@ class ReducedBag:
 
 
 class _Pass:
-    """A pass over the blocks of a source; `has_rate`: whether all angular rates are finite."""
+    """One reading of all blocks of a source; `has_rate`: whether all angular rates are finite."""
 
     def __init__(self, source: FitSource, accumulator: CellAccumulator) -> None:
         readings: dict[str, list[Readings]] = {}
@@ -193,11 +193,11 @@ def reduce_source(
     Read one source in blocks and keep its sufficient statistics.
 
     `still_sd` is the largest sd of samples at rest [g]. Without `min_rest_s` a rest lasts at least
-    3 s, or at least 1 or 2 s if these shorter rests determine bias and scale better. The largest
+    3 s, or at least 1 or 2 s if rests of this length determine bias and scale better. The largest
     variance allowed in a rest is chosen so that rests determine bias and scale best. If the user
     or the bag states |f|, the limit of the variance is fixed, and `min_rest_s` is by default 3 s.
-    At a low sample rate, cells of the usual 30 samples are so long that drifts look like motions
-    and short rests are lost: cells of 10 or 5 samples are then tried.
+    Cells of the usual 30 samples are over 3 s long at a low sample rate, so that drifts look like
+    motions and short rests are lost: cells of 10 or 5 samples are then tried.
     """
 
     def reduced(least: int) -> tuple[ReducedBag, float]:
@@ -236,7 +236,7 @@ def _reduced(
     if source.force is None:
         ranges = _rests(cells, min_rest_s, still_sd)
     else:
-        # The stated |f| is not gravity, so the norms of rests cannot decide on thresholds.
+        # The stated |f| is not gravity, so the norms of rests cannot select the thresholds.
         cells = stillness.without_rotation(cells)
         ranges = stillness.still_intervals(cells, min_rest_s or 3.0, still_sd)
     restless = reading.causes.cause(cells, still_sd)
@@ -287,8 +287,8 @@ def _cycle_s(cells: Cells) -> float:
     """Return the typical interval between samples [s]; NaN without samples."""
     if not len(cells.count):
         return np.nan
-    # A cell is complete if its number of samples differs from the median number by at most 1. If
-    # most cells are incomplete, as with bursts, cells with over half the median number are used.
+    # A cell is complete if its number of samples differs from the median number by at most 1.
+    # Samples in bursts make most cells incomplete: use cells with over half the median number.
     median = float(np.median(cells.count))
     use = np.abs(cells.count - median) <= 1.0
     if np.mean(use) < 0.5:
@@ -304,7 +304,7 @@ def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
     use &= stamp_ns > np.maximum.accumulate(before[: len(stamp_ns)])
     stamp_ns, value = stamp_ns[use], value[use]
     span_s = np.ptp(stamp_ns) * 1e-9 if len(stamp_ns) else 0.0
-    # No thermometer responds within 0.2 s, and the tracker's loop over the readings is slow.
+    # No thermometer responds within 0.2 s, so means over 0.2 s lose nothing and save time.
     size = int(0.2 * (len(stamp_ns) - 1) / span_s) if span_s else 1
     n = len(stamp_ns) // size * size if size > 1 else 0
     if n:
@@ -317,15 +317,15 @@ def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
 
 @np.errstate(invalid='ignore')
 def is_spike(value: Floats) -> Bools:
-    """Return which readings are over 10 K from the median of five readings about them, (n,)."""
-    # A thermometer with a loose contact reads -127 or 85 degC for a moment. Noise is estimated
-    # without such readings, so that the tracker rejects them as outliers.
+    """Return whether each reading is over 10 K from the median of the five around it, (n,)."""
+    # A thermometer with a loose contact reads -127 or 85 degC for a moment. If the noise of the
+    # thermometer is estimated without these readings, the tracker rejects them as outliers.
     far = np.zeros(len(value), dtype=bool)
     if len(value) > 4:
         middle = np.median(sliding_window_view(value, 5), axis=1)
         far[2:-2] = np.abs(value[2:-2] - middle) > 10.0
-        # The first and the last reading have neighbours on one side only. A large step to the
-        # nearest reading belongs to a ramp if the next step in this direction is similar.
+        # The first and the last reading have neighbours on one side only. A large step from such a
+        # reading to its neighbour belongs to a ramp if the neighbour's next step is similar.
         for place, nearest in ((0, value[:3]), (-1, value[:-4:-1])):
             step, after = np.abs(np.diff(nearest)).tolist()
             far[place] = step > 10.0 and after < CONTINUED_SHARE * step
@@ -333,7 +333,7 @@ def is_spike(value: Floats) -> Bools:
 
 
 def _max_abs(cells: Cells) -> float:
-    """Return the 99 % quantile, over cells, of the largest |mean| + 3 sd of the three axes."""
+    """Return the 99 % quantile over cells of |mean| + 3 sd, the largest of the three axes."""
     if not len(cells.count):
         return 0.0
     sizes = np.max(np.abs(cells.mean) + 3.0 * np.sqrt(cells.variance), axis=1)
@@ -343,7 +343,7 @@ def _max_abs(cells: Cells) -> float:
 def _rests(cells: Cells, min_rest_s: float | None, still_sd: float) -> list[tuple[int, int]]:
     """Find the rests, with the thresholds whose rests determine bias and scale best."""
     candidates: list[list[tuple[int, int]]] = []
-    # Limits of the variance in a rest to try, divided by the variance in the quietest cells.
+    # Candidate limits of the variance in a rest, divided by the variance in the quietest cells.
     ratios = tuple(stillness.VARIANCE_RATIO * 2.0**power for power in range(6))
     of_ratios = stillness.still_runs(cells, still_sd, ratios)
     for shortest_s in (3.0, 2.0, 1.0) if min_rest_s is None else (min_rest_s,):
@@ -362,10 +362,10 @@ def _rests(cells: Cells, min_rest_s: float | None, still_sd: float) -> list[tupl
 
 def _joined(cells: Cells, ranges: list[tuple[int, int]], still_sd: float) -> list[tuple[int, int]]:
     """
-    Join rests that are separated by a vibration without motion, if a bag has six or more such
-    vibrations, as from a compressor that cycles. There is no motion if on each axis a parabola
-    through the cells, from four before to four after the vibration, leaves a mean square residual
-    below 4 variances of a cell's mean.
+    Join rests that are separated by a vibration without motion, as from a compressor that cycles.
+    There is no motion if on each axis a parabola fits the means of the cells, from four before to
+    four after the vibration, with a mean square residual below 4 variances of a cell's mean. Bags
+    with fewer than six of these vibrations keep their separate rests.
     """
     is_calm = stillness.is_under(cells, still_sd)
     result = ranges[:1]
@@ -374,7 +374,7 @@ def _joined(cells: Cells, ranges: list[tuple[int, int]], still_sd: float) -> lis
         around = slice(max(first, last - 4), min(stop, start + 4))
         time, mean = cells.time[around], cells.mean[around]
         variance = np.maximum(cells.variance[around], cells.quantum**2 / 12.0)
-        # Equal samples have no variance: their means differ by rounding, by 1e-12 of a reading.
+        # Equal samples have no variance: their means differ by rounding, by 1e-12 of a sample.
         variance = np.maximum(variance, (1e-12 * np.abs(mean).max()) ** 2 + 1e-300)
         root = np.sqrt(np.maximum(cells.count[around, None], 1) / variance)
         is_same = is_calm[last:start].all() and np.all(np.diff(cells.index[around]) == 1)
@@ -400,7 +400,7 @@ def _windows(
     offsets = np.arange(0, end - lower, per_window)
     count = cells.count[rows].astype(np.float64)
     total = np.add.reduceat(count, offsets)
-    # The last window counts as whole only if it has 90 % of the median number of samples.
+    # The last window is of full length only if it has 90 % of the median number of samples.
     if n_whole and total[n_whole - 1] < 0.9 * np.median(total):
         n_whole -= 1
     mean = block_means(cells.mean[rows], count, offsets)
@@ -421,7 +421,7 @@ def _windows(
 
 def rounding_sd(variance: Floats, drift: Floats, quantum: Floats) -> Floats:
     """
-    Return the sd of the error of a mean by rounding to a converter's steps, shape (3,).
+    Return the sd of a mean's error due to the rounding of samples to converter steps, shape (3,).
 
     `variance`: median variance of the rounded samples in a cell; if it is above 0, the noise of
     the samples averages the rounding error to 0.

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the tests of the rests of a recording: whether temperatures and readings change in a rest,
+Owns the tests of the rests of a recording: whether temperatures and samples change in a rest,
 which attitudes were heated, and to which attitudes the unit was returned.
 """
 
@@ -18,14 +18,14 @@ from .initial_triad import block_means, white_noise_of, within_positions
 from .unknowns import Windows
 from .windows import LAGS, ThermalWindows
 
-# Largest change of the board temperature that the unit's electronics cause after power-on [K].
+# Largest change of the board temperature by self-heating after power-on [K].
 _WARM_UP_K = 10.0
 
 
 def is_constant(windows: ThermalWindows, part: Ints) -> bool:
     """
-    Whether the board temperature changes less (RMS) within parts than from part to part; `part`:
-    index of each window's part, its position or its bag, shape (n,).
+    Whether the board temperature changes less (RMS) within parts of the data than between parts.
+    `part`: index of each window's part, shape (n,); a part is a position or a bag.
     """
     t = windows.temperature
     within = within_positions(t[:, None], part)[:, 0]
@@ -35,7 +35,7 @@ def is_constant(windows: ThermalWindows, part: Ints) -> bool:
 def only_warms_up(windows: ThermalWindows) -> bool:
     """
     Whether no bag contains a ramp of a chamber: the board temperature changes by at most
-    `_WARM_UP_K` in each bag, and changes less (RMS) within bags than from bag to bag.
+    `_WARM_UP_K` in each bag, and less (RMS) within bags than between bags.
     """
     t, bag = windows.temperature, windows.data.bag
     changes = [float(np.ptp(t[bag == number])) for number in np.unique(bag)]
@@ -50,10 +50,10 @@ def is_bench(windows: ThermalWindows, up: Floats) -> bool:
 
 def _is_heated(windows: ThermalWindows) -> Bools:
     """
-    Return which positions were heated or cooled, shape (n_positions,), or all if none was. In such
-    a position the temperature changes, or its mean differs from the median of all positions, by
-    more than a tenth of the range of all temperatures: smaller drifts, as of short rests in a
-    room, hardly separate bias and scale.
+    Return whether each position was heated or cooled, shape (n_positions,); all True if none was.
+    In a heated position the temperature changes, or its mean differs from the median of all
+    positions, by more than a tenth of the range of all temperatures. Smaller changes, as of short
+    rests in a room, hardly separate bias and scale.
     """
     t, edges, weight = windows.temperature, windows.data.edges[:-1], windows.data.weight
     mean = block_means(t[:, None], weight, edges)[:, 0]
@@ -64,10 +64,9 @@ def _is_heated(windows: ThermalWindows) -> Bools:
 
 def is_steady(windows: ThermalWindows) -> Bools:
     """
-    Return which positions have constant temperatures, shape (n_positions,): in a position the
-    board temperature and the lags change (RMS) by less than three sd of the estimated board
-    temperature. A ninth of the mean square of a change of three sd is noise, so a slope fitted to
-    such a change would be too small by a ninth.
+    Return whether each position has constant temperatures, shape (n_positions,): the RMS change of
+    the board temperature and of the lags is below three sd of the error of the board temperature.
+    A ninth of a mean square of (3 sd)^2 is noise, so a slope would be too small by a ninth.
     """
     data, model = windows.data, windows.model
     lags = [column.group in LAGS and not column.power for column in model.columns]
@@ -79,7 +78,7 @@ def is_steady(windows: ThermalWindows) -> Bools:
 
 
 def is_without_drift(data: Windows, scale: Floats) -> Bools:
-    """Return positions whose RMS drift is at most 3 times a window's noise, (n_positions,)."""
+    """Return whether each position's RMS drift is <= 3 sd of a window's noise, (n_positions,)."""
     drift = within_positions(data.mean / scale, data.position) * np.sqrt(data.weight)[:, None]
     square = np.add.reduceat(drift**2, data.edges[:-1], axis=0) / np.diff(data.edges)[:, None]
     return np.asarray((square <= (3.0 * white_noise_of(data, scale)) ** 2).all(axis=1))
@@ -87,8 +86,8 @@ def is_without_drift(data: Windows, scale: Floats) -> Bools:
 
 def constant_in(data: Windows, steady: Bools, settled: Bools) -> Windows:
     """
-    Set the columns constant in the positions of the mask `steady`. Set the effects of initial lag
-    states, which would only fit noise, to 0 in the positions of the mask `settled`.
+    Set the columns constant in positions where `steady` is True. Set the effects of initial lag
+    states to 0 in positions where `settled` is True, because they would only fit noise.
     """
     in_steady = steady[data.position][:, np.newaxis]
     means = (data.columns - within_positions(data.columns, data.position))[data.edges[:-1]]
@@ -104,7 +103,7 @@ def poses_of(windows: ThermalWindows, up: Floats) -> Ints | None:
     Return the index of each position's pose, -1 without pose, (n_positions,); None without poses.
 
     `up`: attitudes, shape (n_positions, 3). The positions of an attitude form a pose if the unit
-    was returned to this attitude from a different one, or if all (two or more) positions have it.
+    was returned to the attitude from another one, or if all (two or more) positions have it.
     """
     if len(up) == 1:
         return None

@@ -3,9 +3,9 @@
 """
 Owns the estimation of the settings of thermometers and of the regime detector from bags.
 
-Rates of temperature are central differences over two minutes, which need later readings and so a
-recording. These rates show the lags of the thermometers and the ramps of the test. From lags,
-ramps and noise follow the settings of the causal thermal tracker and regime detector.
+Temperature rates are central differences over two minutes of a recording. The rates show the lags
+of the thermometers and the ramps of the test. The settings of the thermal tracker and of the
+regime detector are computed from lags, ramps and noise.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from ..thermal.settings import OBVIOUS_SHARE, RAMP_K_MIN, DetectorSettings, Ther
 from ..typing import Floats, Ints
 from .reduction import Readings, ReducedBag
 
-# Interval between temperature rates [s]; number of intervals per side of a central difference.
+# Interval between temperature rates [s]; number of intervals on each side of a central difference.
 _BIN_S, _BINS_PER_SIDE = 10.0, 6
 
 
 @dataclass(frozen=True)
 class RateHistory:
-    """Temperature rate of a thermometer, every 10 s of a bag, and sd of its noise [K/s]."""
+    """Temperature rates of a thermometer at intervals of 10 s, and sd of their noise [K/s]."""
 
     rate: Floats
     rate_sd: float
 
     @property
     def least_ramp(self) -> float:
-        """Smallest rate that counts as a ramp [K/s]: 5 sd of the noise of the rate."""
+        """Smallest rate of a ramp that noise does not hide [K/s]: 5 sd of the noise of a rate."""
         return 5.0 * self.rate_sd
 
     @property
@@ -45,7 +45,7 @@ class RateHistory:
 
 
 def learn_detector(bags: Sequence[ReducedBag]) -> DetectorSettings:
-    """Return the detector settings for the noise, lags and ramps in the bags."""
+    """Return detector settings that suit the noise, lags and ramps in the bags."""
     base = DetectorSettings()
     board = learn_thermometer([bag.board for bag in bags], base.board)
     case = learn_thermometer([bag.case for bag in bags], base.case)
@@ -69,7 +69,7 @@ def learn_thermometer(
     if not long:
         return base
     quantum = quantum_of(np.concatenate([readings.value for readings in long]))
-    # With a noise setting below 0.1 mK the estimated temperature would follow rounding errors.
+    # A noise setting below 0.1 mK would let the estimated temperature follow rounding errors.
     noise = max(_noise_of(long, quantum), 1e-4)
     histories = _histories(recorded, noise, quantum)
     with_ramps = [history for history in histories if history.fastest > history.least_ramp]
@@ -99,7 +99,7 @@ def learn_thermometer(
 
 
 def quantum_of(values: Floats) -> float:
-    """Return the step to which readings are rounded [K], their quantum, or 0 without rounding."""
+    """Return the quantum of readings [K], the step to which they are rounded; 0 if not rounded."""
     levels = np.unique(np.round(values, 9))
     if len(levels) < 2 or len(levels) > 0.5 * len(values):
         return 0.0
@@ -115,8 +115,8 @@ def _noise_of(recorded: Sequence[Readings], quantum: float) -> float:
     second = np.concatenate([np.diff(readings.value, 2) for readings in recorded])
     if not quantum:
         return 1.4826 * float(np.median(np.abs(second))) / float(np.sqrt(6.0))
-    # Most rounded readings equal their neighbours, so the median of the differences is 0. Use the
-    # mean square of the differences, without the largest 1 %, less the variance of rounding.
+    # Most rounded readings equal their neighbours, so the median of the differences is 0. The mean
+    # square of the differences, without the largest 1 %, less the rounding variance is used.
     square = np.sort(second**2)[: int(0.99 * len(second))]
     noise = float(np.sqrt(max(float(square.mean()) / 6.0 - quantum**2 / 12.0, 0.0)))
     limit = 0.1 * quantum
@@ -126,8 +126,8 @@ def _noise_of(recorded: Sequence[Readings], quantum: float) -> float:
 def _flicker(recorded: Sequence[Readings]) -> float:
     """
     Return the sd of the noise of readings whose quantum is much larger than the noise [K]. While
-    the temperature passes the edge between two rounded values at the rate r, readings with
-    interval h and noise of sd s change ``2 s / (r h sqrt(pi))`` times, but at least once.
+    the temperature passes the edge between two rounded values at the rate r, readings at intervals
+    h with noise of sd s change ``2 s / (r h sqrt(pi))`` times, but at least once.
     """
     moves = inverse_rates = 0.0
     for readings in recorded:
@@ -146,7 +146,7 @@ def _flicker(recorded: Sequence[Readings]) -> float:
 
 
 def _histories(recorded: Sequence[Readings], noise: float, quantum: float) -> list[RateHistory]:
-    """Return the rate of temperature in each bag of at least 30 readings over 6 minutes."""
+    """Return the temperature rates of each bag with at least 30 readings and 6 minutes."""
     side = _BIN_S * _BINS_PER_SIDE
     result = []
     for readings in recorded:
@@ -160,14 +160,14 @@ def _histories(recorded: Sequence[Readings], noise: float, quantum: float) -> li
         means = (edges[_BINS_PER_SIDE:] - edges[:-_BINS_PER_SIDE]) / side
         rate = (means[_BINS_PER_SIDE:] - means[:-_BINS_PER_SIDE]) / side
         per_side = max(1.0, side * (len(time) - 1) / time[-1])
-        # Rounding errors do not average out while the temperature changes by less than a quantum.
+        # Rounding errors of a temperature that changes by less than a quantum do not average out.
         spread = np.sqrt(2.0 * (noise**2 / per_side + quantum**2 / 12.0))
         result.append(RateHistory(rate, float(spread) / side))
     return result
 
 
 def _slowest_ramp(histories: Sequence[RateHistory], usual: float) -> float:
-    """Return 0.7 times the slowest rate of ramps longer than 10 min, RAMP_K_MIN..usual [K/min]."""
+    """Return 0.7 times the rate of the slowest ramp over 10 min, in RAMP_K_MIN..usual [K/min]."""
     slowest = usual / 0.7
     for history in histories:
         is_ramp = np.abs(history.rate) > max(history.least_ramp, 0.1 / 60.0)
@@ -180,7 +180,7 @@ def _slowest_ramp(histories: Sequence[RateHistory], usual: float) -> float:
 
 
 def _ripple(histories: Sequence[RateHistory], lag_s: float, usual: float) -> float:
-    """Return the amplitude of ripple of the ambient temperature in soaks [K]."""
+    """Return the amplitude of the periodic changes of the case temperature in soaks [K]."""
     rates = [np.zeros(0)]
     for history in histories:
         moving = np.abs(history.rate) > max(0.2 * history.fastest, history.least_ramp)
@@ -192,14 +192,14 @@ def _ripple(histories: Sequence[RateHistory], lag_s: float, usual: float) -> flo
     noise = float(np.median([history.rate_sd for history in histories]))
     swing = float(np.quantile(np.abs(resting - np.median(resting)), 0.95))
     clean = float(np.sqrt(max(swing**2 - (2.0 * noise) ** 2, 0.0)))
-    # Noise may hide a ripple whose rates are up to 3 sd of the noise of the rates: assume such a
-    # ripple, but at most the `usual` ripple.
+    # Noise may hide a ripple whose rates are up to 3 sd of the noise of the rates: assume a ripple
+    # of this amplitude, but at most the `usual` amplitude.
     hidden = min(usual, 3.0 * noise * lag_s)
     return float(np.clip(max(clean * lag_s, hidden), 0.02, 1.0))
 
 
 def gradients_at_rest(bags: Sequence[ReducedBag], sensors: Sequence[str]) -> dict[str, float]:
-    """Return T_sensor - T_board at constant temperature, due to self-heating, by sensor [K]."""
+    """Return T_sensor - T_board of each sensor at constant temperature (by self-heating) [K]."""
     result = {}
     for name in sensors:
         rate, gradient = [np.zeros(0)], [np.zeros(0)]
@@ -224,7 +224,7 @@ def gradients_at_rest(bags: Sequence[ReducedBag], sensors: Sequence[str]) -> dic
 
 
 def slope_of_gradient(gradient: Floats, rate: Floats) -> float:
-    """Return the slope of the gradient over the rate [s], NaN at a constant rate."""
+    """Return the slope of gradients over rates [s]; NaN if all rates are equal."""
     moved = rate - np.mean(rate)
     power = float(moved @ moved)
     return float(moved @ gradient) / power if power > 0.0 else np.nan
@@ -259,10 +259,10 @@ def averaged(
     bag: ReducedBag, detector: DetectorSettings, inputs: Sequence[str], step_s: float
 ) -> tuple[ReducedBag, DetectorSettings]:
     """
-    Average readings over steps of `step_s` if they are at least two per step, as from IMU drivers.
+    Average readings over steps of `step_s` if each step has two or more, as from IMU drivers.
 
     Return the bag with mean readings, and the settings with the noise of a mean reading.
-    `inputs`: thermometers, first the board's; all but the first have the settings of the case.
+    `inputs`: names of thermometers, the board's first; the others have the settings of the case.
     """
     temperatures = {**bag.temperatures}
     settings = [detector.board, detector.case]
@@ -282,7 +282,7 @@ def averaged(
 
 
 def _means(readings: Readings, step: Ints, has_cells: bool) -> Readings:
-    """Average readings in each step; if `has_cells`, keep a step's first and changed readings."""
+    """Average the readings of each step; if `has_cells`, keep its first and changed readings."""
     stamp_ns, value = readings
     is_first = np.diff(step, prepend=-1) != 0
     if has_cells:
@@ -290,11 +290,11 @@ def _means(readings: Readings, step: Ints, has_cells: bool) -> Readings:
         return Readings(stamp_ns[is_first], value[is_first])
     first = np.flatnonzero(is_first)
     least, most = np.minimum.reduceat(value, first), np.maximum.reduceat(value, first)
-    # Where readings differ by an impossible step, the tracker must get the readings themselves.
+    # The tracker tests readings with impossible changes, so these readings are not averaged.
     is_first |= np.repeat(most - least > LARGEST_STEP, np.diff(first, append=len(step)))
     first = np.flatnonzero(is_first)
     n = np.diff(first, append=len(step))
-    # Means of equal readings must be equal, or rounding would hide that readings are constant.
+    # Means of equal readings must be exactly equal, so that a stuck thermometer is recognised.
     after_ns, after = (values - np.repeat(values[first], n) for values in readings)
     mean_ns = stamp_ns[first] + np.add.reduceat(after_ns, first) // n
     return Readings(mean_ns, value[first] + np.add.reduceat(after, first) / n)

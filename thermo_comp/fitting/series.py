@@ -1,20 +1,20 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the base series of the windows (a constant, columns, derivatives of columns, readings), the
-filter that whitens these series for slow noise, and the sums of products of whitened series.
+Owns the base series of the windows (a constant, columns, derivatives of columns, mean samples),
+the filter that whitens these series for slow noise, and sums of products of the whitened series.
 
 All terms of the measurement equation (`equations`) are linear combinations of the base series, so
 the sums of the products of whitened base series in each position are sufficient statistics.
 
-The error of the mean reading of window k in a position is ``c_k + e_k``. e_k is white noise of
-variance ``sigma^2 / weight_k``. c_k is slow noise (`unknowns.Noise`): a stationary first-order
-Gauss-Markov process of variance ``ratio sigma^2`` and correlation time T (IEEE Std 952, Annex
-B.4.3), whose limit for a long T is a random walk; or flicker noise, the bias instability of a
-sensor, which is the sum of Gauss-Markov processes of equal variance with the correlation times T,
-10 T, 100 T and so on [2]_. The innovations of a Kalman filter for the error ``c_k + e_k``, divided
-by their standard deviations, are white and contain all information of a series. Least squares
-with the innovations of readings and columns is therefore the optimal estimator [1]_.
+The mean sample of window k in a position has the error ``c_k + e_k``. e_k is white noise of
+variance ``sigma^2 / weight_k``. The slow noise c_k (`unknowns.Noise`) is one of two kinds. The
+first is a stationary first-order Gauss-Markov process of variance ``ratio sigma^2`` and
+correlation time T (IEEE Std 952, Annex B.4.3); for a long T it is a random walk. The second is
+flicker noise, the bias instability of a sensor: a sum of Gauss-Markov processes of equal variance
+with the correlation times T, 10 T, 100 T and so on [2]_. The innovations of a Kalman filter for
+the error ``c_k + e_k``, divided by their standard deviations, are white and contain all
+information of a series, so least squares with the innovations is the optimal estimator [1]_.
 
 References
 ----------
@@ -42,8 +42,8 @@ class Whitener:
     """
     A Kalman filter that whitens series of window values, separately in each position.
 
-    position, time: index of each window's position, and its time [s]; the windows are sorted by
-        position and time, shape (n,)
+    position: index of each window's position, shape (n,)
+    time: time of each window [s], shape (n,); the windows are sorted by position, then by time
     """
 
     def __init__(self, position: Ints, time: Floats) -> None:
@@ -52,7 +52,7 @@ class Whitener:
         n_steps = int(lengths.max())
         step = np.arange(n_steps)[:, None]
         self._is_there = step < lengths
-        #: Index of the j-th window of each position, in row j; 0 after a position's last window.
+        #: Row j: index of the j-th window of each position; 0 if the position has fewer windows.
         self._row = np.where(self._is_there, starts + step, 0)
         self._n = len(position)
         since = np.diff(time[self._row], axis=0, prepend=time[self._row[:1]])
@@ -72,8 +72,8 @@ class Whitener:
         self.n_flicker = 1 + math.ceil(math.log10(max(span_s / (3.0 * typical_s), 1.0)))
 
     def shows(self, time_s: float) -> bool:
-        """Whether a search may try a correlation time: from `times_s[0]` to `_longest_s`."""
-        # Rounding must not exclude the shortest correlation time.
+        """Whether a search may try this correlation time: from `times_s[0]` to `_longest_s`."""
+        # The factors 0.999 and 1.001 include both limits in spite of rounding errors.
         shortest_s = 0.999 * self.times_s[0] if self.times_s else math.inf
         return shortest_s < time_s < 1.001 * self._longest_s
 
@@ -83,8 +83,8 @@ class Whitener:
         """
         Run the Kalman filter over series, (n, m), for k noises with equal numbers of processes.
 
-        Yields for step j: index of the j-th window of each position, whether the position has j
-        windows, innovations, (k, n_positions, m), and their variances [sigma^2], (k, n_positions).
+        Step j yields the index of the j-th window of each position, whether the position has this
+        window, innovations, (k, n_positions, m), and their variances [sigma^2], (k, n_positions).
         """
         times_s = np.array([[noise.times_s] for noise in noises])
         # Stationary covariance of the processes, which are independent of each other.
@@ -104,7 +104,7 @@ class Whitener:
             covariance = covariance - gain[..., None] * shared[..., None, :]
 
     def filter(self, series: Floats, weight: Floats, noise: Noise) -> Floats:
-        """Return series, shape (n, m), whitened for `noise`."""
+        """Return series whitened for `noise`, which are innovations / their sd, (n, m)."""
         if noise.ratio <= 0.0:
             return np.asarray(series * (1.0 / np.sqrt(1.0 / weight))[:, None])
         result = np.empty_like(series)
@@ -113,7 +113,7 @@ class Whitener:
         return result
 
     def log_determinant(self, weight: Floats, noise: Noise) -> float:
-        """Return the log determinant of the noise covariance, in units of sigma^2."""
+        """Return the log determinant of the windows' noise covariance / sigma^2."""
         steps = self._innovations(np.empty((self._n, 0)), weight, [noise])
         return float(sum(np.log(total[0, is_there]).sum() for _, is_there, _, total in steps))
 
@@ -125,7 +125,7 @@ class Whitener:
         over the white variance of each axis. White noise is returned unless slow noise raises
         twice the log likelihood by 9.2, the 1 % point of a chi-square with two degrees of freedom.
         """
-        # Ratios to try of the Gauss-Markov variance to the white variance of a window.
+        # Candidate ratios of the Gauss-Markov variance to the white variance of a window.
         ratios = 10.0 ** np.arange(-2.5, 3.6, 0.5)
         candidates = [Noise(float(ratio), time_s) for time_s in self.times_s for ratio in ratios]
         if not candidates:
@@ -153,7 +153,7 @@ class Whitener:
 
 
 def _vertex(values: Floats, at: int) -> float:
-    """Return the place of a parabola's minimum by three values, less `at`; 0 without minimum."""
+    """Return the minimum's index, less `at`, of a parabola through 3 values; 0 if it has none."""
     if not 0 < at < len(values) - 1:
         return 0.0
     before, here, after = values[at - 1 : at + 2].tolist()
@@ -164,15 +164,16 @@ def _vertex(values: Floats, at: int) -> float:
 @dataclass(frozen=True)
 class Base:
     """
-    The order of the base series, for given active columns: the constant 1; the columns; for each
-    column with a lag its derivative w.r.t. the initial state of the lag; the temperature t of the
-    nonlinear terms, if the fit has such terms; the functions `Windows.tilt`; the readings of the
-    three axes less their mean in the position.
+    The order of the base series for given active columns.
+
+    The order is: the constant 1; the columns; for each column with a lag its derivative w.r.t. the
+    initial state of the lag; the temperature t of nonlinear terms, if the fit has nonlinear terms;
+    the functions `Windows.tilt`; the mean samples of three axes less their mean in the position.
 
     columns: indices of the active columns among all columns
-    lagged: places in `columns` of the columns with a lag; lag: index of each of these lags
-    at_start, t, tilts, measured: places, among the base series, of the derivatives w.r.t. initial
-        lag states, of t (shape (1,) or (0,)), of the functions `Windows.tilt`, and of the readings
+    lagged: indices, within `columns`, of the columns with a lag; lag: index of each one's lag
+    at_start, t, tilts, measured: indices, among the base series, of the derivatives w.r.t. initial
+        lag states, of t (shape (1,) or (0,)), of `Windows.tilt`, and of the mean samples
     """
 
     columns: Ints
@@ -185,7 +186,7 @@ class Base:
 
     @classmethod
     def of(cls, columns: Ints, lags: Ints, n_t: int, n_tilts: int) -> Base:
-        """Assign indices to base series; `lags`: index of each column's lag, -1 for none."""
+        """Assign indices to base series; `lags`: index of each column's lag, -1 if it has none."""
         lagged = np.flatnonzero(lags[columns] >= 0)
         counts = 1 + len(columns), len(lagged), n_t, n_tilts, 3
         _, *places = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
@@ -201,8 +202,7 @@ class Base:
 class Products:
     """
     Sums over windows of the products of all pairs of whitened base series. A cell of `Products`
-    (not of samples) is the set of the windows of one position in one section of the chamber
-    program.
+    (not of samples) has the windows of one position in one section of the chamber program.
 
     base: order of the base series
     means: mean of each base series, not whitened, in each position, shape (n_positions, n_base)
@@ -222,7 +222,7 @@ class Products:
         return np.asarray(np.add.reduceat(self.cells, self.first, axis=0))
 
     def without(self, sections: Ints) -> Floats:
-        """Return the sums of products over each position without the given sections."""
+        """Return the sums of products over each position, less the cells of `sections`."""
         result: Floats = self.of_positions.copy()
         left_out = np.flatnonzero(np.isin(self.section, sections))
         position = np.searchsorted(self.first, left_out, side='right') - 1
@@ -232,8 +232,8 @@ class Products:
 
 class Series:
     """
-    The values of the base series (such as columns and readings) in the windows of a fit, and the
-    sums of products of these series. Nominal scale factors convert the readings to m/s^2.
+    The values of the base series (such as columns and mean samples) in the windows of a fit, and
+    the sums of products of these series. Nominal scale factors convert mean samples to m/s^2.
 
     windows: the data of the fit
     nominal_scale: nominal scale factors [input units per m/s^2], shape (3,)
@@ -249,12 +249,12 @@ class Series:
         self.columns = windows.columns / self.rms
         self.bag_of_position = windows.bag_of_position
         self.n_bags = int(windows.bag.max()) + 1
-        # Derivatives below 1e-9 are set to 0, because arithmetic with denormal numbers is slow.
+        # Arithmetic with denormal numbers is slow, so derivatives below 1e-9 are set to 0.
         self._starts = np.where(np.abs(windows.start) < 1e-9, 0.0, windows.start) / self.rms
         values, vectors = np.linalg.eigh(windows.start_covariance)
         # The initial lag states are so correlated that few principal components suffice.
         kept = values > 1e-6 * values.max(initial=0.0)
-        #: Root of the prior covariance of the initial lag states, shape (n_lags, r).
+        #: Matrix square root of the prior covariance of the initial lag states, (n_lags, r).
         self.start_root = vectors[:, kept] * np.sqrt(values[kept])
         self._first = windows.edges[:-1]
         self.level = self._averaged(self.measured)
@@ -281,7 +281,7 @@ class Series:
         self.noise_determinant = self.whitener.log_determinant(self.weight, noise)
 
     def products(self, used: Bools) -> Products:
-        """Return the sums of products, with the columns `used`, (2, m), for the current noise."""
+        """Return sums of products for the noise set; `used`: columns of bias and scale, (2, m)."""
         active = np.flatnonzero(used.any(axis=0))
         if self._products is None or not np.array_equal(self._products.base.columns, active):
             base = Base.of(active, self.windows.lag, self._n_t, self.windows.tilt.shape[1])
@@ -295,8 +295,8 @@ class Series:
 
     def products_of(self, columns: Ints, base: Base, state: State) -> tuple[Floats, Floats]:
         """
-        For the initial lag states of `state`, return the sums of products of k columns with each
-        other, (n_positions, k, k), and of k columns with base series, (n_positions, k, n_base).
+        Return sums of products of k columns with each other, (n_positions, k, k), and with base
+        series, (n_positions, k, n_base); the columns have the initial lag states of `state`.
         """
         values, lag = self.columns[:, columns], self.windows.lag[columns]
         lagged, start = lag >= 0, (state.start @ self.start_root.T)[self.windows.bag]
@@ -323,8 +323,8 @@ class Series:
 
     def at_starts(self, rows: Floats, state: State, base: Base) -> Floats:
         """
-        Convert linear functions of the base series, (n_positions, k, n_base), from columns with
-        initial lag states at the prior mean to columns with the initial lag states of `state`.
+        Convert linear functions of the base series, (n_positions, k, n_base), whose columns have
+        initial lag states 0 (the prior mean), to the initial lag states of `state`.
         """
         if not len(base.lagged):
             return rows  # the memory layout of a copy would change the last bits of products

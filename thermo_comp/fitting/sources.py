@@ -3,9 +3,9 @@
 """
 Owns the input of a fit: sources of blocks of accelerometer samples and temperature readings.
 
-Bags, tables and simulated runs all give blocks of the type `Block` to fit and compensator. If |f|
-of a bag is not g, the user or the bag's metadata state it: as a single value, as a table of time
-sections, or by a rotation rate and a radius.
+Bags, tables and simulated runs all give blocks of the type `Block` to fit and compensator. The
+user or a bag's metadata state a |f| that is not g: as a single value, as a table of time sections,
+or by a rotation rate and a radius.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ RADIUS, RADIUS_SD = 'rotation_radius_m', 'rotation_radius_sd_m'
 
 
 class Section(NamedTuple):
-    """A part of a bag, in seconds since the bag's first sample, with |f| and its sd [m/s^2]."""
+    """Times since a bag's first sample [s], with |f| between them (`size`) and its sd [m/s^2]."""
 
     begin_s: float
     end_s: float
@@ -49,8 +49,8 @@ class Magnitude(NamedTuple):
     The known |f| of a rest, ``hypot(still, spin)`` [m/s^2].
 
     still: |f| without the rotation
-    spin: centripetal acceleration w^2 r at the stated radius
-    sd: sd of |f|, except for the error of the radius
+    spin: centripetal acceleration w^2 r at the stated radius r and the rotation rate w
+    sd: sd of |f| without the effect of the radius's error
     """
 
     still: float
@@ -66,11 +66,11 @@ class Magnitude(NamedTuple):
 @dataclass(frozen=True)
 class KnownForce:
     """
-    The known |f| of a bag over time; outside the sections |f| is gravity.
+    The known |f| of a bag over time: in `sections` (else |f| is gravity), or due to a rotation.
 
-    stamp_ns, rate: readings of the rotation rate [rad/s], about a vertical axis
-    radius, radius_sd: distance of the unit from the axis and its sd [m]; if the sd is 0, the
-        radius is not estimated
+    stamp_ns, rate: measurements of the rotation rate [rad/s], about a vertical axis
+    radius, radius_sd: distance of the unit from the axis and its sd [m]; the fit does not estimate
+        a radius with the sd 0
     """
 
     name: str
@@ -109,9 +109,9 @@ class KnownForce:
 @dataclass(frozen=True)
 class ForceOptions:
     """
-    The user's options about |f|.
+    The user's options that state |f|.
 
-    magnitude: |f| as a value with unit, or the path of a table
+    magnitude: |f| as a value with unit, or the path of a table of |f|
     rotation: topic of the rotation rate, as TOPIC or TOPIC:FIELD
     radius, radius_sd: distance of the unit from the rotation axis and its sd [m]
     """
@@ -129,7 +129,7 @@ class ForceOptions:
 
 
 def angular_velocity(block: object) -> Floats | None:
-    """Return the angular rate [rad/s] of a block of Imu messages; None if absent or all 0."""
+    """Return the angular rate [rad/s] in a block of Imu messages; None if it is absent or 0."""
     imu = getattr(block, 'imu', None)
     if imu is None or (imu.angular_velocity_covariance[:, 0] == -1.0).any():
         return None
@@ -161,8 +161,8 @@ def fit_sources(
     """
     Make sources of recordings; a fit opens each recording again.
 
-    Raises RecordingError if a recording cannot be read or lacks a topic, and FitError if a
-    recording is given twice, or if some recordings have counts and some have Imu messages.
+    Raises RecordingError if a recording cannot be read or lacks a topic. Raises FitError if a
+    recording is given twice, or if some recordings have counts and the others Imu messages.
     """
     sources: list[FitSource] = []
     kinds: dict[str, str] = {}
@@ -193,7 +193,7 @@ def recording_source(
     """
     Make a source of a recording; each iteration over its blocks opens the recording again.
 
-    `require`: topics that must exist; `force`: options about |f|, which replace the bag's metadata
+    `require`: roles whose topics must exist; `force`: options for |f|, instead of the metadata
     """
     path = Path(path)
     with open_recording(path, topics, require=require) as reader:
@@ -232,7 +232,7 @@ def digest(path: Path) -> str:
 
 def known_force(path: Path, info: RecordingInfo, asked: ForceOptions) -> KnownForce | None:
     """
-    Return the known |f| of a bag from the options (`asked`) or its metadata; None if |f| is g.
+    Return |f| of a bag from the options `asked`, else from its metadata; None if |f| is g.
 
     Raises FitError for a stated |f| that cannot be parsed, and for a rotation topic without data.
     """
@@ -261,7 +261,7 @@ def known_force(path: Path, info: RecordingInfo, asked: ForceOptions) -> KnownFo
 def parse_sections(text: str) -> tuple[Section, ...]:
     """
     Read |f| [m/s^2] from a text: one line ``MAGNITUDE [SD]``, or lines of ``BEGIN END MAGNITUDE
-    [SD]``, with times since the bag's first sample [s]. A ; ends a line, a # begins a comment.
+    [SD]`` with times since the bag's first sample [s]. A ; ends a line, a # begins a comment.
     """
     lines = text.replace(',', ' ').replace(';', '\n').split('\n')
     rows = [_numbers(words) for line in lines if (words := line.split('#')[0].split())]
@@ -315,7 +315,7 @@ def _asked_sections(text: str, path: Path) -> tuple[Section, ...]:
     mine: list[str] = []
     for line in content.splitlines():
         first, _, rest = line.strip().replace(',', ' ').partition(' ')
-        # 01.mcap and run_* are names of bags; 10s is no name, but a number with its unit.
+        # A first word such as 01.mcap or run_* is a bag's name; 10s is a number with its unit.
         if not first or first[0] == '#' or not re.search(r'[A-Za-z_*?]{2}|[*]', first):
             mine.append(line)
         elif fnmatch(path.name, first):
@@ -329,7 +329,7 @@ def _asked_sections(text: str, path: Path) -> tuple[Section, ...]:
 
 
 def _rotating(path: Path, info: RecordingInfo, asked: ForceOptions) -> KnownForce:
-    """Read the rotation rate of a bag; return the known |f|, from this rate and the radius."""
+    """Read the rotation rate of a bag, and combine it with the radius to the known |f|."""
     wanted, field = split_field(asked.rotation or '')
     names = [name for name in info.topics if is_called(name, wanted)]
     if len(names) != 1:

@@ -4,10 +4,10 @@
 Owns ranges of temperatures, rates and gradients in a fit's data, the lag of the board, and the
 error of an axis at temperatures at which no position has gravity along this axis.
 
-A scale factor has an effect on the readings only if gravity acts along its axis. A recording in
+A scale factor has an effect on the samples only if gravity acts along its axis. A recording in
 one attitude at new temperatures extends the temperature range of the calibration, but determines
-only the scale factor of the vertical axis at these temperatures. The scale factors of the
-horizontal axes are extrapolated; the error of this extrapolation is added to the lack of fit.
+only the scale factor of the vertical axis at the new temperatures. The scale factors of the
+horizontal axes are extrapolated; the error of the extrapolation is added to the lack of fit.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ def union(ranges: Iterable[Range]) -> Range:
 
 def valid_range(values: Floats, smallest_margin: float, order: int = 0) -> Range:
     """
-    Return the valid range of a quantity: the range of its values with a margin. If the quantity is
-    proportional to a power (`order`) of a heat flow, and so of the rate of a ramp, the range is
-    extended by the factor 2^order to ramps of twice the rate.
+    Return the valid range of a quantity: the range of its values with a margin. A quantity
+    proportional to a power `order` of the ramp rate is valid in ramps of twice the rate: its range
+    is extended by the factor 2^order.
     """
     ratio = 2.0**order
     lower, upper = float(np.min(values)), float(np.max(values))
-    # The margin of 2 % of the span allows for the noise of thermometers in use.
+    # The margin of 2 % of the range allows for the noise of thermometers in use.
     margin = max(0.02 * (upper - lower), smallest_margin)
     lower, upper = lower - margin, upper + margin
     return min(lower, ratio * lower), max(upper, ratio * upper)
@@ -50,25 +50,25 @@ def valid_range(values: Floats, smallest_margin: float, order: int = 0) -> Range
 
 def temperature_range(windows: ThermalWindows) -> Range:
     """Return the valid range of board temperatures [degC]."""
-    # A calibration from one temperature is valid within 0.5 K of this temperature; a calibration
-    # without thermometer within 50 K, as its covariance includes an unknown slope.
+    # A calibration from one temperature is valid within 0.5 K of this temperature. A calibration
+    # without a thermometer is valid within 50 K, as its covariance includes an unknown slope.
     return valid_range(windows.temperature, 0.5 if windows.was_measured else 50.0)
 
 
 def soak_gradient(windows: ThermalWindows, earlier: Calibration | None) -> Range | None:
     """
-    Return the gradient of the first sensor in soaks and its robust scatter [K], from the prior
-    calibration `earlier` if it states them, else from the windows; None without sensor or soak.
+    Return the gradient of the first sensor in soaks, and the sd of its scatter [K]: the values of
+    the prior `earlier` if it has them, else of the windows; None without sensor or soak.
     """
     if earlier is not None and earlier.soak_gradient_k is not None:
         return earlier.soak_gradient_k
     rate = 60.0 * np.abs(windows.rate)
-    # If the rate is noisy, the tenth of the windows with the smallest rates counts as a soak.
+    # For noisy rates, the tenth of the windows with the smallest rates is taken as a soak.
     slowest = max(0.2 * RAMP_K_MIN, float(np.quantile(rate, 0.1)))
     is_soak = rate <= slowest
     if not windows.gradient.any() or slowest > RAMP_K_MIN or is_soak.sum() < 5:
         return None
-    # The rates in a soak differ from 0: fit a line over the rate to get the gradient at rate 0.
+    # Rates in a soak are not exactly 0: fit a line over the rate to get the gradient at rate 0.
     gradient, by_rate = windows.gradient[is_soak], np.vander(windows.rate[is_soak], 2)
     slope, middle = np.linalg.lstsq(by_rate, gradient, rcond=None)[0].tolist()
     scatter = np.abs(gradient - by_rate @ (slope, middle))
@@ -81,10 +81,9 @@ def rest_gradient_range(
     """
     Return the valid range of the first sensor's gradient at rate 0, ``gradient - lag_s * rate``.
 
-    The result includes the range of a prior calibration, `earlier`. The windows give no range
-    without the sensor, without ramps (which determine the lag), or if their range would exceed
-    +-100 K, as for bags too short for a rate. The result is None if neither prior nor windows give
-    a range.
+    The result includes the range of the prior calibration `earlier`. The range of the windows is
+    ignored if there is no sensor, if there are no ramps (which determine the lag), or if the range
+    exceeds +-100 K, as for bags too short for a rate. The result is None if no range remains.
     """
     lower, upper = valid_range(windows.gradient - lag_s * windows.rate, 0.01)
     is_small = max(-lower, upper) < 100.0
@@ -95,7 +94,7 @@ def rest_gradient_range(
 
 
 def measured_board_lag(windows: ThermalWindows) -> float:
-    """Return the lag of the board behind the case [s], NaN without ramps or a case temperature."""
+    """Return the lag of the board behind the case [s]; NaN without ramps or case temperature."""
     return slope_of_gradient(windows.gradient, windows.rate) if _has_gradients(windows) else np.nan
 
 
@@ -106,7 +105,7 @@ def _has_gradients(windows: ThermalWindows) -> bool:
 
 
 def usable_board_lag(windows: ThermalWindows) -> float:
-    """Return the board's lag behind the case [s]; a usual lag if the slope is not in 1..1e5 s."""
+    """Return the board's lag behind the case [s]; the usual lag if it is not in 1..1e5 s."""
     lag = slope_of_gradient(windows.gradient, windows.rate)
     return lag if 1.0 <= lag <= 1e5 else USUAL_BOARD_LAG_S
 
@@ -117,14 +116,14 @@ def with_unseen_axes(
     """
     Add the error of extrapolated scale factors to the lack of fit of each regime, `lacks`.
 
-    `earlier`: calibration used as prior, or None. At temperatures at which no position of the bags
-    determines the scale of an axis, `earlier` gives the least value of the axis' lack of fit.
+    `earlier`: calibration used as prior, or None. The lack of fit of `earlier` is the least value
+    for an axis at temperatures at which no position of the bags has gravity along the axis.
     """
     (lower, upper), (new_lower, new_upper) = _determined_ranges(fit, earlier), _seen(fit, None)
     slope = _unknown_slope(fit) * fit.regression.gravity
     ends = _ends(fit, earlier)
-    # The variance of an extrapolated scale factor is quadratic in temperature, but is interpolated
-    # linearly between stated temperatures, so five temperatures are stated.
+    # A calibration interpolates variances of the lack of fit linearly, but the variance of an
+    # extrapolated scale factor is quadratic in temperature: state it at five temperatures.
     between = [
         np.linspace(edge, end, 5)
         for edge, end in zip((lower.max(), upper.min()), ends, strict=True)
@@ -168,8 +167,8 @@ def judge_unseen_axes(fit: Fit, earlier: Calibration | None) -> list[Finding]:
 def _determined_ranges(fit: Fit, earlier: Calibration | None) -> Floats:
     """
     Return the range of board temperature, shape (2, 3) [degC], in which the scale factor of each
-    axis has no added error. The range of an axis along which no position has gravity is infinite:
-    the prior sd of its scale factor includes the error of extrapolation.
+    axis has no error of extrapolation. An axis along which no position has gravity has an infinite
+    range: the prior sd of its scale factor includes the error of extrapolation.
     """
     lower, upper = _seen(fit, earlier)
     # The temperature ranges of the positions of one test differ by about a tenth of the range.
@@ -181,10 +180,10 @@ def _determined_ranges(fit: Fit, earlier: Calibration | None) -> Floats:
 def _seen(fit: Fit, earlier: Calibration | None) -> Floats:
     """
     Return for each axis the lowest and the highest board temperature of the positions with gravity
-    along the axis, and of a prior calibration, shape (2, 3) [degC]; (inf, -inf) if none has any.
+    along the axis, and of a prior, shape (2, 3) [degC]; (inf, -inf) without prior and position.
     """
     temperature = fit.windows.temperature[:, np.newaxis]
-    # At 0.5 g along an axis, |f| has a quarter of the relative error of the axis' scale factor.
+    # With 0.5 g along an axis, |f| has a quarter of the relative error of the axis' scale factor.
     is_along = np.abs(fit.posterior.state.up) >= 0.5
     is_seen = is_along[fit.windows.data.position]
     lower = np.where(is_seen, temperature, np.inf).min(axis=0)
@@ -196,7 +195,7 @@ def _seen(fit: Fit, earlier: Calibration | None) -> Floats:
 
 
 def _ends(fit: Fit, earlier: Calibration | None) -> Range:
-    """Return the lowest and the highest board temperature of all windows and of a prior [degC]."""
+    """Return the lowest and highest board temperatures of the windows and the prior [degC]."""
     temperature = fit.windows.temperature
     ranges = [regime.temperature_range_c for regime in earlier.regime_sets()] if earlier else []
     return union([(float(temperature.min()), float(temperature.max())), *ranges])
@@ -211,7 +210,7 @@ def _unknown_slope(fit: Fit) -> float:
 
 
 def _variance(points: Sequence[LackOfFit], at: Floats) -> Floats:
-    """Return the variance of a lack of fit at board temperatures `at`, shape (n, 3)."""
+    """Return variances of a lack of fit at board temperatures `at`, (n, 3) [(m/s^2)^2]."""
     if not points:
         return np.zeros((len(at), 3))
     celsius = [point.temperature_c for point in points]

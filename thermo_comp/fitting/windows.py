@@ -3,8 +3,8 @@
 """
 Owns the table of windows and columns of the regression, made from the statistics of bags.
 
-Fit and compensator use the same thermal tracker and the same columns, of `unit.columns`, so a
-column has the same values in the fit and online; if readings are averaged (`sensors.averaged`),
+The fit and the compensator use the same thermal tracker and the columns of `unit.columns`, so a
+column has the same values in both; if the fit averages temperature readings (`sensors.averaged`),
 the values agree within the noise of a reading.
 """
 
@@ -33,12 +33,12 @@ from .reduction import ReducedBag, StillInterval
 from .sensors import averaged, readings_in_order
 from .unknowns import Windows
 
-#: Groups of columns: the curve, the difference of the static and dynamic sets, bends (changes of
-#: slope at a temperature), and the curves over the temperatures of parts.
+#: Groups of columns: the static curve, its difference from the dynamic curve, changes of the slope
+#: of the curve at one temperature, and the curves over the temperatures of parts.
 CURVE, SET, BEND, PART = 'curve', 'set', 'bend', 'part'
-#: `LAGS`: groups of columns linear in a difference of temperatures. `PRODUCTS`: groups of the lag
-#: times powers of the temperature, and of the square and cube of the lag. A curve over a part's
-#: temperature is a sum of columns of the curve over board temperature, 'board' and `PRODUCTS`.
+#: `LAGS`: groups of columns linear in a difference of temperatures. `PRODUCTS`: groups of products
+#: of a lag and powers of the temperature, and of squares and cubes of a lag. A curve over a part's
+#: temperature is a sum of columns of the groups `CURVE`, 'board' and `PRODUCTS`.
 LAGS, PRODUCTS = ('gradient', 'board', 'gradient_lag'), ('product', 'square')
 #: Number of windows into which a short rest is divided, to determine the noise of the rest.
 FEWEST_WINDOWS = 20
@@ -50,9 +50,9 @@ N_SECTIONS = 6
 @dataclass(frozen=True)
 class Sets:
     """
-    Families of the curves of the static and the dynamic set; their coefficients are not used.
+    Function families of the static and the dynamic curve; the functions' coefficients are unused.
 
-    is_shared: whether the dynamic curve is the static curve plus a difference, no separate curve
+    is_shared: whether the fitted dynamic curve is the static curve plus a fitted difference
     """
 
     static: TemperatureFunction
@@ -79,7 +79,7 @@ class Sets:
 
     @property
     def level(self) -> int:
-        """Index of the column of the dynamic set's level: this column is the set's weight w."""
+        """Index of the column of the dynamic set's level; its values are the weight of the set."""
         return self.static.n_free
 
 
@@ -91,7 +91,7 @@ class Model:
     name: name of the model in the provenance
     parts: the lag of the part of each axis, or None in a model without one lag per axis
     sensors: thermometers other than the board's; the first is the case thermometer
-    range_c: board temperatures of the windows in use [degC]; a rest wholly outside is used, too
+    range_c: board temperatures of windows used [degC]; a rest with no window inside is used whole
     """
 
     name: str
@@ -117,14 +117,14 @@ class Model:
     @cached_property
     def part_sums(self) -> Floats:
         """
-        The powers x, x^2 and x^3 of the temperature x of each axis's part, as sums of columns:
-        factors of the m columns of sets and response, shape (9, m), in the order of axes, then of
-        powers; (0, m) without `parts`, without a needed column, or if the sets share no cubic.
+        Factors that combine the model's m columns to powers of a part's temperature, (9, m).
 
-        The temperature of a part less the reference is ``x = t - m``, with the board temperature t
-        and the part's lag m. x^p is a sum of t^p, t^(p-1) m, ..., m^p (binomial theorem), so one
-        weight per power describes a curve over x. If all bags repeat one warm-up, m is a function
-        of t, and the data would not determine separate weights of t^p, t^(p-1) m, ..., m^p.
+        Rows: powers x, x^2, x^3 for axis x, then for y, z. No rows if `parts` is None, if a column
+        is missing, or if the sets share no cubic. The temperature of a part less the reference is
+        ``x = t - m``: board temperature less reference, less the part's lag m. x^p is a sum of
+        t^p, t^(p-1) m, ..., m^p (binomial theorem), so one weight per power describes a curve over
+        x. If all bags repeat one warm-up, m is a function of t, and the data would not determine
+        separate weights of t^p, t^(p-1) m, ..., m^p.
         """
         static, n_curves = self.sets.static, len(self.sets.groups)
         n_columns = n_curves + len(self.columns)
@@ -150,8 +150,8 @@ class Track(NamedTuple):
 
     start_s, step_s: start and step of the time grid [s]
     states: thermal states, shape (n, width); is_known: which states are valid, shape (n,)
-    settled_s: time from which the estimate of the board temperature is accurate [s]: until coarse
-        readings first change, the error of the estimate is up to a step of the readings
+    settled_s: time from which the estimate of the board temperature is accurate [s]: before coarse
+        readings first change, the estimate may be wrong by the resolution of the readings
     """
 
     start_s: float
@@ -175,7 +175,7 @@ class ThermalWindows:
     temperature, rate, weight: board temperature [degC] and its rate [K/s]; weight of the dynamic
         set; each of shape (n,)
     gradient: T_case - T_board [K], shape (n,)
-    raw: values u of the response's columns, without limits and powers of temperature, (n, k)
+    raw: values of the response's columns before limits and powers of temperature apply, (n, k)
     angular_rate: mean angular rate [rad/s], shape (n, 3), or (n, 0) if a bag has no angular rate
     typical_count: median number of samples of a window
     rests: bag and interval of each position
@@ -207,13 +207,13 @@ class ThermalWindows:
 
     @property
     def has_soaks(self) -> bool:
-        """Whether >= 5 % of the windows are static, and span half of the temperature range."""
+        """Whether >= 5 % of windows are static and they span half the range of temperatures."""
         is_short = self.static_span < 0.5 * float(np.ptp(self.temperature))
         return bool(np.mean(self.is_dynamic) <= 0.95) and not is_short
 
     @property
     def was_measured(self) -> bool:
-        """Whether a temperature was recorded, even if it is constant over the bags."""
+        """Whether a board temperature was recorded, even if it is constant over the bags."""
         return self.has_temperature or bool(self.data.columns[:, 0].any())
 
     @property
@@ -228,7 +228,7 @@ class _Rows(NamedTuple):
 
     thermal: board temperature [degC] and variance of its estimate [K^2], rate [K/s], weight of the
         dynamic set, gradient [K], and the k columns `ThermalWindows.raw`, shape (n, 5 + k)
-    columns: values of the columns, as in `Windows`
+    columns: values of the columns of sets and response, shape (n, m)
     start: derivatives of the k response columns w.r.t. the initial states of their lags, (n, k)
     angular_rate: mean angular rate [rad/s], shape (n, 3) or (n, 0)
     """
@@ -248,9 +248,9 @@ def thermal_windows(
     """
     Combine the windows of all bags with the columns of their thermal states.
 
-    Windows are left out before the board's first reading, while the estimate of the board
-    temperature settles, and while readings of a thermometer are missing. A bag without any
-    board temperature is taken to be at the reference temperature, where all columns are 0.
+    Windows before the board's first reading, while the estimate of the board temperature settles,
+    or while a thermometer gives no readings, are not used. A bag without any board temperature is
+    taken to be at the reference temperature, where all columns are 0.
 
     `tracks`: thermal states of the bags, if already computed with the detector of `model`
     """
@@ -310,8 +310,8 @@ def _rows(
     table: ColumnTable,
 ) -> _Rows:
     """
-    Average the windows of a rest selected by `use` to windows of 60 s, shorter in a short rest.
-    `states`: thermal states, (width, n); `begin_s`: time of the initial lag states [s]
+    Average the windows of a rest for which `use` is True to windows of 60 s (shorter if the rest
+    would give fewer than 20). `states`: (width, n); `begin_s`: time of the initial lag states [s]
     """
     time, count = interval.time[use], interval.count[use]
     window_s = min(60.0, float(time[-1] - time[0]) / (FEWEST_WINDOWS - 1) or 60.0)
@@ -350,15 +350,15 @@ def _windows(
     tilt = np.column_stack((t, gradient, (t + gradient) ** 2))
     tilt_rms = np.sqrt(np.mean(tilt**2, axis=0))
     is_tilting = tilt_rms > 0.0
-    # The level of the dynamic set has no weight in the scale, as the relative scale is 1 at the
-    # reference temperature in both regimes; terms without `has_scale` act on the bias only.
+    # The dynamic set's level acts on the bias only, as the relative scale is 1 at the reference
+    # temperature in both regimes; terms without `has_scale` act on the bias only, too.
     in_scale = [True] * n_curves + [c.term.has_scale for c in columns] + [True] * len(sums)
     in_scale[model.sets.level] = False
     start = np.hstack((np.zeros((len(t), n_curves)), rows.start))
     lag = np.array([-1] * n_curves + [lags.get(c.source, -1) for c in columns], np.int64)
     of_part = rows.columns @ sums.T
     kelvins = _kelvins(model, rows.columns, rows.thermal[:, 5:], t, gradient)
-    # A curve over a part's temperature is a sum of columns without a lag, or with this part's lag.
+    # All columns with a lag in the curve over a part's temperature have this part's lag.
     lag_of_part = np.where(sums != 0.0, lag, -1).max(axis=1, initial=-1)
     settled = _settled(model, spec, rows, table)
     return Windows(
@@ -384,7 +384,7 @@ def _windows(
 
 
 def _settled(model: Model, spec: MemorySpec, rows: _Rows, table: ColumnTable) -> Floats:
-    """Return the columns at 9 board temperatures over the windows' range, with lags settled."""
+    """Return the columns with all lags 0, at 9 board temperatures from lowest to highest."""
     board, is_static = rows.thermal[:, 0], rows.thermal[:, 3] <= 0.5
     some = is_static if is_static.any() else np.ones_like(is_static)
     states = np.zeros((StateLayout(spec).width, 9))
@@ -406,14 +406,14 @@ def _sections(position: Ints, time: Floats) -> Ints:
 
 
 def _kelvins(model: Model, values: Floats, raw: Floats, t: Floats, gradient: Floats) -> Floats:
-    """Return `Windows.kelvins`, the RMS / largest slope over temperature of columns [K], (m,)."""
+    """Return each column's RMS divided by its largest slope over temperature [K], shape (m,)."""
     farthest = float(np.abs(t).max(initial=0.0))
     flow = float(np.sqrt(np.mean(gradient**2))) or 1.0
     grid = np.linspace(float(t.min()), float(t.max()) + 1e-9, 100)
     curves = model.sets.columns(grid, np.full_like(grid, 0.5))
     steepest = [float(np.abs(np.gradient(curve, grid)).max()) for curve in curves]
     rms = np.sqrt(np.mean(values**2, axis=0))
-    # The slope of the dynamic set's weight w over temperature counts as 1 / RMS gradient.
+    # The slope of the dynamic set's weight over temperature is taken as 1 / RMS gradient [1/K].
     steepest[model.sets.level] = 1.0 / flow
     for column, series in zip(model.columns, raw.T, strict=True):
         steepest.append(column.term.steepest(column, series, flow) * farthest**column.power)
@@ -422,7 +422,7 @@ def _kelvins(model: Model, values: Floats, raw: Floats, t: Floats, gradient: Flo
 
 
 def _part_kelvins(values: Floats) -> Floats:
-    """Return RMS / largest slope [K] of each power x^p in `Model.part_sums`, shape (9,)."""
+    """Return RMS / largest slope [K] of each power of a part's temperature, shape (9,)."""
     power = np.tile((1, 2, 3), values.shape[1] // 3)
     # The largest slope of x^p is p |x|^(p - 1) at the largest |x|.
     largest = np.repeat(np.abs(values[:, ::3]).max(axis=0, initial=0.0), 3)
@@ -431,10 +431,10 @@ def _part_kelvins(values: Floats) -> Floats:
 
 
 def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
-    """Run the thermal tracker over the readings of a bag; store its state 5 times per window."""
+    """Run the thermal tracker over the readings of a bag; sample its state 5 times per window."""
     spec = replace(spec, lags=(), plays=())
     if not len(bag.board.value):
-        # Without readings the temperature counts as the reference for 1e9 s: all lags are 0.
+        # Without readings the temperature is taken as the reference since 1e9 s: all lags are 0.
         still = np.zeros((2, StateLayout(spec).width))
         still[:, BOARD] = model.reference_temperature
         end_s = 1.0 + (bag.end_ns - bag.start_ns) * 1e-9
@@ -442,8 +442,8 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
     lengths_s = (float(np.median(np.diff(i.time))) for i in bag.intervals if len(i.time) > 1)
     step_s = max(min(lengths_s, default=1.0) / 5.0, 0.1)
     inputs = spec.inputs
-    # A reading needs more computing time than a state, so readings are averaged over two steps,
-    # unless a mean over more than 8 s would delay the dynamic regime.
+    # A reading costs more computing time than a sample of the state, so readings are averaged over
+    # two steps, but over one step if two exceed 8 s, which would delay the dynamic regime.
     mean_s = 2.0 * step_s if step_s <= 4.0 else step_s
     bag, detector = averaged(bag, model.detector, inputs, mean_s)
     config = ThermalConfig()
@@ -457,7 +457,7 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
     reading = next(readings, None)
     for stamp_ns in range(begin_ns, max(bag.end_ns, begin_ns) + step_ns, step_ns):
         # As in the node, a state depends on all readings stamped up to the state's stamp. A mean
-        # has the mean stamp of its readings; some readings may be a step later than the state.
+        # of readings has their mean stamp, so some of these may be later than the state.
         while reading is not None and reading[1] <= stamp_ns:
             tracker.read(*reading)
             reading = next(readings, None)
@@ -474,11 +474,11 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
 
 def _bridge_pauses(states: Floats, is_fresh: Bools, spec: MemorySpec) -> None:
     """
-    Interpolate board temperature and gradients while readings are missing, because lags after a
-    pause depend on the temperatures in it. The tracker holds these, and they step after the pause.
+    Interpolate board temperature and gradients in pauses of the readings, in place.
 
-    `states`: (n, width), changed in place; `is_fresh`: whether a thermometer has a recent reading,
-    (n, n_thermometers), the board's first
+    Lags after a pause depend on the temperatures in the pause, which the tracker holds constant.
+    `states`: (n, width); `is_fresh`: whether the board's thermometer (column 0) and the others
+    have a recent reading, (n, n_thermometers)
     """
     places, row = StateLayout(spec).places, np.arange(len(states))
     of_gradients = [(places[Gradient(name)], is_fresh.all(axis=1)) for name in spec.sensors]

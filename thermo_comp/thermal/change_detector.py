@@ -4,11 +4,11 @@
 Owns the detection of departures of a temperature's rate from the baseline, the rate in a soak.
 
 Two Kalman filters of temperature and rate, with a long and a short memory, model d2T/dt2 as white
-noise. A rate has departed if it exceeds the baseline, away from 0, by more than the sum of its
-swing, the error of the baseline and h times the sd of the rate's noise; h follows from the
-permitted number of false alarms per hour (Rice's formula [1]_, docs/regime.md). If noise cannot
-change the reading of a quantized sensor, the filters are not used: the mean rate follows from two
-successive crossings of edges between cells of one quantum.
+noise. A rate departs if its excess over the baseline, away from 0, is larger than the swing (the
+rate's amplitude in a soak), plus the error of the baseline, plus h times the sd of the rate's
+noise. h is computed from the permitted false alarms per hour (Rice's formula [1]_,
+docs/regime.md). If noise cannot change the reading of a quantized sensor, no filter is used: the
+mean rate is computed from successive crossings of edges between intervals of equal readings.
 
 References
 ----------
@@ -23,16 +23,16 @@ from typing import Final
 from .settings import ThermometerSettings
 from .thermometer import Thermometer
 
-# For each filter: d2T/dt2 that it detects best / d2T/dt2 at the onset of the smallest ramp.
+# d2T/dt2 that each filter detects best / d2T/dt2 at the onset of the smallest ramp.
 BEND_SHARES = (1.0, 10.0)
 TUNING: Final = 1.45  # best memory of a filter [s] / (noise sd / d2T/dt2)^0.4, readings at 1 Hz
-# Noise variance of a filter's rate / rate variance by the filter, if noise is mostly quantization.
+# True noise variance of a filter's rate / variance that the filter states, for coarse readings.
 CELL_NOISE_SHARE: Final = 0.4
 SETTLING_MEMORIES: Final = 5.0  # age / memory above which a filter's noise is stationary
-LONGEST_HALF_SWING_S: Final = 600.0  # longest half period of a temperature ripple [s]
+LONGEST_HALF_SWING_S: Final = 600.0  # longest half period of an oscillation of temperature [s]
 LARGEST_BASELINE_SHARE: Final = 0.25  # largest baseline rate of a soak / smallest ramp's rate
 SWING_MARGIN: Final = 1.25  # assumed swing / observed swing of the rate about its trend
-SWING_SIGMAS: Final = 3.0  # noise sds subtracted from the observed amplitude (swing) of the rate
+SWING_SIGMAS: Final = 3.0  # number of noise sds subtracted from the rate's observed amplitude
 SWING_MEMORY_LAGS: Final = 10.0  # time constant of the decay of the swing / lag of the sensor
 
 
@@ -53,9 +53,9 @@ class ChangeDetector:
         self._ripple_rate = min(ripple / sensor.lag_s, self._largest_swing)
         self._baseline_s = 0.5 * sensor.lag_s
         self._swing_memory_s = SWING_MEMORY_LAGS * sensor.lag_s
-        # The best memory (1 / tracking frequency) [s] of a filter to detect a second derivative of
-        # ``share * onset`` [K/s^2] in readings at 1 Hz determines the spectral density of the
-        # filter's process noise for any interval of readings.
+        # The spectral density of a filter's process noise, for any interval of readings, is set so
+        # that at 1 Hz the filter has the best memory (1 / tracking frequency) [s] to detect
+        # a second derivative of ``share * onset`` [K/s^2].
         self._noise = sensor.noise_sd_c**2 + sensor.quantum_c**2 / 12.0
         noise_sd, onset = sqrt(self._noise), smallest_rate / sensor.lag_s
         memories = [TUNING * math.pow(noise_sd / (share * onset), 0.4) for share in BEND_SHARES]
@@ -69,7 +69,7 @@ class ChangeDetector:
         self.rate = 0.0
         self.swing = self._ripple_rate
         self._baseline = 0.0
-        # Largest error of the baseline [K/s]: at first the rate may be at a crest of a ripple.
+        # Largest error of the baseline [K/s]; the first rate may be at the crest of a ripple.
         self._baseline_error = self.swing
         self._trend = 0.0
         self._is_above = False
@@ -77,7 +77,7 @@ class ChangeDetector:
         self._peak = self._peak_before = 0.0  # largest distances of the rate from its trend [K/s]
 
     def settle(self, sensor: Thermometer, least_error: float = 0.0) -> None:
-        """Begin a soak: the rate becomes the baseline, with an error of at least `least_error`."""
+        """Begin a soak: the rate becomes the baseline, with an error of `least_error` or more."""
         self._baseline = self.rate
         self._baseline_error = max(self.swing, least_error, 2.0 * sqrt(sensor.var_rate))
         self._edge = nan  # last edge of a cell crossed in the soak: none yet
@@ -137,7 +137,7 @@ class ChangeDetector:
         self._reading = sensor.reading
 
     def _tune(self, dt: float) -> None:
-        """Compute each filter's threshold of (excess of the rate)^2 / variance of the rate."""
+        """Set thresholds of (excess of a filter's rate)^2 / variance that the filter states."""
         self._dt = dt
         self._thresholds: list[float] = []
         for power in self._powers[::-1]:
@@ -184,8 +184,8 @@ class ChangeDetector:
         reading, before = sensor.reading, self._reading
         apart = (stamp_ns - self._edge_ns) * 1e-9
         if reading == before:
-            # Without a crossing the rate is at most a quantum divided by the time since the last
-            # crossing of an edge between cells.
+            # While no edge is crossed, the rate is at most a quantum / time since the last
+            # crossing.
             bound = self._settings.quantum_c / apart
             if bound < self._baseline_error + abs(self._baseline):
                 self._baseline_error = max(min(self._baseline_error, bound), self.swing)
@@ -223,8 +223,8 @@ class ChangeDetector:
             self._peak = max(self._peak, abs(apart))
             return
         if self._age_s - self._turned_s < LONGEST_HALF_SWING_S:
-            # Take the smaller of the rate's peaks on the two sides of the trend: at the onset or
-            # end of a ramp the rate deviates far on one side only.
+            # Use the smaller one of the rate's last peaks above and below the trend: at the onset
+            # or end of a ramp the rate deviates far on one side only.
             noise = SWING_SIGMAS * sqrt(self._noise_share * self._filters[0][4])
             swing = SWING_MARGIN * min(self._peak, self._peak_before) - noise
             self.swing = max(self.swing, min(swing, self._largest_swing))

@@ -6,9 +6,9 @@ Owns the definitions of lags and play operators, and the covariance of their ini
 The lagged value L of an input u obeys ``dL/dt = (u - L) / tau``; the stored state is
 ``m = u - L``. For two stages in series, of time constants ``tau_1 > tau_2``, and a lead theta, m
 is a weighted sum of the states m_1 and m_2 of two first-order lags,
-``m = ((tau_1 - theta) m_1 - (tau_2 - theta) m_2) / (tau_1 - tau_2)``. With T = T_board, a part
-between the board and a sensor s lags ``T + v G``, where ``G = T_s - T`` is the gradient and v its
-share, so ``m = T - L(T + v G)`` is ``T - L(T)`` less ``v L(G)`` (docs/theory.md, Parts).
+``m = ((tau_1 - theta) m_1 - (tau_2 - theta) m_2) / (tau_1 - tau_2)``. A part between the board
+and a sensor s lags ``T + v G``, with the board temperature T, the gradient ``G = T_s - T`` and its
+share v, so ``m = T - L(T + v G)`` is ``T - L(T)`` less ``v L(G)`` (docs/theory.md, Parts).
 """
 
 import math
@@ -23,8 +23,8 @@ from ..typing import Floats
 
 #: Name of the board temperature as the input of a lag or play.
 BOARD_INPUT: Final = 'board'
-#: Relative jitter on the diagonal of the covariance of initial states of first-order lags: lags of
-#: similar time constants are almost collinear, and their covariance would not be invertible.
+#: Relative increase of the variances of initial lag states: the states of lags with similar time
+#: constants are almost collinear, so that their covariance would not be invertible.
 START_JITTER: Final = 3e-4
 #: Prior sd [K] of the initial state of a lag with the time constant `START_TAU_S` [s].
 BOARD_START_SD: Final = 3.0  # for a lag of the board temperature
@@ -33,19 +33,19 @@ START_TAU_S: Final = 3600.0
 
 
 class Quantity:
-    """A quantity of the thermal state, from readings of `input` and, for a gradient, the board."""
+    """A quantity of the thermal state; `input`: its thermometer, for a gradient the sensor."""
 
     input: str
     #: Largest magnitude of the quantity that a calibration may contain.
     largest: ClassVar[float] = QUANTITIES['temperature span'].at_most or 0.0
     #: Typical change of the quantity per kelvin of temperature change.
     per_kelvin: ClassVar[float] = 1.0
-    #: Whether the quantity depends on a lag behind the board, which is 0 s for the board itself.
+    #: Whether the quantity depends on the temperature of a part, which lags the board by >= 0 s.
     is_of_part: ClassVar[bool] = True
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Names of the input thermometers; of a gradient (sensor less board) only the sensor."""
+        """Names of the thermometers; for a gradient (sensor less board) the sensor alone."""
         return (self.input,)
 
     @property
@@ -65,28 +65,29 @@ class _Lag(NamedTuple):
 
 class Lag(_Lag, Quantity):
     """
-    T_board less the temperature of a part that lags the board or, if `input` is a sensor, the
-    lagged gradient of the sensor [K]. `tau_s` and `second_tau_s` are the time constants of two
-    stages [s]; the second is shorter, or 0 for a lag of one stage. A part may lag a temperature
-    between board and sensor: T_board plus `sensor_share` times the gradient of `sensor`.
-    `lead_s`: lag of the board thermometer behind the temperature that drives the part [s].
+    A lag [K]: T_board less the temperature of a part or, if `input` is a sensor, the lagged
+    gradient of the sensor.
+
+    tau_s, second_tau_s: time constants of two stages [s]; the second is shorter, 0 for one stage
+    sensor, sensor_share: a part may lag T_board plus `sensor_share` times the gradient of `sensor`
+    lead_s: lag of the board thermometer behind the temperature that drives the part [s]
     """
 
     @property
     def by_board(self) -> float:
-        """Derivative of the quantity w.r.t. T_board, at constant lagged values L (module top)."""
+        """Derivative of the lag w.r.t. T_board at constant lagged values (L, module docstring)."""
         if self.input != BOARD_INPUT:
             return 0.0
         return 1.0 if self.second_tau_s else self.shares[0]
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Names of the thermometers: `input`, and for a part between board and sensor `sensor`."""
+        """Names of the lag's thermometers: `input`, and `sensor` if its gradient has a share."""
         return (self.input, self.sensor) if self.sensor else (self.input,)
 
     @property
     def first_order_weights(self) -> dict[tuple[str, float], float]:
-        """Weights of first-order lags whose weighted sum is this lag, by input and tau [s]."""
+        """Weights of the first-order lags that sum to this lag, by (input, time constant [s])."""
         stages = list(zip((self.tau_s, self.second_tau_s), self.shares, strict=True))
         return {
             (name, tau): factor * share
@@ -102,7 +103,7 @@ class Lag(_Lag, Quantity):
         return (tau - lead) / (tau - second), (lead - second) / (tau - second) if second else 0.0
 
     def remaining_share(self, age_s: Any, exp: Any = math.exp) -> Any:
-        """Return the sd due to a lag's initial state after `age_s` [s] / this sd at age 0 s."""
+        """Return sd of the lag due to its initial state after `age_s` [s] / this sd at age 0."""
         first = exp(-age_s / self.tau_s)
         if not self.second_tau_s:
             return first
@@ -128,29 +129,31 @@ class _Play(NamedTuple):
 class Play(_Play, Quantity):
     """
     Output of a play of half-width `width_k` less its input [K]. The input is the lagged board
-    temperature, or the board temperature if `tau_s` is 0. The output of a play less its input has
-    no variance, because an error of the input shifts input and output equally.
+    temperature, or the board temperature if `tau_s` is 0. An error of the input shifts input and
+    output equally, so their difference is taken as free of error.
     """
 
     input = BOARD_INPUT
 
     @property
     def lag(self) -> Lag | None:
-        """The lag of the play's input behind the board; None if the input is not lagged."""
+        """The lag of the play's input behind the board; None if the input has no lag."""
         return Lag(BOARD_INPUT, self.tau_s, *self[2:]) if self.tau_s else None
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Thermometers of the play: the board and, if the lag has a `sensor_share`, `sensor`."""
+        """Names of the play's thermometers: 'board', and the `sensor` of its lag if it has one."""
         return self.lag.inputs if self.lag else (self.input,)
 
 
 @dataclass(frozen=True)
 class MemorySpec:
     """
-    Contents of the thermal state of a tracker. `sensors`: names of the thermometers other than the
-    board's; the regime detector uses the first as the leading sensor. `lags`: lags of the board,
-    then lags of each sensor. `rates`: sensors whose rate of change is in the state.
+    Contents of the thermal state of a tracker.
+
+    sensors: names of the thermometers other than the board's, the leading sensor first
+    lags: lags of the board, then lags of each sensor
+    rates: sensors whose temperature rate is in the thermal state
     """
 
     sensors: tuple[str, ...] = ('case',)
@@ -169,12 +172,12 @@ class MemorySpec:
 
 
 def first_order_lags(lags: Iterable[Lag]) -> tuple[tuple[str, float], ...]:
-    """Return input and time constant [s] of each first-order lag that the lags contain."""
+    """Return input and time constant [s] of each first-order lag in the sums of `lags`."""
     return tuple(dict.fromkeys(term for lag in lags for term in lag.first_order_weights))
 
 
 def start_covariance(lags: Sequence[tuple[Any, ...]]) -> Floats:
-    """Return the covariance of the lags at the first reading of their input, (n, n) [K^2]."""
+    """Return the prior covariance of lags at the first reading of their input, (n, n) [K^2]."""
     root = start_root(lags)
     return np.asarray(root @ root.T)
 
@@ -182,7 +185,7 @@ def start_covariance(lags: Sequence[tuple[Any, ...]]) -> Floats:
 def start_root(lags: Sequence[tuple[Any, ...]]) -> Floats:
     """
     Return a matrix whose product with its transpose is `start_covariance`, shape (n, number of
-    first-order lags) [K]. `start_covariance` may be singular: two lags may be nearly equal.
+    first-order lags) [K]. (Nearly equal lags may make `start_covariance` singular.)
 
     The input before the first reading is modelled as a random walk with ``D = 2 sd^2 /
     START_TAU_S`` [K^2/s]: lags k, l of one input have the covariance ``P_kl = D tau_k tau_l /

@@ -20,17 +20,17 @@ import numpy as np
 from ..typing import Floats
 from .lags import BOARD_INPUT, Lag, MemorySpec, first_order_lags
 
-#: Interval between readings / time constant of a lag above which variance is added, because the
-#: time at which the input changed between the readings is unknown.
+#: If interval between readings / time constant of a lag is above this value, the unknown time of a
+#: change between the readings adds variance to the lag.
 SPARSE_SHARE: Final = 0.1
-#: Smallest weight of an old input in `_recursion`; a smaller weight has no effect in float64.
+#: `_recursion` neglects old inputs whose weight is smaller: they have no effect in float64.
 _LEAST_WEIGHT: Final = 1e-18
 
 
 class LagBank:
     """
-    First-order lags of one input with the time constants `taus` [s]. `stamp_ns`, `start_ns`: last
-    and first stamp of the input since the last `forget`.
+    First-order lags of one input with the time constants `taus` [s]; `stamp_ns`, `start_ns`: last
+    and first stamp of the input since the last call of `forget`.
     """
 
     def __init__(self, taus: tuple[float, ...]) -> None:
@@ -39,11 +39,11 @@ class LagBank:
         self.forget()
 
     def forget(self) -> None:
-        """Forget the input: at the next value all lags start at 0."""
+        """Forget the input; all lags begin at 0 with the next input value."""
         self.stamp_ns: int | None = None
         self.start_ns: int | None = None
         self.input = 0.0
-        #: For each lag: input less lagged input [K]; variance if the initial state is known [K^2].
+        #: Input less lagged input of each lag [K]; its variance for a known initial state [K^2].
         self.lagging = self.extra = [0.0] * len(self.taus)
 
     def step(self, stamp_ns: int, value: float, sd: float = 0.0) -> None:
@@ -71,14 +71,14 @@ class LagBank:
             if dt > SPARSE_SHARE * tau:
                 grown += (change * (1.0 - e)) ** 2
             if sd:
-                # An error of the input is the same in all steps, so the standard deviations due
-                # to the steps add, not the variances.
+                # An error of the input is the same in all steps, so the steps' standard deviations
+                # add, not their variances.
                 grown = (math.sqrt(grown) + sd * (1.0 - e)) ** 2
             result.append(grown)
         self.extra = result
 
     def note_jump(self, change: float) -> None:
-        """Add the square of a wrong step of the input [K] to the variance of each lag."""
+        """Add `change`^2 to the variance of each lag; `change`: a wrong step of the input [K]."""
         self.extra = [variance + change * change for variance in self.extra]
 
     def at(self, stamp_ns: int, value: float) -> tuple[list[float], list[float]]:
@@ -125,13 +125,13 @@ class ThermalMemory:
         }
         self.board = self.banks[BOARD_INPUT]
         self.is_empty = not spec.lags and not spec.plays
-        #: For each lag: index and weight of the first-order lags in it; [] if all are first-order.
+        #: Index and weight of the first-order lags in each lag; [] if all lags are first-order.
         self._sums = [weights(lag) for lag in spec.lags]
         if self._sums == [[(k, 1.0)] for k in range(len(terms))]:
             self._sums = []
-        #: For each play: index of the lag of its input, -1 for the board; half-width [K].
+        #: Index of the lag of each play's input, or -1 if the input is the board temperature.
         self._inputs = [spec.lags.index(play.lag) if play.lag else -1 for play in spec.plays]
-        #: For each play: index and weight of each first-order lag in its input; [] without a lag.
+        #: Index and weight of each first-order lag in each play's input; [] if it has no lag.
         self._followed = [weights(play.lag) if play.lag else [] for play in spec.plays]
         self._needs_sensors = any(play.inputs != (BOARD_INPUT,) for play in spec.plays)
         self._widths = [play.width_k for play in spec.plays]
@@ -142,8 +142,8 @@ class ThermalMemory:
         for bank in self.banks.values():
             bank.forget()
         self._held: list[float] = []  # output of each play; empty before the first temperature
-        #: Rate of a ramp in which the unit may have been switched on [K/s], estimated from the
-        #: board's rate shortly afterwards; `sure_rate`: its lower bound, largest rate less 2 sd.
+        #: Estimated board rate in a ramp in which the unit may have been switched on [K/s];
+        #: `sure_rate`: lower bound of this rate, the largest estimate of the board rate less 2 sd.
         self.start_rate = self.sure_rate = 0.0
 
     def forget_input(self, name: str) -> None:
@@ -169,7 +169,7 @@ class ThermalMemory:
         self._held = list(map(_follow, self._held or inputs, inputs, self._widths))
 
     def note_jump(self, change: float) -> None:
-        """Add the square of a wrong step of the board readings [K] to the variance of each lag."""
+        """Add `change`^2 to the variance of each lag; `change`: wrong step of the board [K]."""
         for bank in self.banks.values():
             bank.note_jump(change)
 
@@ -182,8 +182,8 @@ class ThermalMemory:
     ) -> list[float]:
         """
         Return each lag [K] and its variance for a known initial state [K^2], then each play less
-        its input [K]. `still`: for each input the possible error of constant readings [K], and
-        their duration [s]; empty if no input has constant readings.
+        its input [K]. `still`: possible error of each input's constant readings [K], and their
+        duration [s]; empty if no input has constant readings.
         """
         behind, extra = self._first_order(stamp_ns, board, gradients)
         if still:
@@ -224,7 +224,7 @@ class ThermalMemory:
         return values, extra
 
     def remaining_shares(self, stamp_ns: int) -> list[float]:
-        """Return `Lag.remaining_share` of each lag at a stamp, 1 to 0."""
+        """Return `Lag.remaining_share` of each lag at a stamp, a number from 1 (start) to 0."""
         ages = {
             name: 0.0 if bank.start_ns is None else max(stamp_ns - bank.start_ns, 0) * 1e-9
             for name, bank in self.banks.items()
@@ -236,9 +236,8 @@ def memory_on_grid(
     spec: MemorySpec, step_s: float, board: Floats, gradients: Sequence[Floats]
 ) -> Floats:
     """
-    Compute the results of `ThermalMemory.at`, except for rounding, on a uniform grid of times.
-
-    Returns (n, 2 * n_lags + n_plays): each lag [K] and the variance 0; then play less input [K].
+    Return the results of `ThermalMemory.at` on a uniform grid of times, equal up to rounding:
+    each lag [K] and the variance 0, then each play less its input [K], (n, 2 n_lags + n_plays).
     """
     inputs = dict(zip(spec.inputs, (board, *gradients), strict=True))
     first_order: dict[tuple[str, float], Floats] = {}
@@ -271,5 +270,5 @@ def _recursion(decay: float, driven: Floats) -> Floats:
 
 
 def _follow(p: float, v: float, width: float) -> float:
-    """Return the output of a play of half-width `width` at the input `v`; `p`: output before."""
+    """Return the output of a play of half-width `width` at the input `v`; `p`: last output."""
     return v - width if p < v - width else v + width if p > v + width else p

@@ -3,11 +3,11 @@
 """
 Owns the plausibility checks of temperature readings before an estimator uses the readings.
 
-A board has a heat capacity, so its temperature cannot step. A thermometer has noise, so its
-readings are not constant, least of all while the temperature of the other thermometer (case or
-board) changes. The case is nearer to the surroundings than the board, so in a ramp the case
-temperature changes first. Implausible readings are left out, or their variance is increased by the
-square of their possible error.
+A board has a heat capacity, so its temperature cannot step. A thermometer has noise, so constant
+readings are implausible, above all while the temperature of the other thermometer (case or board)
+changes. The case is nearer to the surroundings than the board, so in a ramp the case temperature
+changes first. Implausible readings are not used, or their variance is increased by the square of
+their possible error.
 """
 
 from enum import Enum
@@ -17,77 +17,77 @@ from typing import Final
 from .settings import ThermometerSettings
 from .thermometer import Thermometer
 
-# Largest possible change of a temperature, in addition to a change by the quantum.
-LARGEST_STEP: Final = 3.0  # between readings, however close [K]
-LARGEST_RATE: Final = 0.2  # additional change per second [K/s]
-#: Number of used readings after which readings are checked for steps: a sensor's first readings
-#: may be wrong.
+# Largest possible change between two readings, in addition to quanta and noise: `LARGEST_STEP` [K]
+# plus `LARGEST_RATE` [K/s] times the interval between the readings.
+LARGEST_STEP: Final = 3.0
+LARGEST_RATE: Final = 0.2
+#: Number of used readings of a sensor after which readings are checked for steps.
 SETTLED_READINGS: Final = 5
-#: A sensor's first reading is wrong if the second reading differs from it by an impossible step,
-#: and the third differs from the second by less than this share of the step, in K and in K/s.
+#: A sensor's first reading is wrong if the step to the second reading is impossible, and the step
+#: from the second to the third reading is less than this share of the first, in K and in K/s.
 CONTINUED_SHARE: Final = 0.25
 #: A sensor stands still after `STILL_S` [s] with this number of equal readings or, if larger, the
 #: number of equal readings that noise gives with the probability `STILL_PROBABILITY`.
 STILL_READINGS: Final = 20
 STILL_S: Final = 5.0
 STILL_PROBABILITY: Final = 1e-9
-#: Number of equal readings in a row that are doubtful if the quantum is not far above the noise.
+#: Least number of equal readings in a row that are doubtful, if the quantum is near the noise.
 DOUBTFUL_READINGS: Final = 4
 # Constant readings of a sensor are frozen if the other sensor's temperature changes by more than
 # noise, quanta and this margin [K].
 OTHER_MOVED: Final = 0.3
-OTHER_MOVED_BEYOND_CELL: Final = 0.7  # this margin [K] if the quantum is far above the noise
+OTHER_MOVED_BEYOND_CELL: Final = 0.7  # replaces `OTHER_MOVED` [K] if the quantum exceeds the noise
 LARGEST_ERROR: Final = 60.0  # largest assumed error of a sensor with constant readings [K]
 
 # In a ramp the sensor with the larger temperature change leads if the changes of the two sensors
-# differ by both limits, at `LEAD_READINGS` readings in a row.
-LEAD_K: Final = 0.5  # limit in K
-LEAD_SHARE: Final = 0.15  # limit relative to the larger change
+# differ by more than `LEAD_K` and `LEAD_SHARE`, at `LEAD_READINGS` readings in a row.
+LEAD_K: Final = 0.5  # difference of the changes [K]
+LEAD_SHARE: Final = 0.15  # difference of the changes / larger change
 LEAD_READINGS: Final = 5
-LEAD_RATE_SHARE: Final = 0.3  # least ratio of the slower to the faster rate at these readings
-#: Ratio of the slower to the faster rate above which a leading board gets a larger variance.
+LEAD_RATE_SHARE: Final = 0.3  # slower / faster rate of the two sensors, least value for a lead
+#: Slower / faster rate of case and board above which a leading board gets a larger variance.
 DOUBTFUL_RATE_SHARE: Final = 0.03
-#: A sensor copies the board if this number of its readings in a row change and equal the board's.
+#: A sensor copies the board if this number of its changed readings in a row equal the board's.
 COPIED_READINGS: Final = 10
 _TOGETHER_NS: Final = 10_000_000  # largest time between two readings that are compared [ns]
 _NOISE_SDS: Final = 6.0  # largest deviation of a temperature due to noise, in sd
-#: Time [ns] for which the rates of both sensors must be low before the temperatures count as
-#: constant: estimates of rates start at 0, also in a unit that heats itself after switch-on.
+#: Time [ns] for which the rates of case and board must be low before their temperatures are taken
+#: as constant: estimates of rates start at 0, even in a unit that heats itself after switch-on.
 _CALM_NS: Final = 120 * 10**9
 
 
 class Fault(Enum):
-    """The faults of a sensor; values are the words of the diagnostics."""
+    """The faults of a temperature sensor; the values are the words of the diagnostics."""
 
     NONE = 'none'
     #: Readings that have been equal for longer than noise explains: used with a growing variance.
     STILL = 'stands still'
-    #: Readings that stay equal while the other sensor's temperature changes: they are not used.
+    #: Readings that stay equal while the temperature of board or case changes: they are not used.
     FROZEN = 'frozen'
     #: A reading that has changed faster than the temperature of any part can: it is not used.
     STEP = 'jumped'
     #: A board temperature that differs from the case's by more than ramp and self-heating explain,
-    #: as with a loose thermometer: its readings are used, with a larger variance.
+    #: as with a loose thermometer: its readings are used with a larger variance.
     LOOSE = 'apart'
-    #: Readings after a jump that no part's temperature can make and that no jump back has undone:
-    #: they are used, with a variance that includes the square of the jump.
+    #: Readings after an impossible jump that was not followed by a jump back: they are used with
+    #: a variance that includes the square of the jump.
     SHIFTED = 'shifted'
     #: Readings that equal the board's, as if both inputs had one topic: they are used, and the
-    #: variance of the gradient includes the square of the gradient expected without the sensor.
+    #: variance of the gradient includes the square of a gradient estimated without the sensor.
     COPY = 'copy of the board'
 
 
 class SensorCheck:
     """
-    Judges readings of `sensor` by its earlier readings and by those of `other`. `lag_s`: lag of
-    the board behind `other` [s], 0 if `other` is the board; `is_revived`: whether the estimator of
-    `sensor` must restart.
+    Judges readings of `sensor` by its earlier readings and by the readings of `other`.
+
+    lag_s: lag of the board behind `other` [s], 0 if `other` is the board
+    is_revived: whether the estimator of `sensor` must restart
     """
 
     def __init__(self, sensor: Thermometer, other: Thermometer, lag_s: float) -> None:
         self.sensor, self._other, self.lag_s = sensor, other, lag_s
-        #: Signed sum [K] of the jumps that no part's temperature can make and after which the
-        #: readings were used.
+        #: Signed sum [K] of the impossible jumps after which the readings were used.
         self.shift = 0.0
         settings = sensor.settings
         self._quantum = settings.quantum_c
@@ -107,9 +107,9 @@ class SensorCheck:
         self._n_used = 0
         self._jumped = 0.0
         self._jumped_ns = 0
-        # Temperature of the other sensor at the last change of this sensor's reading. Since then:
-        # change expected of this sensor, largest change of the other sensor [K].
+        # Temperature of `other` [degC] when the reading of `sensor` last changed.
         self._other_then = nan
+        # Change expected of `sensor`, and largest change of `other`, since that time [K].
         self._expected = self._moved = 0.0
         self._seen_ns: int | None = None
         #: Stamps and values [degC] of the first two readings; None from the third reading on.
@@ -117,16 +117,16 @@ class SensorCheck:
 
     @property
     def finding(self) -> tuple[Fault, float]:
-        """The present fault, and the size of the jump [K] if the fault is a jump."""
+        """The present fault, and the size of the last jump [K], or the sum of jumps if shifted."""
         is_shifted = self.fault is Fault.NONE and abs(self.shift) > LARGEST_STEP
         return (Fault.SHIFTED, self.shift) if is_shifted else (self.fault, self.step)
 
     def forget_other(self) -> None:
-        """Measure the change of the other sensor anew, from the other sensor's next reading on."""
+        """Measure the change of `other` anew, from the next reading of `other` on."""
         self._other_then = nan
 
     def has_wrong_start(self, stamp_ns: int, celsius: float) -> bool:
-        """Judge the sensor's first reading, after power-up, by the two readings that follow it."""
+        """Return whether the first reading of `sensor` is wrong, by its next two readings."""
         first = self._first
         if first is None or not isfinite(celsius) or (first and stamp_ns <= first[-1][0]):
             return False
@@ -137,13 +137,13 @@ class SensorCheck:
         (first_ns, wrong), (second_ns, second) = first
         step, after = second - wrong, celsius - second
         possible = LARGEST_RATE * (second_ns - first_ns) * 1e-9 + 2.0 * self._quantum
-        # Change from the second to the third reading [K] if a ramp caused the step.
+        # Change from the second to the third reading in a ramp that caused the first change [K].
         continued = abs(step) * (stamp_ns - second_ns) / (second_ns - first_ns)
         is_step = abs(step) > possible + _NOISE_SDS * self.sensor.settings.noise_sd_c
         return is_step and abs(after) < CONTINUED_SHARE * min(abs(step), continued)
 
     def admits(self, stamp_ns: int, celsius: float) -> bool:
-        """Judge a new reading [degC]: return whether the estimator may use the reading."""
+        """Return whether the estimator may use a new reading [degC]."""
         sensor = self.sensor
         last_ns, fault = sensor.stamp_ns, self.fault
         self.is_revived = False
@@ -156,12 +156,12 @@ class SensorCheck:
         change = celsius - sensor.reading
         is_doubtful = self._n_same >= self._n_doubtful and not self._has_cells
         if is_doubtful and abs(change) > self._largest_noise:
-            # A large change after equal readings: the equal readings and the estimate were wrong.
+            # A large change after equal readings shows that they and the estimate were wrong.
             self.note_jump(stamp_ns, change)
         self._n_same = 0
         self._other_then = nan
         age = (stamp_ns - last_ns) * 1e-9
-        # Accept at once a reading within `LARGEST_STEP` of the temperature expected now.
+        # To save time, accept a reading near the estimate without the tests below.
         is_near = abs(celsius - sensor.temperature) + abs(sensor.rate) * age < LARGEST_STEP
         if fault is Fault.NONE and is_near:
             self._n_used += 1
@@ -184,7 +184,7 @@ class SensorCheck:
         return True
 
     def watch_other(self) -> None:
-        """Note the other sensor's change [K] since the last change of this sensor's reading."""
+        """Note the change of `other` [K] since the last change of the reading of `sensor`."""
         other = self._other
         now_ns = other.stamp_ns
         moved = other.temperature - self._other_then
@@ -196,7 +196,7 @@ class SensorCheck:
         if self.lag_s > 0.0:
             dt = (now_ns - (self._seen_ns or now_ns)) * 1e-9
             if dt > 0.0:
-                # Expect the judged sensor to follow the other sensor with a first-order lag.
+                # `sensor`, the board's, should follow `other` with a first-order lag.
                 self._expected += dt / (dt + self.lag_s) * (moved - self._expected)
         else:
             # The board may approach, but not pass, the constant temperature of `sensor`.
@@ -220,7 +220,7 @@ class SensorCheck:
         return Fault.FROZEN if self._moved > OTHER_MOVED + margin else Fault.STILL
 
     def note_jump(self, stamp_ns: int, change: float) -> None:
-        """Note a jump of the readings [K]: the readings before or after the jump are wrong."""
+        """Increase the variance by a jump `change` [K]: readings before or after it are wrong."""
         self._jumped = self._jump_at(stamp_ns) + change * change
         self._jumped_ns = stamp_ns
 
@@ -230,7 +230,7 @@ class SensorCheck:
         return self._jumped * exp(-max(stamp_ns - self._jumped_ns, 0) * self._decay)
 
     def extra_variance(self, stamp_ns: int) -> float:
-        """Return the variance of the temperature due to constant readings and jumps [K^2]."""
+        """Return the variance of the temperature due to doubtful readings and jumps [K^2]."""
         return max(self._jump_at(stamp_ns), self.shift**2) + self.still(stamp_ns)[0] ** 2
 
     def still(self, stamp_ns: int) -> tuple[float, float]:
@@ -257,8 +257,8 @@ def still_readings(settings: ThermometerSettings) -> int:
 
 class CopyCheck:
     """
-    Finds out whether a sensor repeats the board's readings, as when one topic is given for both:
-    the sensor's gradient (its temperature less the board's) would be 0 even in a ramp.
+    Finds out whether a sensor repeats the board's readings, as when one topic is given for both.
+    The sensor's gradient (its temperature less the board's) is then wrong: 0 even in a ramp.
     """
 
     def __init__(self) -> None:
@@ -286,11 +286,11 @@ class LeadCheck:
     """
     Finds out whether the case or the board temperature changes first (leads) in a ramp.
 
-    While case and board temperature change in the same direction, their changes since both rates
-    were last low are compared. Heat from outside changes the case temperature first. If the
-    board leads, the topics of case and board are swapped or the heat comes from inside; in both
-    cases the gradient terms are wrong. `extra_variance` [K^2]: if the board may lead, the square
-    of the difference between the changes of board and case temperature, else 0.
+    While case and board temperature change in the same direction, their changes since the rates of
+    both were last low are compared. Heat from outside changes the case temperature first. A board
+    leads if the topics of case and board are swapped, or if the heat comes from inside; the
+    gradient terms are then wrong. `extra_variance`: if the board may lead, the square of the
+    difference between the changes of board and case temperature, else 0 [K^2].
     """
 
     def __init__(self, case: Thermometer, board: Thermometer, calm_k_min: float) -> None:
@@ -306,7 +306,7 @@ class LeadCheck:
         self._is_against = False
 
     def update(self, is_static: bool) -> None:
-        """Compare the estimates of case and board; called after each reading of the case."""
+        """Compare the temperatures of case and board, after a reading of the case."""
         case, board = self._case, self._board
         calm = self._calm_rate
         if is_static or (-calm < case.rate < calm and -calm < board.rate < calm):

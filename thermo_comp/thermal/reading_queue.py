@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the queue of readings, ordered by stamps, that wait for the sample that they apply to."""
+"""Owns the queue of readings, ordered by stamps, that wait for a sample with a later stamp."""
 
 import heapq
 from collections.abc import Callable, Iterator
@@ -11,17 +11,17 @@ from .lags import BOARD_INPUT
 #: A waiting reading: stamp [ns], whether the thermometer is not the board's, name of the
 #: thermometer, order of arrival, temperature [degC].
 Entry = tuple[int, bool, str, int, float]
-#: Number of waiting readings above which only the newest half is kept: readings and samples use
-#: different clocks, or no samples come.
+#: Number of waiting readings at which the oldest half is dropped: readings and samples have
+#: different clocks, or no samples arrive.
 PENDING_LIMIT: Final = 4096
-#: Largest backward step between consecutive stamps of one sensor [ns]; after a larger step the
-#: earlier readings are taken to be from another clock.
+#: If consecutive stamps of a sensor step back by more than this time [ns], the sensor's earlier
+#: readings are taken to be from another clock.
 DISORDER_NS: Final = 5_000_000_000
 NEVER_NS: Final = 1 << 62  # a stamp later than any real stamp [ns]
 
 
 class ReadingQueue:
-    """Waiting readings by stamp; at equal stamps those of the board come before all others."""
+    """Waiting readings in order of stamps; at equal stamps the board's reading is the first."""
 
     def __init__(self) -> None:
         self._entries: list[Entry] = []
@@ -34,7 +34,7 @@ class ReadingQueue:
         return self._entries[0][0] if self._entries else NEVER_NS
 
     def push(self, name: str, stamp_ns: int, celsius: float) -> list[str]:
-        """Add a reading; return the thermometers of readings dropped: full queue or new clock."""
+        """Add a reading; return the thermometers of dropped readings (full queue, new clock)."""
         dropped = []
         last_ns, self._last_ns[name] = self._last_ns.get(name, -NEVER_NS), stamp_ns
         if stamp_ns < last_ns - DISORDER_NS:

@@ -3,12 +3,12 @@
 """
 Owns the causal decision [1]_ between static and dynamic regime, from stamped readings alone.
 
-The dynamic state *begins* when the rate of the leading sensor has left the baseline of the soak
-(`change_detector`), or when the rate of any sensor is clearly that of a ramp. The dynamic state
-is *held* while the rate of the case or of the board, at present or extrapolated by half a lag, may
-exceed `relaxed_rate_k_min`; so a ramp of constant rate stays dynamic. With `end_condition` =
-'case' (the paper's rule) only the rate of the case is tested or, while the case gives no readings,
-the rate of the board (docs/regime.md).
+The dynamic state *begins* when the rate of the leading sensor departs from its rate in the soak
+(`change_detector`), or when the rate of case or board is clearly as large as in a ramp. The
+dynamic state is *held* while the rate of the case or of the board, at present or extrapolated by
+half a lag, may exceed `relaxed_rate_k_min`; so a ramp of constant rate stays dynamic. With the
+`end_condition` 'case' (the paper's rule) only the rate of the case is tested or, while the case
+gives no readings, the rate of the board (docs/regime.md).
 
 References
 ----------
@@ -25,11 +25,11 @@ from .settings import OBVIOUS_SHARE, DetectorSettings, ThermometerSettings
 from .thermometer import Thermometer
 
 HOLD_LAGS: Final = 0.75  # shortest duration of the dynamic state / lag of the leading sensor
-# Number of sds of a rate by which it must be below a limit: only 0.5, because in a soak most of
-# the variance of the rate is an allowance for a ramp that may begin at any time.
+# A rate must be below a limit by this number of its sds: only 0.5, because in a soak most of the
+# variance of the rate is an allowance for a ramp that may begin at any time.
 SURE_SIGMAS: Final = 0.5
-OBVIOUS_SIGMAS: Final = 5.0  # number of sds of a rate by which it must exceed a limit
-FIRST_READINGS: Final = 20  # number of readings from which the noise estimate is reliable
+OBVIOUS_SIGMAS: Final = 5.0  # a rate must exceed a limit by this number of its sds
+FIRST_READINGS: Final = 20  # number of readings after which the noise estimate is reliable
 
 
 class Regime(IntEnum):
@@ -79,8 +79,8 @@ class RegimeDetector:
         is_calm = self._case.is_calm(stamp_ns, case, change.swing)
         is_calm = self._board.is_calm(stamp_ns, board, change.swing) and is_calm
         if is_dynamic and not self._is_grown:
-            # The onset of a ramp is detected while the rate is low. Until the rate exceeds 1.5
-            # times the relaxed rate, the dynamic state ends only at a rate near the baseline.
+            # The onset of a ramp is detected while the rate is still low. Before the rate has
+            # exceeded 1.5 times the relaxed rate, only a rate near the baseline is taken as low.
             self._is_grown = abs(lead.rate) > OBVIOUS_SHARE * self._relaxed_rate
             is_calm = is_calm and change.is_back()
         if not is_calm:
@@ -90,7 +90,7 @@ class RegimeDetector:
 
         if not is_dynamic:
             speed = OBVIOUS_SHARE * self._relaxed_rate
-            # If noise alone never changes a reading, two successive changes in one direction prove
+            # If noise never changes a reading, two successive changes in one direction prove
             # a ramp, even in an unknown regime.
             is_sure = lead.settings.has_wide_cells and departure * lead.rate > speed
             if departure and (is_static or is_sure):
@@ -118,7 +118,7 @@ class RegimeDetector:
         return self.regime
 
     def _turn(self, stamp_ns: int, direction: int) -> None:
-        """Reverse the direction if the rate's new sign lasts: coarse quanta may flip the sign."""
+        """Reverse the direction if the rate's new sign lasts; coarse quanta may flip the sign."""
         if direction == self.direction or not direction:
             self._turning_ns = None
         elif self._turning_ns is None:
@@ -152,8 +152,8 @@ class _Watch:
         self._relaxed = settings.relaxed_rate_k_min / 60.0
         self._memory_s = 0.25 * sensor.lag_s
         self._stale_ns = round(0.5e9 * sensor.lag_s)
-        # A reading unchanged for `still_s` proves a low rate: the temperature would leave its cell
-        # (one quantum) at the relaxed rate, and also at a second derivative `bend` [K/s^2].
+        # At the relaxed rate, or at a second derivative `bend` [K/s^2], a reading changes within
+        # `still_s`: a reading that is unchanged for longer proves a low rate.
         quantum, bend = sensor.quantum_c, settings.smallest_ramp_k_min / 60.0 / sensor.lag_s
         still_s = max(quantum / self._relaxed, 2.0 * sqrt(2.0 * quantum / bend))
         self._still_ns = round(1e9 * still_s)
@@ -161,7 +161,7 @@ class _Watch:
         self._mean = 0.0
 
     def is_calm(self, stamp_ns: int, sensor: Thermometer | None, lead_swing: float) -> bool:
-        """Update a sensor's mean rate; return whether the rate is low, or no reading is recent."""
+        """Update a sensor's mean rate; return whether the rate is low or no reading is recent."""
         seen_ns = None if sensor is None else sensor.stamp_ns
         if sensor is None or seen_ns is None or stamp_ns - seen_ns > self._stale_ns:
             return True
@@ -169,8 +169,8 @@ class _Watch:
             self._stamp_ns = None
             return False
         change = self.change
-        # In a ripple of the temperature the rate by the third-order filter of `Thermometer`
-        # overshoots, but the rate by the detector's filters does not.
+        # The rate of `Thermometer`, a third-order filter, overshoots if the temperature
+        # oscillates; the rate of the detector's filters does not.
         rate = change.rate if change.is_following(stamp_ns) else sensor.rate
         sd, relaxed = sqrt(sensor.var_rate), self._relaxed
         stamp, self._stamp_ns = self._stamp_ns, stamp_ns
@@ -192,7 +192,7 @@ class _Watch:
 
 
 def _obvious(sensor: Thermometer, limit: float) -> int:
-    """Return the sign of a rate that exceeds a limit by `OBVIOUS_SIGMAS` sd, 0 for other rates."""
+    """Return the sign of a rate that exceeds a limit by `OBVIOUS_SIGMAS` sd; 0 if it does not."""
     margin = abs(sensor.rate) - limit
     if margin > 0.0 and margin * margin > OBVIOUS_SIGMAS**2 * sensor.var_rate:
         return 1 if sensor.rate > 0.0 else -1

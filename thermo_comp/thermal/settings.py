@@ -3,7 +3,7 @@
 """
 Owns the settings of thermometers, detector and tracker.
 
-A calibration file states the settings of thermometers and detector, the user those of the tracker.
+A calibration file has the settings of thermometers and detector; the user sets the tracker's.
 """
 
 from dataclasses import dataclass, field
@@ -11,16 +11,15 @@ from typing import Annotated, Final, Literal, get_args
 
 from ..quantities import QUANTITIES, NotNegative, Positive, refuse_impossible
 
-CELL_SIGMAS: Final = 2.5  # quantum / noise sd above which a reading counts as an interval (cell)
-# Quantum / noise sd above which noise alone never changes a reading: 6 sd of the difference of two
-# readings.
+CELL_SIGMAS: Final = 2.5  # quantum / noise sd above which a reading is treated as an interval
+# Quantum / noise sd above which noise does not change a reading: the quantum is 6 sd of the
+# difference of two readings.
 WIDE_CELL_SIGMAS: Final = 8.5
 # Hysteresis of the dynamic state: rate that begins the state / rate below which the state ends.
 OBVIOUS_SHARE: Final = 1.5
 #: Advised span of the board temperature over all bags of a unit's thermal test [K].
 ADVISED_SPAN_K: Final = 25.0
-#: Rate of the board temperature from which a change counts as a ramp [K/min]; a slower change is a
-#: drift within a soak.
+#: Smallest rate of the board temperature in a ramp [K/min]; a slower change is a drift in a soak.
 RAMP_K_MIN: Final = 0.1
 
 
@@ -51,7 +50,7 @@ class ThermometerSettings:
 
     @property
     def has_cells(self) -> bool:
-        """Whether the quantum far exceeds the noise; then a reading is an interval, a cell."""
+        """Whether the quantum far exceeds the noise, so that a reading is an interval (cell)."""
         return self.quantum_c > CELL_SIGMAS * self.noise_sd_c
 
     @property
@@ -65,7 +64,7 @@ EndCondition = Literal['board', 'case']
 
 @dataclass(frozen=True, slots=True)
 class DetectorSettings:
-    """Settings of the regime detector; keys of the section `detector` of a calibration file."""
+    """Settings of the regime detector: the section `detector` of a calibration file."""
 
     smallest_ramp_k_min: Annotated[
         float, QUANTITIES['ramp'], 'Rate of the slowest ramp that must be detected, K/min.'
@@ -94,8 +93,8 @@ class DetectorSettings:
     ] = 60.0
     end_condition: Annotated[
         EndCondition,
-        'Sensors whose rates must be low before the dynamic state ends: the leading one alone '
-        '(`case`, as in the paper), or leading sensor and board (`board`).',
+        'Sensors whose rates must be low before the dynamic state ends: `case` for the leading '
+        'sensor alone, as in the paper; `board` for the leading sensor and the board.',
     ] = 'board'
     case: Annotated[ThermometerSettings, 'Settings of the case thermometer.'] = field(
         default_factory=ThermometerSettings
@@ -124,8 +123,8 @@ class ThermalConfig:
     #: Time over which the two sets of coefficients are blended after a change of regime [s], up to
     #: ten times longer if the force would change faster than 1 ug/s; 0: a step, as in the paper.
     transition_time_s: NotNegative = 30.0
-    #: Age of the board temperature after which nothing is published [s], unless the correction is
-    #: constant; also the time for which board readings after an impossible step are refused.
+    #: Age of the board temperature after which no sample is published [s], unless the correction
+    #: is constant; also the time for which board readings after an impossible step are refused.
     temperature_timeout_s: Positive = 60.0
     #: Age of the case temperature after which the board temperature decides the regime [s]; also
     #: the time for which the readings of other sensors after an impossible step are refused.

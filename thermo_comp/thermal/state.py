@@ -8,15 +8,15 @@ from typing import Final
 from ..quantities import QUANTITIES
 from .lags import BOARD_INPUT, MemorySpec, Quantity
 
-#: The thermal memory counts as settled if the sd of every lag is below this [K].
+#: The thermal memory is settled if the sd of every lag is below this limit [K].
 MEMORY_SETTLED_SD: Final = 0.05
 #: Lag of a board behind its case if the bags do not determine the lag [s]: 15 min, typical of a
 #: housing of a few hundred grams in a chamber.
 USUAL_BOARD_LAG_S: Final = 900.0
 
-#: Indices of the first numbers of a thermal state: board temperature and its variance, rate of the
-#: board temperature, weight of the dynamic set, flag (1.0 while the regime is unknown), gradient
-#: of the first sensor and its variance.
+#: Indices of the first numbers of a thermal state: board temperature and its variance, its rate,
+#: weight of the dynamic set, flag (1.0 while the regime is unknown), gradient of the first sensor
+#: and its variance.
 (BOARD, VAR_BOARD, RATE, WEIGHT, UNKNOWN, GRADIENT, VAR_GRADIENT) = range(7)
 
 
@@ -51,9 +51,9 @@ class StateLayout:
     """
     Order of the numbers of a thermal state: BOARD to UNKNOWN, (value, variance) pairs, plays.
 
-    pairs: index of each quantity among the pairs; `lag_pairs`: slice of the lags among the pairs
+    pairs: index of each quantity among the pairs; lag_pairs: slice of the lags among the pairs
     lags: index of each lag in `MemorySpec.lags`
-    variances: indices in the state of the variances of the pairs
+    variances: slice of the state with the variances of all pairs
     numbers: meaning of each number: a quantity, (quantity, 'variance'), VAR_BOARD, WEIGHT, UNKNOWN
     places: index of each quantity in the state
     """

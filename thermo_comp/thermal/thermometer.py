@@ -8,8 +8,8 @@ the acceleration is almost constant (a soak, the middle of a ramp), and *bending
 acceleration changes as at the onset and end of a ramp behind a thermal lag [2]_. The estimate is
 the mean of both filters weighted by their probabilities, and its variance includes the filters'
 difference. If a sensor's quantum exceeds the noise, all temperatures in a cell (an interval of one
-quantum) give the same reading. A changed reading is then a precise measurement of the edge between
-two cells, and an unchanged reading only bounds the temperature by the cell [3]_.
+quantum) give the same reading. A changed reading then measures the edge between two cells
+precisely; an unchanged reading only shows that the temperature is in the cell [3]_.
 
 References
 ----------
@@ -27,16 +27,16 @@ from typing import Final
 from .settings import ThermometerSettings
 
 OUTLIER_SIGMAS: Final = 6.0  # innovation / its sd above which a reading is down-weighted
-OUTLIER_LIMITS: Final = 5.0  # innovation / limit of an outlier above which a reading is rejected
+OUTLIER_LIMITS: Final = 5.0  # innovation / limit of outliers, above which a reading is rejected
 RESTART_READINGS: Final = 4  # consecutive outliers of equal sign after which the filter restarts
 # Mean time in the quiet mode [s]; the mean time in the bending mode is the lag of the sensor.
 SOAK_S: Final = 900.0
-# Sd of the noise that drives the temperature's second derivative: quiet filter / bending filter.
+# Sd of the noise that drives d2T/dt2 in the quiet filter / sd of this noise in the bending filter.
 QUIET_SHARE: Final = 5e-3
-CELL_SHARE: Final = 0.2  # replaces `QUIET_SHARE` if noise alone never changes the reading
+CELL_SHARE: Final = 0.2  # replaces `QUIET_SHARE` if noise never changes a reading
 _ROOT_HALF: Final = 0.7071067811865476  # 1 / sqrt(2)
 _DENSITY_AT_0: Final = 0.3989422804014327  # 1 / sqrt(2 pi)
-#: Range of readings accepted as temperatures [degC]; the lower end is absolute zero.
+#: Smallest (absolute zero) and largest reading that is accepted as a temperature [degC].
 COLDEST: Final = -273.15
 HOTTEST: Final = 1000.0
 HORIZON_INTERVALS: Final = 5.0  # longest linear extrapolation [reading intervals]
@@ -57,10 +57,10 @@ class Thermometer:
     The estimates hold at `stamp_ns`, the stamp of the last used reading; before the first reading
     they are NaN with infinite variances. `changed_ns`: stamp of the last change of the reading;
     `interval_s`: typical interval between readings; `n_in_row`: number of readings since the
-    filter last started; `n_restarts`: starts after a gap or a step; `is_ready`: `n_in_row` is 2 or
-    more, which gives a rate. `measured` and its variance: the last reading or, if the quantum far
-    exceeds the noise, a Gaussian measurement in its place (infinite variance: no information).
-    `bending`: probability of the bending mode, in which the acceleration changes.
+    filter last started; `n_restarts`: number of starts after a gap or a step; `is_ready`: whether
+    `n_in_row` is 2 or more, so that there is a rate. `measured`, `measured_variance`: the last
+    reading or, if the quantum far exceeds the noise, a Gaussian measurement in its place (infinite
+    variance: no information). `bending`: probability that the acceleration changes.
     """
 
     def __init__(self, settings: ThermometerSettings) -> None:
@@ -70,7 +70,7 @@ class Thermometer:
         self._noise = noise * noise
         self._flat = noise * noise + quantum * quantum / 12.0
         self._noise_scale = 1.0  # noise factor: actual / declared noise variance
-        self._n_turns = 8.0  # number of innovations in `_noise_scale`; its prior counts as 8
+        self._n_turns = 8.0  # number of innovations in `_noise_scale`, plus 8 for its prior
         self._has_cells = settings.has_cells
         self._quantum = quantum
         self._lag = settings.lag_s
@@ -102,8 +102,8 @@ class Thermometer:
 
     def update(self, stamp_ns: int, reading_c: float) -> bool:
         """
-        Use a reading [degC]; return False for an impossible temperature, a stamp not after that of
-        the last used reading, or an outlier that is too far from the prediction to be used.
+        Use a reading [degC]; return False for an impossible temperature, for a stamp that is not
+        after the last used stamp, and for an outlier too far from the prediction to be used.
         """
         if not COLDEST <= reading_c <= HOTTEST:
             return False
@@ -119,8 +119,8 @@ class Thermometer:
             self._start(stamp_ns, reading_c)
             return True
 
-        # Interaction step of the multiple-model filter [1]: each mode starts from a mixture of
-        # both modes.
+        # Interaction step of the multiple-model filter [1]: each filter starts from a mixture of
+        # the states of both.
         to_bending = dt / (dt + SOAK_S)
         to_quiet = dt / (dt + lag)
         bending = self.bending
@@ -144,8 +144,8 @@ class Thermometer:
         is_turning = innovation * self._innovation < 0.0
         self._innovation = innovation
         if is_turning and not self._has_cells:
-            # Estimate the noise from innovations whose sign differs from that of the innovation
-            # before: a change of the rate gives innovations of equal sign.
+            # Estimate the noise from innovations whose sign differs from the sign of the preceding
+            # innovation: a change of the rate gives innovations of equal sign.
             excess = min(innovation * innovation / spread - 1.0, 8.0)
             if self._n_turns < NOISE_MEMORY:
                 self._n_turns += 1.0
@@ -167,8 +167,8 @@ class Thermometer:
             move = (quiet[1] + prior_bending * (bent[1] - quiet[1])) * dt
             measured, noise = self._cell(reading_c, expected, variance, move, bent[6] * dt * dt)
 
-        # Update the filters of both modes, and the probability of the bending mode by the
-        # likelihoods of their innovations.
+        # Update both filters, and the probability of the bending filter by the likelihoods of
+        # the filters' innovations.
         if noise < inf:
             quiet, of_quiet, s = correct(quiet, measured, noise)
             bent, of_bent, bent_s = correct(bent, measured, noise)
@@ -215,8 +215,8 @@ class Thermometer:
         rate = self.rate
         unknown = 0.0
         if not -horizon <= ahead <= horizon:
-            # Beyond the extrapolation horizon the temperature is held constant, with a variance
-            # that grows by the square of the change that its rate or an unseen ramp would cause.
+            # Beyond the extrapolation horizon the temperature is held constant, and its variance
+            # grows by the square of the change that its rate or an unseen ramp would cause.
             dt = horizon if ahead > 0.0 else -horizon
             beyond = ahead - dt
             unseen = min(0.5 * self._bend * abs(beyond), self._rate_sd)
@@ -259,8 +259,8 @@ class Thermometer:
         half = 0.5 * self._quantum
         noise = self._noise
         if variance < 4.0 * noise:
-            # The sd of the prediction is below twice that of the noise: match the moments of the
-            # prediction truncated to the reading's cell. Alternating readings show a cell's edge.
+            # For a prediction whose sd is below twice the noise: match the moments of the
+            # prediction truncated to the reading's cell.
             spread = variance + noise
             sd = sqrt(spread)
             low = (reading - half - expected) / sd
@@ -285,8 +285,8 @@ class Thermometer:
         box = half * half / 3.0
         if variance > box:
             return reading, variance * box / (variance - box)
-        # A prediction outside the reading's cell is corrected to the edge; all readings taken
-        # while the prediction changes by its sd count together as one measurement.
+        # A prediction outside the reading's cell is corrected to the edge. All readings within the
+        # time in which the prediction changes by its sd have the weight of one measurement.
         if abs(expected - reading) > half:
             edge = reading + (half if expected > reading else -half)
             return edge, variance * max(1.0, sqrt(variance) / (abs(move) + 1e-30))
@@ -294,7 +294,7 @@ class Thermometer:
 
 
 def mix(state: State, other: State, share: float) -> State:
-    """Return mean and covariance of a mixture of `state` and, with the weight `share`, `other`."""
+    """Return mean and covariance of a mixture of two states; `share`: weight of `other`."""
     t, v, a, p00, p01, p02, p11, p12, p22 = state
     u, w, b, r00, r01, r02, r11, r12, r22 = other
     dt, dv, da = u - t, w - v, b - a

@@ -4,7 +4,7 @@
 Owns the tracker of a unit's thermal state: thermometers, regime, memory, dynamic weight.
 
 The compensator, the fit and the report all run `ThermalTracker`, so a regressor has the same value
-in the fit and in the correction (within the noise of a reading where the fit averages readings).
+in the fit and in the correction (within the noise of a reading if the fit averages readings).
 `ThermalTracker` is causal and reads no clock: each reading has a stamp, and the thermal state is
 requested for a stamp.
 """
@@ -23,12 +23,12 @@ from .thermometer import RESTART_READINGS, Thermometer
 
 #: Relative sd of a gradient that is estimated while its sensor is lost (gives no readings).
 LOST_GRADIENT_RELATIVE_SD: Final = 0.5
-#: Time without a regime decision after which the regime is unknown / lag of the case thermometer.
+#: The regime is unknown after this time without a decision / lag of the case thermometer.
 UNWATCHED_SHARE: Final = 0.25
-# Largest change of the self-heating gradient since the fit that is not taken as an error of the
-# board temperature, because the air flow may have changed: the larger of these two.
+# Another air flow changes the self-heating gradient after the fit. Changes up to the larger one of
+# these two limits are not taken as errors of the board temperature.
 SELF_HEATING_CHANGE_K: Final = 1.0  # in K
-SELF_HEATING_CHANGE: Final = 0.5  # relative to the gradient in the fit
+SELF_HEATING_CHANGE: Final = 0.5  # times the largest self-heating gradient in the fit
 ANY_RANGE: Final = (-inf, inf)
 
 
@@ -76,19 +76,19 @@ class ThermalTracker:
         rest_gradient_range_k: tuple[float, float],
         stamp_ns: int | None,
     ) -> None:
-        """Use the given settings from a stamp on, without a step in the dynamic weight."""
+        """Use new settings from a stamp on, without a step in the weight of the dynamic set."""
         if stamp_ns is not None:
             self._weight = self.weight_at(stamp_ns)
             self._weight_ns = stamp_ns
         self.config = config
         self._rest_gradient_range = rest_gradient_range_k
-        #: Lag of the board behind the case [s], for the gradient without readings of the case.
+        #: Lag of the board behind the case [s], to estimate the gradient of a lost sensor.
         self._board_lag_s = board_lag_s
         lag_s = self.settings.case.lag_s
         usual_s = max(UNWATCHED_SHARE * lag_s, config.case_timeout_s)
         #: Time without a decision after which the regime is unknown [s].
         self._unwatched_s = min(usual_s, max(lag_s, self.settings.board.lag_s))
-        # Set the lag in a copy of the board's plausibility check, which other trackers may share.
+        # Other trackers may share the board's plausibility check: set the lag in a copy of it.
         self.checks = {**self.checks, BOARD_INPUT: copy(self.checks[BOARD_INPUT])}
         self.checks[BOARD_INPUT].lag_s = board_lag_s
 
@@ -120,7 +120,7 @@ class ThermalTracker:
         if sensor is self.case:
             self.checks[BOARD_INPUT].watch_other()
             if check.fault is not Fault.STILL or self.detector.regime is not Regime.DYNAMIC:
-                # Constant readings of a faulty sensor do not prove that a ramp has ended.
+                # In the dynamic regime a sensor that stands still must not end the regime.
                 self._decide(stamp_ns, sensor)
             self.lead.update(self.detector.regime is Regime.STATIC)
         return True
@@ -134,11 +134,11 @@ class ThermalTracker:
             memory.board_step(stamp_ns, board.temperature, error)
             age_s = (stamp_ns - (memory.board.start_ns or 0)) * 1e-9
             if age_s <= max(self._board_lag_s, board.settings.lag_s):
-                # Until the longer of both lags has passed, the rate shows a ramp begun earlier.
+                # Within the longer of the two lags, a rate may be due to a ramp before the start.
                 rate = abs(board.rate)
                 memory.sure_rate = max(memory.sure_rate, rate - 2.0 * sqrt(board.var_rate))
                 memory.start_rate = max(memory.sure_rate, rate)
-            # A sensor without any reading counts as lost once the time-out has passed.
+            # A sensor that has given no reading is lost once the time-out has passed.
             is_young = age_s <= self.config.case_timeout_s
             for name, bank in memory.banks.items():
                 sensor = self.thermometers[name]
@@ -157,14 +157,14 @@ class ThermalTracker:
     def _use(
         self, name: str, sensor: Thermometer, check: SensorCheck, stamp_ns: int, celsius: float
     ) -> bool:
-        """Use a reading, if plausible; after a jump or gap adjust the lags. False: not used."""
+        """Use a plausible reading, adjust lags after a jump or gap; return whether it was used."""
         if check.has_wrong_start(stamp_ns, celsius):
             self._begin_again(name, sensor)
         before_ns, before, n_restarts = sensor.stamp_ns, sensor.temperature, sensor.n_restarts
         n_before, has_jumped = sensor.n_in_row, check.fault is Fault.STEP
         is_rejected = not check.admits(stamp_ns, celsius)
         if is_rejected:
-            # Restart the estimate if all readings during the time-out were rejected as steps.
+            # If all readings for the length of the time-out were rejected as steps, restart.
             age_s = 0.0 if before_ns is None else (stamp_ns - before_ns) * 1e-9
             config, is_board = self.config, sensor is self.board
             timeout_s = config.temperature_timeout_s if is_board else config.case_timeout_s
@@ -182,7 +182,7 @@ class ThermalTracker:
         if before_ns is not None and (is_new or has_restarted):
             is_gap = has_restarted and (stamp_ns - before_ns) * 1e-9 > sensor.settings.lag_s
             if has_restarted and not is_gap and n_before < 2 * RESTART_READINGS:
-                # The few readings before the restart were wrong: restart at the present reading.
+                # The few readings before the restart were wrong: forget what followed from them.
                 self._begin_again(name, sensor)
                 sensor.update(stamp_ns, celsius)
                 return True
@@ -197,7 +197,7 @@ class ThermalTracker:
         return True
 
     def _begin_again(self, name: str, sensor: Thermometer) -> None:
-        """Forget the readings of a sensor, and lags, gradients and regime computed from them."""
+        """Forget a sensor's readings, and the lags, gradients and regime that depend on them."""
         sensor.reset()
         self.memory.forget_input(name)
         self._rest_gradients.clear()
@@ -209,7 +209,7 @@ class ThermalTracker:
         board = self.board if self.board.stamp_ns is not None else None
         decided_ns, self._decided_ns = self._decided_ns, stamp_ns
         if decided_ns is not None and (stamp_ns - decided_ns) * 1e-9 > self._unwatched_s:
-            # Between readings far apart a ramp may have begun or ended: restart the detector.
+            # A ramp may have begun or ended in the long time without a decision.
             self._begin_watch()
         regime = self.detector.update(stamp_ns, case, board)
         target = 1.0 if regime is Regime.DYNAMIC else 0.0
@@ -229,8 +229,8 @@ class ThermalTracker:
     def sample(self, stamp_ns: int) -> tuple[float, ...]:
         """
         Return the thermal state at a stamp, in the order of `StateLayout`; the board must have a
-        reading. The variance of a gradient is that of the sensor, without the variance of the
-        board temperature; the variance of a lag is that for a known initial state.
+        reading. The variance of a gradient is the variance of the sensor's temperature, without
+        that of the board; the variance of a lag is its variance for a known initial state.
         """
         board, rate, var_board = self.board.at(stamp_ns)
         decided_ns = self._decided_ns
@@ -251,7 +251,7 @@ class ThermalTracker:
         for name in self.spec.rates:
             sensor = self.thermometers[name]
             is_live = self.is_live(stamp_ns, sensor)
-            # The rate of a lost sensor is taken to be the board's rate, with an sd of 100 %.
+            # A lost sensor is given the board's rate, with an sd of 100 %.
             pairs += [sensor.rate, sensor.var_rate] if is_live else [rate, rate * rate]
         var_board += self.checks[BOARD_INPUT].extra_variance(stamp_ns)
         var_board += self._board_error(gradients[0])
@@ -265,20 +265,20 @@ class ThermalTracker:
     def _board_error(self, gradient: float) -> float:
         """
         Return the variance of the board temperature [K^2] due to an impossible gradient of the
-        leading sensor, as with a loose thermometer or with swapped topics.
+        leading sensor, as with a loose thermometer or swapped topics.
         """
         loose, lead = self.loose_k(gradient), self.lead
         # If the board leads the case in a ramp, the topics of case and board may be swapped.
         return loose * loose + (gradient * gradient if lead.is_reversed else lead.extra_variance)
 
     def loose_k(self, gradient: float) -> float:
-        """Return the leading sensor's gradient [K] beyond that of ramp and self-heating."""
+        """Return the part of the leading sensor's gradient beyond ramp and self-heating [K]."""
         of_ramp = self._board_lag_s * self.board.rate
         lower, upper = self._rest_gradient_range
         excess = max(gradient - of_ramp - upper, lower - gradient + of_ramp)
         if excess > SELF_HEATING_CHANGE_K:
             usual = max(SELF_HEATING_CHANGE_K, SELF_HEATING_CHANGE * max(-lower, upper))
-            # In other surroundings the board may lag the case twice as much as in the fit.
+            # In other surroundings the board's lag may be twice the lag in the fit.
             return max(excess - usual - abs(of_ramp), 0.0)
         return 0.0
 
@@ -295,14 +295,14 @@ class ThermalTracker:
     def _lost_gradient(self, name: str, stamp_ns: int, rate: float) -> tuple[float, float]:
         """
         Estimate a gradient while its sensor is lost: lag times rate of the board, plus the
-        gradient due to self-heating in the last static regime, else that of the fit, else 0.
+        gradient by self-heating in the last static regime (else of the fit, else 0).
         """
         lag = self._board_lag_s
         lower, upper = self._rest_gradient_range
         is_known = name == self.spec.sensors[0] and upper < inf
         usual = 0.5 * (lower + upper) if is_known else 0.0
         gradient = self._rest_gradients.get(name, usual) + lag * rate
-        # Largest change of the case temperature since the board's extrapolation ended [K].
+        # Largest change of the case temperature after the end of the board's extrapolation [K].
         unseen = self.settings.case.fastest_ramp_k_min / 60.0 * self.board.beyond(stamp_ns)
         of_rate = (LOST_GRADIENT_RELATIVE_SD * gradient) ** 2 + lag * lag * self.board.var_rate
         return gradient, of_rate + unseen * unseen

@@ -3,9 +3,9 @@
 """
 Owns the calibration of one unit: immutable dataclasses with the keys of the calibration file.
 
-Measurement model of axis i (equations 6 to 9 of Golovach 2016, extended by the columns phi_j): N_i
-is the raw sample, ``t = T_board - T_ref``, w the weight of the dynamic set (0..1), phi_j column j
-of the thermal response (`columns`), M the misalignment matrix, f the specific force. delta and Fs
+The measurement model of axis i (equations 6 to 9 of Golovach 2016, plus the columns phi_j) has the
+raw sample N_i, ``t = T_board - T_ref``, the weight w of the dynamic set (0..1), columns phi_j of
+the thermal response (`columns`), the misalignment matrix M and the specific force f. delta and Fs
 are the offset and the curve of the bias, Fc is the curve of the scale; the index s marks the
 static set, d the dynamic set::
 
@@ -60,7 +60,7 @@ Input = Literal['counts', 'm/s^2']
 
 @dataclass(frozen=True)
 class Unit:
-    """Serial number; unit of measure, full scale and interval of the raw samples."""
+    """Serial number of a unit; unit of measure, full scale and interval of its raw samples."""
 
     serial: Annotated[Serial, 'Serial number of the unit, one printable line.']
     input: Annotated[Input, 'Unit of the raw samples: counts per conversion cycle, or m/s^2.']
@@ -133,8 +133,8 @@ class LackOfFit:
 class RegimeSet:
     """
     The curves of one regime. Outside `temperature_range_c` the covariance of the force grows, and
-    each curve runs parallel to the other regime's curve. Outside the ranges of both regimes each
-    curve continues along a tangent for a quarter of the range, and is constant from there on.
+    each curve runs parallel to the curve of the other regime. Outside the ranges of both regimes
+    each curve continues along a tangent for a quarter of the range, and then is constant.
     """
 
     temperature_range_c: Annotated[tuple[Celsius, Celsius], 'Calibrated range of T_board [degC].']
@@ -230,7 +230,7 @@ class Calibration:
     soak_gradient_k: Annotated[
         tuple[_Kelvin, _Kelvin] | None,
         'T_s - T_board of the first sensor s in a soak, due to self-heating, and the sd of this '
-        'difference; null: unknown, taken as 0. Certificates and exported files include it.',
+        'difference; certificates and exported files include it; null: unknown, taken as 0.',
     ] = None
     detector: Annotated[
         DetectorSettings, 'Settings of the thermometers and of the regime detector.'
@@ -313,7 +313,7 @@ class Calibration:
 
     @property
     def needs_case(self) -> bool:
-        """Whether case readings are needed: `detector.case` is set, or a column is of a sensor."""
+        """Whether readings of a sensor are needed, by `detector.case` or a column of a sensor."""
         is_default = self.detector.case == ThermometerSettings()
         return not is_default or any(column.is_of_sensor for column in self.columns)
 
@@ -327,7 +327,7 @@ class Calibration:
 
 
 def parameter_layout(calibration: Calibration) -> ParameterLayout:
-    """Return the indices in the posterior of all parameters of a calibration."""
+    """Return the indices of a calibration's parameters in its posterior."""
     pairs: list[tuple[TemperatureFunction, TemperatureFunction]] = []
     for static, dynamic in zip(*(part.axes() for part in calibration.regime_sets()), strict=True):
         pairs.append((static.bias_function, dynamic.bias_function))

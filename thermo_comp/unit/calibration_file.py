@@ -19,15 +19,15 @@ from .calibration import FORMAT_VERSION, Calibration
 from .schema import SchemaError, build, fields_of, plain
 
 #: Largest calibration file [bytes]. A calibration with all columns of `columns.bank` but `bend`,
-#: and a posterior of full rank, takes 3.3 MB with one thermometer beside the board, 6 MB with two.
+#: and a posterior of full rank, takes 3.3 MB with one sensor besides the board's, 6 MB with two.
 SIZE_LIMIT = 1 << 23
 
-#: First line of a written file. A file with this first line is refused if its last line is not
-#: `_END`, because a file that is cut between two keys could be read as valid.
+#: First line of a written file. A file that begins with this line must end with `_END`, because
+#: a file that was cut between two keys could be read as valid.
 _HEADER = '# written by thermo_comp: the last line of a complete file is "..."'
 _END = '...'
 
-#: Names of groups and kinds of columns: name in files of version 0.2.0, and present name.
+#: Groups and kinds of columns: their names in files of version 0.2.0, and their present names.
 _FORMER = {
     'now': 'gradient',
     'neighbour': 'gradient_lag',
@@ -35,7 +35,7 @@ _FORMER = {
     'even': 'gradient_even',
     'change': 'gradient_even_about_rest',
 }
-#: For each section of a calibration file: a key's name in version 0.2.0, and its present name.
+#: Sections of a calibration file with a renamed key: the name in version 0.2.0, the present name.
 _FORMER_KEYS = {'detector': ('closes', 'end_condition'), 'posterior': ('rest', 'diagonal')}
 
 
@@ -43,8 +43,8 @@ def load_calibration(path: str | Path) -> Calibration:
     """
     Read and validate a calibration file.
 
-    Raises CalibrationError, which names the file, if the file cannot be read, is not YAML of the
-    accepted kind, or has a wrong value, whose key the message names with the expected value.
+    Raises CalibrationError, with the name of the file, if the file cannot be read or is not YAML
+    of the accepted kind, or for a wrong value, with its key and the expected value.
     """
     try:
         content = read_bounded(path, SIZE_LIMIT)
@@ -70,7 +70,7 @@ def parse_calibration(content: bytes, path: str | Path | None = None) -> Calibra
     missing = [key for key in fields_of(Calibration)[1] if key not in data]
     rule = f'not a calibration: the key `{missing[0]}` is missing' if missing else None
     version = data.get('format_version')
-    # The version is checked before the keys: keys of another version would be reported as unknown.
+    # Check the version before the keys: keys of another version would be reported as unknown.
     if type(version) is int and version != FORMAT_VERSION:
         advice = 'the file is of a newer release; update thermo_comp'
         if version < FORMAT_VERSION:
@@ -100,7 +100,7 @@ def _rename(data: dict[str, Any]) -> None:
 
 
 def dump_calibration(calibration: Calibration) -> str:
-    """Return a Calibration as YAML; CalibrationError if too large or if not read back as equal."""
+    """Return YAML of a Calibration; CalibrationError if too large, or not equal if read again."""
     content: str = yaml.dump(
         plain(calibration),
         Dumper=_Dumper,
@@ -124,10 +124,10 @@ def save_calibration(
     calibration: Calibration, path: str | Path, *, overwrite: bool = True
 ) -> None:
     """
-    Write a calibration file atomically.
+    Write a calibration file atomically; an error leaves an existing file unchanged.
 
-    Raises CalibrationError if the calibration is not valid or the text too large, OutputError if
-    the file may not or cannot be written; an existing file then stays as it was.
+    Raises CalibrationError if the calibration is not valid or its text too large, and OutputError
+    if the file may not or cannot be written.
     """
     text = dump_calibration(calibration)
     write_atomically(path, text.encode(), CALIBRATION, overwrite=overwrite)

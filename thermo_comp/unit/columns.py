@@ -6,10 +6,10 @@ Owns the columns of the thermal response: the regressors of bias and scale.
 A column is ``phi = u t^power r``. The value u is computed by the column's kind (`unit.terms`), t
 is the board temperature less the reference, and r is 1, 1 - w or w, with w the weight of the
 dynamic set. u is limited to the column's range, and t to the calibrated temperatures, because no
-recording determines the effect of a column outside this range and these temperatures.
+recording determines the effect of a column outside these limits.
 
 The function `bank` makes the candidate columns of a fit. The group *part* has columns of the kinds
-board, square and cube, whose sum with a curve over the board temperature is a curve over the
+board, square and cube: their sum with a curve over the board temperature is a curve over the
 temperature of a part.
 """
 
@@ -31,20 +31,20 @@ from .terms import GROUPS, LINE, TERMS, Term
 
 UNBOUNDED: Final = (-1e9, 1e9)
 #: Time constants of the columns of `bank` [s], in steps of a factor sqrt(2), from a few reading
-#: intervals to the longest lag that bags determine. Columns linear in a lag are made for all 15
-#: time constants: sums of them approximate a lag of any time constant. Products and powers of lags
-#: have smaller effects than the lags, so every second time constant suffices for them.
+#: intervals to the longest lag that bags determine. Columns linear in a lag have all 15 time
+#: constants, so that their sums approximate a lag of any time constant. Products and powers of
+#: lags have smaller effects than lags, so every second time constant suffices.
 FINE_TAUS: Final = tuple(np.geomspace(60.0, 7680.0, 15).round(9).tolist())
 BANK_TAUS: Final = FINE_TAUS[::2]
-#: Widths of kind gradient_even [K], half-widths of plays [K], and time constants of the lagged
-#: board temperatures that are inputs of plays [s]; 0 = board temperature.
+#: Widths of kind gradient_even [K]; half-widths of plays [K]; time constants of the lagged board
+#: temperatures that are inputs of plays [s], 0 for the board temperature itself.
 EVEN_WIDTHS: Final = (0.375, 0.75, 1.5, 3.0, 6.0)
 PLAY_WIDTHS: Final = (0.4, 0.8, 1.6, 3.2, 6.4)
 PLAY_TAUS: Final[tuple[float, ...]] = (0.0, 450.0, 900.0, 1800.0)
-#: Kind bend: time constants [s]; smallest span of board temperatures per knee (change of slope)
-#: [K]; largest number of knees per lag. With the argument `parts`, `bank` makes up to
-#: `MOST_PART_KNEES` knees, and a third of the span suffices per knee.
+#: Time constants of kind bend [s].
 BEND_TAUS: Final = (0.0, *FINE_TAUS[4:11])
+#: At its knee [K] the slope of a bend changes: smallest span of board temperatures per knee [K];
+#: largest number of knees per lag, and with the argument `parts` of `bank` (a third of the span).
 LEAST_KNEE_K, MOST_KNEES, MOST_PART_KNEES = 1.0, 20, 60
 
 
@@ -63,7 +63,7 @@ class Part(NamedTuple):
     """
     The lag of a part of the unit behind the board; the fields are keys of a column.
 
-    tau_s, second_tau_s: time constants of the two stages [s]; the second is 0 for a single stage
+    tau_s, second_tau_s: time constants of two stages [s]; the second is 0 for a single stage
     sensor_share: the part lags the board temperature plus this share of the sensor's gradient
     lead_s: lag of the board thermometer behind the temperature that drives the part [s]
     """
@@ -91,7 +91,7 @@ class Column:
     ]
     sensor: Annotated[str, 'Thermometer s of the gradient g_s = T_s - T_board.'] = 'case'
     tau_s: Annotated[
-        _Lag, 'Time constant of the lag; 0 = no lag (not in kinds board, gradient_lag and cube).'
+        _Lag, 'Time constant of the lag; 0 = no lag. Above 0 in kinds board, gradient_lag, cube.'
     ] = 0.0
     second_tau_s: Annotated[
         _Lag, 'Time constant of a second stage of the lag, in series with the first; 0 = none.'
@@ -99,7 +99,7 @@ class Column:
     sensor_share: Annotated[
         float,
         QUANTITIES['share'],
-        "The part's T lags T_board + sensor_share * g_s (kinds board, square, cube, play, bend).",
+        'A part lags T_board + sensor_share * g_s (kinds board, square, cube, play and bend).',
     ] = 0.0
     lead_s: Annotated[
         _Lag,
@@ -143,12 +143,12 @@ class Column:
 
     @property
     def term(self) -> Term:
-        """The kind of the column."""
+        """The function of the column's kind."""
         return TERMS[self.kind]
 
     @property
     def source(self) -> Quantity:
-        """The quantity of the thermal state that determines the column's value."""
+        """The quantity of the thermal state of which the column is a function."""
         return self.term.source(self)
 
     @property
@@ -174,9 +174,11 @@ def bank(
     parts: Sequence[Part] | None = None,
 ) -> tuple[Column, ...]:
     """
-    Return all candidate columns, with ranges that exclude no value. `at_rest`: gradient of each
-    sensor in a soak [K]; `span_k`: lowest and highest board temperature in the data, less the
-    reference [K]; `parts`: the lag of the part of each axis; if given, no other lags are used.
+    Return all candidate columns, with ranges that exclude no value.
+
+    at_rest: gradient g_s of each sensor in a soak [K]
+    span_k: lowest and highest board temperature in the data, less the reference [K]
+    parts: lag of each axis's part: the only lags of the columns; None: lags of all time constants
     """
     fine, coarse, of_plays, of_bends = (
         list(map(Part, taus)) for taus in (FINE_TAUS, BANK_TAUS, PLAY_TAUS, BEND_TAUS)
@@ -193,7 +195,7 @@ def bank(
     columns += _family('product', ['board'], powers=(1, 2), lags=coarse)
     columns += _family('gradient_x_temperature', ['gradient'], sensors, powers=(1,))
     columns += _family('gradient_x_temperature', ['gradient_lag'], sensors, (1,), coarse_gradient)
-    # The temperature of a part of lag m is t - m. A bias that is a polynomial of it has the terms
+    # A bias that is a polynomial of t - m, the temperature of a part of lag m, has the terms
     # (t - m)^2 = t^2 - 2 t m + m^2 and (t - m)^3 = t^3 - 3 t^2 m + 3 t m^2 - m^3.
     columns += _family('square', ['square'], powers=(0, 1), lags=coarse)
     columns += _family('square', ['cube'], lags=coarse)
@@ -222,7 +224,7 @@ def _family(
     lags: Sequence[Part] = (Part(0.0),),
     widths: Sequence[float] = (0.0,),
 ) -> list[Column]:
-    """Return the columns of a group, one per combination of sensor, kind, power, lag, width."""
+    """Return the columns of a group: all combinations of sensor, kind, power, lag and width."""
     ranges = {kind: TERMS[kind].bounds or UNBOUNDED for kind in kinds}
     return [
         Column(group, kind, sensor, *part, width, power=power, range=ranges[kind])
@@ -231,7 +233,7 @@ def _family(
 
 
 def memory_of(columns: Iterable[Column], sensors: Sequence[str] = ('case',)) -> MemorySpec:
-    """Return lags, hysteresis plays and rates of columns; ValueError: sensor not in `sensors`."""
+    """Return lags, plays and rates of columns; ValueError for a sensor not in `sensors`."""
     sources: set[Quantity] = set()
     for column in columns:
         sources.add(column.source)
@@ -270,7 +272,7 @@ class ColumnTable:
         ranges = np.array([column.range for column in columns])
         self._range = ranges.reshape(-1, 2).T[:, :, np.newaxis]
         # The value u of a column is constant outside its range. Only a bend, a curve over a part's
-        # temperature, continues for `TANGENT_SPANS` of its range, as a curve over T_board does.
+        # temperature, continues like a curve over T_board, for `TANGENT_SPANS` of its range.
         is_curve = np.array([c.term.is_temperature for c in columns], bool)[:, np.newaxis]
         lower, upper = self._range
         extension = np.where(is_curve, TANGENT_SPANS * (upper - lower), 0.0)
@@ -313,7 +315,7 @@ class ColumnTable:
         return raw - hold(raw, *self._range)
 
     def excess(self, raw: Floats) -> Floats:
-        """Return (1 + d)^(1/p) - 1; d: half ranges from u to its range, p: order of the column."""
+        """Return (1 + d)^(1/p) - 1; d: distance of u from its range / half range; p: order."""
         lower, upper = self._range
         excess = np.asarray(np.abs(self.beyond(raw)) / ((upper - lower) / 2.0))
         for order in {*self._orders.tolist()} - {1}:
@@ -337,8 +339,8 @@ class ColumnTable:
 
     def slopes(self, states: Floats) -> tuple[Floats, Floats | None]:
         """
-        Differentiate the unlimited u of each column w.r.t. the column's quantity of the state and,
-        at constant lag, w.r.t. T_board (None if no column is a function of t - lag).
+        Return derivatives of the unlimited u of each column: w.r.t. the column's quantity of the
+        state; w.r.t. T_board at constant lag, None if no column is a function of t - lag.
         """
         slopes, scaled = np.ones((len(self._places), states.shape[1])), self._scaled(states)
         for rows, term in self._terms:

@@ -6,9 +6,9 @@ Owns the arithmetic of the correction: bias, scale and error variances from ther
 n thermal states are the columns of an array of shape (width, n), whose rows are in the order of
 `thermal.state`. Sums run in a fixed order, and the result of a state does not depend on the other
 states, so a stream and a batch get the same bits. Results for three axes stand in rows: the bias
-of x, y, z, then the scale of x, y, z. The notation is that of `calibration`; x is the specific
-force of an axis before the misalignment, and its error variance is ``v(x) = a + b x + c x^2``
-[m^2/s^4]. The module `covariance` adds misalignment errors and covariances between axes.
+of x, y, z, then the scale of x, y, z. An axis with the specific force x, before the misalignment
+is corrected, has the error variance ``v(x) = a + b x + c x^2`` [m^2/s^4]. The module `covariance`
+adds misalignment errors and covariances between axes.
 """
 
 from collections.abc import Sequence
@@ -28,28 +28,26 @@ from .functions import hold, in_order
 from .gravity import MICRO_G
 from .nonlinearity import ForceCorrection, beyond_force
 
-#: Largest rate of change of the force in a transition between regimes [m/s^3]: 1 ug per second; a
-#: faster transition is lengthened, by a factor of at most `LONGEST_TRANSITION`.
+#: Largest rate of change of the force in a transition between regimes [m/s^3]: 1 ug per second. A
+#: faster transition is made longer, at most `LONGEST_TRANSITION` times.
 GENTLE_RATE = MICRO_G
 LONGEST_TRANSITION = 10.0
-#: Number of board temperatures at which the slopes and the difference of the sets are evaluated.
+#: Number of board temperatures for which slopes, and the difference of the sets, are evaluated.
 _GAP_TEMPERATURES = 33
-#: Variance of rounding [counts^2]: twice 1/12, as the converter adds the remainder to the next
-#: cycle.
+#: Rounding variance [counts^2]: 2/12, as the converter adds the remainder to the next cycle.
 ROUNDING_VARIANCE = 1.0 / 6.0
-#: Smallest noise variance of a sample / largest variance of any axis: this minimum keeps the
+#: Smallest noise variance of a sample / largest variance of any axis. This minimum keeps the
 #: covariance positive definite in spite of rounding, and is far below the noise of any instrument.
 _LEAST_SHARE = 1e-13
-#: Largest number accepted in a result of `Correction.line`: with smaller numbers the corrected
-#: samples do not overflow.
+#: Largest number in a usable result of `Correction.line`: corrected samples then do not overflow.
 _LARGEST = 1e140
 #: Indices of the variances of the axes at zero force in a result of `Correction.line`.
 VARIANCES = tuple(12 + place for place in CONSTANTS)
 #: Indices of the variances of the relative scale of the axes in a result of `Correction.line`: the
 #: coefficients of x^2 in xx, y^2 in yy, z^2 in zz.
 SCALE_VARIANCES = tuple(place + last for place, last in zip(VARIANCES, (2, 5, 9), strict=True))
-#: Number of thermal states above which sums are computed in a loop over the columns, which is then
-#: faster than a sum over an array of all products.
+#: Number of thermal states above which a loop over the columns is faster than a sum over an array
+#: of all products.
 _FEW = 64
 #: Largest number of thermal states evaluated at once, to bound the memory.
 _CHUNK = 2048
@@ -58,21 +56,21 @@ _CHUNK = 2048
 class Excess(NamedTuple):
     """How far a thermal state lies outside the calibrated ranges; 0 inside."""
 
-    temperature: float  # board temperature beyond the range of the present regime, signed [K]
-    rate: float  # rate of the board temperature beyond this regime's range, signed [K/s]
-    gradient: float  # excess of the gradient farthest outside its range, signed [K]
-    relative: float  # sum of excess temperature, rate and worst column [half ranges]
+    temperature: float  # board temperature less the nearest edge of the regime's range [K]
+    rate: float  # rate of the board temperature less the nearest edge of the regime's range [K/s]
+    gradient: float  # gradient less the nearest edge of its range, of the worst gradient [K]
+    relative: float  # sum of the excesses / half ranges of temperature, rate and worst column
 
 
 class Correction:
     """
     Evaluates bias, scale and error variances of a calibration at thermal states.
 
-    memory: lags, plays and rates of the states; by default those that the unit's columns need
-    noise: noise variance of one sample per axis, rounding of counts included [m^2/s^4]
+    memory: lags, plays and rates in the thermal states; default: those of the unit's columns
+    noise: noise variance of one sample per axis, including rounding of counts [m^2/s^4]
     noise_trace: the sum of `noise`
     misalignment: elements yx, zx, zy of the misalignment matrix M
-    beyond: additional variance at forces above the largest force of the fit
+    beyond: additional variance at forces above the largest |f| of the fit
     """
 
     def __init__(self, calibration: Calibration, memory: MemorySpec | None = None) -> None:
@@ -95,7 +93,7 @@ class Correction:
         slopes, (_, of_bends) = self.curves.slopes(settled[BOARD]), self.table.slopes(settled)
         if of_bends is not None:
             slopes += self._weigh(of_bends, np.zeros(slopes.shape[1:]))
-        # Sd over the calibrated range of the slopes of both sets: of the bias, then of the scale.
+        # Sd, over the calibrated temperatures, of the slopes of both sets: of bias, then of scale.
         of_bias = np.arange(6)[:, np.newaxis] < 3
         sds = slopes.std(axis=2, keepdims=True)
         self._slope_sds = np.concatenate((sds * of_bias, sds * ~of_bias))
@@ -113,11 +111,11 @@ class Correction:
         self.of_force: ForceCorrection | None = None
         if calibration.nonlinearity is not None:
             self.of_force = ForceCorrection(calibration, calibration.nonlinearity, self._span)
-        #: Number of rows of the slowly varying error covariance that `SlowUncertainty.at` returns.
+        #: Number of rows that `SlowUncertainty.at` returns, a covariance of slowly varying errors.
         self.n_slow = N_ROWS if self.of_force is None else N_ROWS + 15
 
     def _find_columns_of_pairs(self) -> None:
-        """Find the columns that depend on each quantity of the state that has a variance."""
+        """Find the columns that depend on each quantity with a variance in the thermal state."""
         self.layout = layout = StateLayout(self.memory)
         pair = np.array([layout.pairs.get(c.source, -1) for c in self.table.columns], np.int64)
         columns = np.argsort(pair, kind='stable')
@@ -149,7 +147,7 @@ class Correction:
         return in_order(np.concatenate((start[:, np.newaxis], self._W * columns), axis=1), 1)
 
     def gentle_transition(self, given_s: float) -> float:
-        """Lengthen a regime transition [s] up to tenfold to limit d(force)/dt to GENTLE_RATE."""
+        """Return the time of a transition [s], up to 10 times `given_s`, to keep `GENTLE_RATE`."""
         board = np.linspace(*self._span, _GAP_TEMPERATURES)
         gap = np.diff(self.curves.values(board), axis=0)[0]
         scale = np.abs(gap[3:]).max(axis=0)
@@ -174,7 +172,7 @@ class Correction:
 
     def by_pairs(self, slopes: Floats) -> Floats:
         """
-        Differentiate bias and relative scale w.r.t. the quantities of `StateLayout.pairs`, shape
+        Return derivatives of bias and relative scale w.r.t. the quantities of `StateLayout.pairs`,
         (p, 6, n); `slopes`: derivative of each column w.r.t. its quantity, (n_columns, n).
         """
         columns = self._pair_columns
@@ -195,11 +193,11 @@ class Correction:
         Evaluate the correction in segments, linear in time between the states `start` and `end`.
 
         `slow`: slowly varying error covariance, (n_slow, n), see `SlowUncertainty.at`;
-        `noise_excess`: relative increase of a sample's noise variance. Returns (52,) or (52, n):
-        for each axis bias, its change over the segment, scale and its change; then the
-        coefficients for `covariance.covariance_at`, noise of a sample included. With a
-        nonlinearity `slow` has 15 more rows, and the result ends with K2, Kq, K3 of each axis and
-        the coefficients of x^3 to x^6 in the variance of each axis.
+        `noise_excess`: relative increase of a sample's noise variance. The result, (52,) or
+        (52, n), has for each axis the bias, the change of the bias over the segment, the scale and
+        its change; then the coefficients for `covariance.covariance_at`, with a sample's noise. If
+        the unit has a nonlinearity, `slow` has 15 more rows, and the result ends with K2, Kq, K3
+        of each axis and the coefficients of x^3 to x^6 in the variance of each axis.
         """
         ends = np.array((start, end), dtype=np.float64)
         n = ends[0, 0].size
@@ -224,7 +222,7 @@ class Correction:
             states[:, n:], raw[:, n:], held[:, n:], factors_at_end, gap, slow[:9].reshape(3, 3, n)
         )
         between = grown(slow[9:N_ROWS], growth)
-        # The largest force that each axis can measure [m/s^2], and the error variance there.
+        # The error variance at the largest force that each axis can measure [m/s^2].
         largest_force = (self._full_scale + np.abs(both[0, :, 0])) / np.abs(both[1, :, 0])
         tilts = between[OF_MISALIGNMENT].max(axis=0)
         variance = v[:, 0] + largest_force * (np.abs(v[:, 1]) + largest_force * (v[:, 2] + tilts))
@@ -250,7 +248,7 @@ class Correction:
     ) -> tuple[Floats, Floats]:
         """
         Evaluate a, b, c of each axis' error variance ``a + b x + c x^2``, (3, 3, n), without
-        sample noise, and the growth factor (3, n) of this variance outside the calibrated ranges.
+        sample noise, and the growth factor (3, n) of the variance outside the calibrated ranges.
 
         `gap`, the dynamic less the static set, is added as an error while the sets are blended,
         outside the calibrated ranges, and while the regime is unknown. In an unknown regime the
@@ -260,7 +258,7 @@ class Correction:
         static_weight, beyond_range = 1.0 - weight, self.table.beyond(raw)
         excess, _, relative, by_rate = self.curves.excess(states)
         if not self._has_lags:
-            # Lags describe the effect of the rate: without lags, add the excess of the rate.
+            # Lags describe the effect of the rate: add the excess rate of a unit without lags.
             relative = relative + by_rate
         outside = static_weight * relative[0] + weight * relative[1]
         shares = np.array([static_weight + unknown * weight, weight + unknown * static_weight])
@@ -284,15 +282,15 @@ class Correction:
         if is_beyond or outside.any() or parts_out.any():
             columns_out = np.where(self._is_present, self.table.excess(raw), 0.0)
             columns_out = columns_out.max(axis=1, initial=0.0)
-            # Outside the calibrated range the curves are extrapolated, with two errors: slope of
-            # the curves at the edge of the range times the board's distance from the edge; sd of
-            # the slopes in the range times the largest distance of board or part from the range.
+            # Outside the calibrated range the curves are extrapolated with two errors. The first
+            # is the slope of the curves at the edge of the range times the board's distance from
+            # the edge, the second is the sd of the slopes in the range times the largest distance
+            # of board or part from the range.
             v += self._spread(shares * excess * excess, slopes)
             squares = shares * np.maximum(excess * excess, parts_out * parts_out)
             slope_sds = np.broadcast_to(self._slope_sds, (4, *slopes.shape[1:]))
             v += self._spread(np.concatenate((squares, squares)), slope_sds)
-            # The posterior is valid within the calibrated ranges: outside, increase the variance
-            # with the distance from the ranges.
+            # The posterior is valid within the calibrated ranges: increase the variance outside.
             growth = 1.0 + (outside + columns_out) ** 2
             v *= growth[:, np.newaxis]
         of_gap = unknown + weight * static_weight + outside * outside
@@ -302,7 +300,7 @@ class Correction:
             both = (np.full_like(weight, w) for w in (0.0, 1.0))
             of_static, of_dynamic = (self.table.factors(board, w)[0] for w in both)
             gap = self._weigh(held * (of_dynamic - of_static), gap)
-        # The part of a column's effect that the limits of its range cut off is an error.
+        # The limits of a column's range cut off a part of its effect, which is taken as an error.
         cut_off = self._weigh(beyond_range * factors[0], np.zeros_like(gap))
         variances_of_both = np.array([of_gap, np.ones_like(of_gap)])
         return v + self._spread(variances_of_both, np.array([gap, cut_off])), growth
@@ -321,12 +319,12 @@ class Correction:
 
 
 def memory_of_unit(calibration: Calibration) -> MemorySpec:
-    """Return the lags, plays and rates that the columns of force and angular rate need."""
+    """Return the lags, plays and rates in the columns of specific force and angular rate."""
     return memory_of(calibration.columns, calibration.sensors)
 
 
 def is_sound(line: Floats) -> npt.NDArray[np.bool_]:
-    """Whether a result of `Correction.line` gives finite forces: no scale 0, numbers < 1e140."""
+    """Whether results of `Correction.line` give finite forces: scale not 0, numbers < 1e140."""
     scale = line[2:12:4]
     is_finite = (np.abs(line) < _LARGEST).all(axis=0)
     return np.asarray(is_finite & (scale * (scale + line[3:12:4]) > 0.0).all(axis=0))

@@ -3,18 +3,18 @@
 """
 Owns the covariance of a corrected sample as polynomials in the forces of the three axes.
 
-x, y, z are the specific forces along the axes, before the misalignment. The vector u has nine
-elements, namely a constant error and a scale error of each axis, and the errors of the three
-elements of the misalignment M. To first order the error e of the corrected force is ::
+x, y, z are the specific forces along the axes, before the misalignment is corrected. The vector u
+has nine elements: a constant error and a scale error of each axis, and the errors of the three
+elements yx, zx, zy of the misalignment. To first order the error e of the corrected force is ::
 
     e_x = u0 + x u1
     e_y = yx (u0 + x u1) + u2 + y u3 + x u6
     e_z = zx (u0 + x u1) + zy (u2 + y u3) + u4 + z u5 + x u7 + y u8
 
 Each element of the covariance of the force error e is a polynomial of second degree in the forces
-x, y, z, and the coefficients are sums over the elements of the covariance of the errors u. The
-covariance of u is stored as rows: for each axis a, b, c of its error variance ``a + b x + c x^2``,
-then for each pair of errors in `BETWEEN` their covariance.
+x, y, z, whose coefficients are sums over the elements of the covariance of the errors u. The
+covariance of u is stored as rows: first a, b, c of the error variance ``a + b x + c x^2`` of each
+axis, then the covariance of each pair of errors in `BETWEEN`.
 """
 
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ Real = TypeVar('Real', float, Floats)
 
 _OF_AXES: Final = [(u + i, u + j) for u in (0, 2, 4) for i, j in ((0, 0), (0, 1), (1, 1))]
 _PAIRS: Final = list(combinations_with_replacement(range(9), 2))
-#: Pairs of errors u of two different axes, and pairs of a misalignment error and any error.
+#: Pairs of errors u: of two different axes, or of a misalignment error and any error.
 BETWEEN: Final = [pair for pair in _PAIRS if pair not in _OF_AXES]
 #: Number of rows of a covariance of the nine errors u.
 N_ROWS: Final = len(_PAIRS)
@@ -69,7 +69,7 @@ class CovarianceMap:
         factors = sums[:, u, w]
         # Row b of an axis is twice the covariance of the axis' constant error and scale error.
         factors[:, 1:9:3] /= 2.0
-        # Each coefficient of xx, ..., zz is a sum over few rows of the covariance of u.
+        # Each coefficient has nonzero factors of only a few rows of the covariance of u.
         n = int((factors != 0.0).sum(axis=1).max())
         self._places = np.argsort(factors == 0.0, axis=1, kind='stable')[:, :n]
         self._factors = np.take_along_axis(factors, self._places, axis=1)[:, :, np.newaxis]
@@ -80,8 +80,8 @@ class CovarianceMap:
 
 
 def grown(between: Floats, growth: Floats) -> Floats:
-    """Scale covariances `BETWEEN`, (36, n), for axis variances multiplied by `growth`, (3, n)."""
-    # The misalignment does not depend on the temperature, so its errors do not grow.
+    """Return covariances `BETWEEN`, (36, n), for axis variances `growth`, (3, n), times larger."""
+    # Errors of the misalignment do not grow, as it does not depend on the temperature.
     roots = np.concatenate((np.repeat(np.sqrt(growth), 2, 0), np.ones_like(growth)))
     return np.asarray(between * roots[_FIRST] * roots[_SECOND])
 
@@ -89,7 +89,7 @@ def grown(between: Floats, growth: Floats) -> Floats:
 def rows_between(errors: Floats, misalignment_variances: Floats) -> Floats:
     """
     Return the rows `BETWEEN`, (36, n), of the covariance of u. `errors`, (9, p, n): u due to each
-    of p independent causes; `misalignment_variances`, (3,): further variances of M's elements.
+    of p independent causes; `misalignment_variances`, (3,): added variances of misalignments.
     """
     # The sums do not use BLAS, whose results depend on the arrays' alignment.
     result = in_order(errors[_FIRST] * errors[_SECOND], 1)

@@ -18,23 +18,23 @@ class Curves:
     """
     Bias and scale of the static set (row 0) and the dynamic set (row 1) over board temperature.
 
-    Where only one set is within its range, the curves of the other set run parallel to it. Beyond
-    both ranges the set whose range extends farther follows tangents for `TANGENT_SPANS` times the
-    width of its range, then is constant; the curves of the other set run parallel to it.
+    At a temperature in the range of one set only, the curves of the other set run parallel to the
+    curves of that set. Beyond both ranges the set whose range extends farther follows tangents for
+    `TANGENT_SPANS` times the width of its range, then is constant; the other set runs parallel.
     """
 
     def __init__(self, calibration: Calibration) -> None:
         self._reference = calibration.reference_temperature_c
         sets = calibration.regime_sets()
         edges = np.array([(part.temperature_range_c, part.rate_range_k_min) for part in sets])
-        # Edges of the fitted ranges of both regimes, (2, 2, 1): lower edges, then upper edges.
+        # Edges of the fitted ranges, (2, 2, 1): lower edges of both regimes, then upper edges.
         self._t_range = (edges[:, 0].T - self._reference)[:, :, np.newaxis]
         self._rate_range = (edges[:, 1].T / 60.0)[:, :, np.newaxis]
         self._functions = [
             [axis.bias_function for axis in axes] + [axis.scale_function for axis in axes]
             for axes in (part.axes() for part in sets)
         ]
-        # Index of the set whose tangent each set follows, below and above the ranges.
+        # Index of the set whose tangent each set follows: below both ranges, then above them.
         regimes, (lower, upper) = np.arange(2), self._t_range[:, :, 0]
         self._leads = np.where([lower > lower.min(), upper < upper.max()], 1 - regimes, regimes)
         self._ends = lower.min(), upper.max()
@@ -44,14 +44,14 @@ class Curves:
         self._levels = np.add(biases, deltas)[:, :, np.newaxis]
         residuals = [[axis.residual_sd_m_s2**2 for axis in part.axes()] for part in sets]
         self._residuals = np.array(residuals)[:, :, np.newaxis]
-        # For each regime with a lack of fit: temperatures of its entries, variances of the axes.
+        # Lack of fit of each regime that has one: temperatures, then variances of three axes.
         lacks = (
             [(p.temperature_c, *np.square(p.sd_m_s2)) for p in part.lack_of_fit] for part in sets
         )
         self._lacks = {regime: np.array(rows).T for regime, rows in enumerate(lacks) if rows}
 
     def excess(self, states: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Return excess of T_board [K] and rate [K/s] for each set, and in half ranges, (2, n)."""
+        """Return excess of T_board [K] and rate [K/s] by set, and both / half ranges, (2, n)."""
         t, rate = states[BOARD] - self._reference, states[RATE]
         over, too_fast = t - hold(t, *self._t_range), rate - hold(rate, *self._rate_range)
         span, rate_span = (edges[1] - edges[0] for edges in (self._t_range, self._rate_range))
@@ -72,33 +72,33 @@ class Curves:
         return result
 
     def _evaluate(self, t: Floats, what: str = 'value') -> Floats:
-        """Evaluate curves or slopes; row k of `t`, (2, n) [K from T_ref], is for regime k."""
+        """Evaluate curves or slopes of regime k at row k of `t`, (2, n), T_board - T_ref [K]."""
         pairs = zip(self._functions, t, strict=True)
         return np.array([[getattr(function, what)(at) for function in row] for row, at in pairs])
 
     def _beyond(self, t: Floats) -> tuple[Floats, Floats]:
-        """Return how far t [K] is below and above the ranges, up to the tangents' ends, (2, n)."""
+        """Return the parts of t [K] below and above both ranges, up to the tangents' ends."""
         (lower, upper), (below, above) = self._ends, self._tangents_k
         return hold(t - lower, -below, 0.0), hold(t - upper, 0.0, above)
 
     def unexplained(self, board: Floats) -> Floats:
-        """Evaluate residual plus lack-of-fit variance of each regime and axis, (2, 3, n)."""
+        """Return variance of residual plus lack of fit by regime and axis [m^2/s^4], (2, 3, n)."""
         return self._residuals + self.lack_of_fit(board)
 
     def lack_of_fit(self, board: Floats) -> Floats:
-        """Evaluate the variance of the lack of fit by regime and axis [m^2/s^4], (2, 3, n)."""
+        """Return the variance of the lack of fit by regime and axis [m^2/s^4], (2, 3, n)."""
         result = np.zeros((2, 3, len(board)))
         for regime, (at, *variances) in self._lacks.items():
             result[regime] = [np.interp(board, at, variance) for variance in variances]
         return result
 
     def slopes(self, board: Floats) -> Floats:
-        """Differentiate bias and scale of both regimes w.r.t. T_board [per K], shape (2, 6, n)."""
+        """Return slopes of bias and scale over T_board [per K] by regime, shape (2, 6, n)."""
         held = hold(board - self._reference, *self._t_range)
         return self._evaluate(held, 'slope')
 
     def regressors(self, states: Floats, phi: Floats) -> list[Floats]:
-        """Differentiate bias and scale of each axis w.r.t. all parameters of a `Block`."""
+        """Return derivatives of bias and scale of each axis w.r.t. the parameters of a `Block`."""
         t, weight = states[BOARD] - self._reference, states[WEIGHT]
         held, shares = hold(t, *self._t_range), np.array([1.0 - weight, weight])
         is_outside = bool((held != t).any())
@@ -115,7 +115,7 @@ class Curves:
         return result
 
     def _followed(self, regime: int, place: int, t: Floats, shares: Floats) -> Floats:
-        """Differentiate bias or scale beyond the ranges w.r.t. free coefficients, (n_free, n)."""
+        """Return derivatives of extrapolated curves w.r.t. free coefficients, (n_free, n)."""
         # Outside its range a curve is a constant plus a tangent, or plus the other set's curve.
         function = self._functions[regime][place]
         own_range, other_range = self._t_range[:, regime], self._t_range[:, 1 - regime]

@@ -5,8 +5,8 @@ Owns functions of temperature (polynomial, cubic spline, exponential) that are 0
 
 A single ``t = T_board - T_ref`` [K] gives the same bits as an array: the code uses only ``+ - *
 /`` in a fixed order, and `math.exp` number by number. Each function is linear in its free
-coefficients, so `basis` gives the regressors of the fit and of the parameter covariance. The paper
-uses polynomials (equations 9 and 10).
+coefficients, so `basis` gives the regressors of the fit and of the parameter covariance. The
+curves of Golovach's paper are polynomials (equations 9 and 10).
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from .schema import broken
 #: A temperature difference [K], or an array of temperature differences.
 Kelvins: TypeAlias = float | Floats
 
-#: Length of the tangent that continues a curve beyond its range / width of the range. A parabola
-#: departs from its tangent at an edge by 1/16 as much over this length as over the whole range.
+#: Length of the tangent that continues a curve beyond its range / width of the range. Over this
+#: length a parabola departs from the tangent by 1/16 of its departure over a whole range.
 TANGENT_SPANS = 0.25
-#: Largest accepted error of a function's value at the reference temperature.
+#: Largest accepted error of a function's value (0 or 1) at the reference temperature.
 NORMALISATION_TOLERANCE = 1e-9
 #: Smallest distance between a spline's knots, and largest distance of a knot from the reference
 #: temperature [K]; numbers far beyond these limits would make the spline overflow.
@@ -45,7 +45,7 @@ def hold(value: Floats, lower: npt.ArrayLike, upper: npt.ArrayLike) -> Floats:
 
 
 def by_element(function: Callable[[float], float], x: Kelvins) -> Floats:
-    """Apply a function to each number: numpy's rounding may depend on the array's length."""
+    """Apply a function to each number, as numpy's rounding may depend on the array's length."""
     return np.array([function(v) for v in np.ravel(x).tolist()]).reshape(np.shape(x))
 
 
@@ -77,8 +77,8 @@ class _Family(ABC):
 @dataclass(frozen=True)
 class Polynomial(_Family):
     """
-    ``c[0] + c[1] t + c[2] t^2 + ...``, t: board less reference temperature [K]; c[0] is 0 for a
-    bias, 1 for a scale (Eq. (10) of the paper).
+    A polynomial ``c[0] + c[1] t + c[2] t^2 + ...`` of t, the board less the reference temperature
+    [K]; c[0] is 0 for a bias, 1 for a scale (equation 10 of Golovach's paper).
     """
 
     coefficients: Annotated[tuple[float, ...], QUANTITIES['coefficients']]
@@ -116,8 +116,8 @@ class Polynomial(_Family):
 @dataclass(frozen=True)
 class CubicSpline(_Family):
     """
-    Natural cubic spline through values at rising knots t [K from T_ref]. One knot is t = 0, with
-    the value 0 (bias) or 1 (scale). Beyond the outer knots the spline is constant.
+    Natural cubic spline through values at rising knots of t = T_board - T_ref [K]. The knot t = 0
+    has the value 0 (bias) or 1 (scale). Beyond the outer knots the spline is constant.
     """
 
     knots_k: Annotated[tuple[float, ...], QUANTITIES['knots']]
@@ -162,7 +162,7 @@ class CubicSpline(_Family):
         return self._along(self._pieces, t, is_slope=is_slope)
 
     def basis(self, t: Kelvins) -> list[Floats]:
-        """Evaluate the derivatives w.r.t. the free coefficients: the cardinal splines."""
+        """Evaluate the derivatives w.r.t. the free coefficients, which are cardinal splines."""
         return [self._along(pieces, np.asarray(t)) for pieces in self._cardinal_pieces]
 
     def _along(self, pieces: Floats, t: Floats, *, is_slope: bool = False) -> Floats:
@@ -178,9 +178,9 @@ class CubicSpline(_Family):
 @dataclass(frozen=True)
 class Exponential(_Family):
     """
-    ``constant + sum_j amplitudes[j] exp(t / e_fold_k[j])``, t: board less reference temperature;
-    the value at t = 0 is 0 (bias) or 1 (scale). An e-fold [K], of any sign, is the change of
-    temperature that multiplies a term by e.
+    A sum ``constant + sum_j amplitudes[j] exp(t / e_fold_k[j])``, with t the board less the
+    reference temperature. The value at t = 0 is 0 (bias) or 1 (scale). An e-fold [K], of any sign,
+    is the change of temperature that multiplies a term by e.
     """
 
     constant: float
@@ -204,7 +204,7 @@ class Exponential(_Family):
         return self.amplitudes
 
     def with_free(self, values: tuple[float, ...], at_reference: float) -> Exponential:
-        """Return these exponentials with the amplitudes `values`; the e-folds stay the same."""
+        """Return a sum of exponentials with the amplitudes `values` and the same e-folds."""
         return replace(self, constant=at_reference - math.fsum(values), amplitudes=values)
 
     def _evaluate(self, t: Floats, *, is_slope: bool = False) -> Floats:
@@ -224,7 +224,7 @@ TemperatureFunction = Polynomial | CubicSpline | Exponential
 
 
 def check_reference(name: str, function: TemperatureFunction, expected: float) -> None:
-    """Raise ValueError, with the key's name, if a function differs from `expected` at t = 0."""
+    """Raise ValueError if a function is not `expected` at t = 0; `name`: key of the function."""
     with np.errstate(all='ignore'):
         value = function.value(0.0)
     if not abs(value - expected) <= NORMALISATION_TOLERANCE:
@@ -232,13 +232,13 @@ def check_reference(name: str, function: TemperatureFunction, expected: float) -
 
 
 def basis_slopes(function: TemperatureFunction, t: float) -> list[float]:
-    """Return the derivatives [per K] of the functions that `basis` evaluates, at `t` [K]."""
+    """Return the derivatives over temperature [per K] of the basis of a function at `t` [K]."""
     units = np.eye(function.n_free).tolist()
     return [float(function.with_free(tuple(unit), 0.0).slope(t)) for unit in units]
 
 
 def _natural_pieces(knots: npt.ArrayLike, values: npt.ArrayLike) -> Floats:
-    """Return ``a, b, c, d`` of a spline's ``a + b h + c h^2 + d h^3``, h: t less the left knot."""
+    """Return a spline's a, b, c, d in ``a + b h + c h^2 + d h^3``, h: t less the left knot."""
     # The tridiagonal system of the spline is solved with numpy: the node must not import scipy.
     y, h = np.asarray(values), np.diff(np.asarray(knots))
     slopes = np.diff(y) / h
@@ -258,6 +258,6 @@ def in_order(values: Floats, axis: int) -> Floats:
     values = np.ascontiguousarray(values)
     if not values.shape[axis] or math.prod(values.shape[axis + 1 :]) > 1:
         return np.asarray(values.sum(axis=axis))
-    # Along the innermost axis numpy's `sum` adds in an order that depends on the length.
+    # Along the innermost axis the order of additions in numpy's `sum` depends on the length.
     total: Floats = np.add.accumulate(values, axis=axis).take(-1, axis)
     return total

@@ -5,8 +5,7 @@
 import math
 import re
 
-#: Standard gravity [m/s^2], exact by definition: 3rd General Conference on Weights and Measures,
-#: 1901.
+#: Standard gravity [m/s^2], defined by the 3rd General Conference on Weights and Measures, 1901.
 STANDARD_GRAVITY = 9.80665
 #: Angular rate of the Earth's rotation [rad/s]: WGS 84, NIMA TR8350.2.
 EARTH_RATE = 7.292115e-5
@@ -24,7 +23,7 @@ _UNITS = {
 
 
 def ug_text(acceleration: float) -> str:
-    """Format an error in ug or, from 1 mg on, in mg: two digits below 99.5, else an integer."""
+    """Format an error in ug, or in mg from 1 mg on: two digits below 99.5, else an integer."""
     value, unit = acceleration / MICRO_G, 'ug'
     if abs(value) >= 999.5:
         value, unit = value / 1e3, 'mg'

@@ -25,20 +25,20 @@ from .schema import broken
 if TYPE_CHECKING:
     from .calibration import Calibration
 
-#: Limits of the relative scale, that is of its curve minus and plus the effects of all columns.
+#: Limits of the relative scale: its curve over temperature, minus and plus the effects of columns.
 SMALLEST_RELATIVE_SCALE, LARGEST_RELATIVE_SCALE = 0.1, 10.0
-#: Largest bias / full scale; samples in an offset code have a bias of half of their range.
+#: Largest bias / full scale. (Samples in an offset code have a bias of half of their range.)
 FULL_SCALES = 2.0
-#: Largest accepted ratio: effect of a column or of a parameter's sd / limit of bias or scale.
+#: Largest effect of a column, or of a parameter's sd, divided by the limit of bias or scale.
 WORST = 1e6
 #: Number of temperatures at which a function of temperature is checked.
 _GRID = 513
-#: End of error messages: the temperatures over which a function is checked.
+#: Words of error messages for the temperatures at which a function is checked.
 _AROUND = f'range and, on each side, along the tangent for {TANGENT_SPANS:g} of the range'
 
 
 def check_limits(calibration: Calibration, layout: ParameterLayout) -> None:
-    """Raise ValueError, with the key's name, if a part of a calibration exceeds its limits."""
+    """Raise ValueError, with the name of the key, if a value of a calibration is too large."""
     reference, sets = calibration.reference_temperature_c, calibration.regime_sets()
     limit = FULL_SCALES * calibration.unit.full_scale
     _check_axes(calibration, limit)
@@ -110,7 +110,7 @@ def _check_bias(key: str, level: float, extremes: tuple[float, float], limit: fl
 
 
 def _check_scale(key: str, extremes: tuple[float, float], effect: float) -> None:
-    """Refuse a scale curve that, minus or plus the `effect` of all columns, leaves the limits."""
+    """Refuse a scale beyond its limits; `effect`: largest effect of all columns on the scale."""
     for word, value, is_kept, limit in (
         ('above', extremes[0] - effect, operator.gt, SMALLEST_RELATIVE_SCALE),
         ('below', extremes[1] + effect, operator.lt, LARGEST_RELATIVE_SCALE),
@@ -123,7 +123,7 @@ def _check_scale(key: str, extremes: tuple[float, float], effect: float) -> None
 
 
 def _extremes(function: TemperatureFunction, edges: Sequence[float]) -> tuple[float, float]:
-    """Return a function's smallest and largest value between `edges` and on tangents beyond."""
+    """Return the smallest and largest values of a function and its tangents beyond `edges`."""
     lower, upper = edges
     t = np.linspace(lower, upper, _GRID)
     beyond_k = TANGENT_SPANS * (upper - lower)
@@ -142,7 +142,7 @@ def _extremes(function: TemperatureFunction, edges: Sequence[float]) -> tuple[fl
 def _regressors(
     functions: Sequence[TemperatureFunction], edges: Sequence[Sequence[float]]
 ) -> list[float]:
-    """Return each function's largest |derivative| w.r.t. its value at T_ref and coefficients."""
+    """Return largest |derivatives| of functions w.r.t. their value at T_ref and coefficients."""
     pairs = zip(functions, edges, strict=True)
     both = [function.basis(np.array(ends)) for function, ends in pairs]
     return [size for basis in both for size in (1.0, *(float(np.abs(v).max()) for v in basis))]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns statistics of residuals: of corrected less true force, or of ``|f| - g``."""
+"""Owns statistics of residuals, which are corrected less true force, or ``|f| - g``."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from ..typing import Bools, Floats, Ints
 
 @dataclass(frozen=True)
 class ResidualStatistics:
-    """Statistics of the finite residuals, NaN if no residual is finite."""
+    """Number, mean, RMS and largest magnitude of finite residuals; NaN if there are none."""
 
     n: int
     mean: float
@@ -29,13 +29,13 @@ def residual_statistics(residual: Floats) -> ResidualStatistics:
 
 
 def norm_residual(specific_force: Floats, gravity: float | Floats) -> Floats:
-    """Return ``|f| - g`` of forces (..., 3), for any attitude; `gravity`: the known |f|."""
+    """Return ``|f| - g`` of forces, shape (..., 3); `gravity`: the true |f| [m/s^2]."""
     square = np.einsum('...i,...i->...', specific_force, specific_force)
     return np.asarray(np.sqrt(square) - gravity)
 
 
 def means_by(labels: Ints, values: Floats, weight: Floats | None = None) -> Floats:
-    """Return the weighted mean of `values`, (n, ...), of each label in ascending order."""
+    """Return the weighted mean of the `values`, (n, ...), with each label, in order of labels."""
     weight = np.ones(len(labels)) if weight is None else weight
     _, place = np.unique(labels, return_inverse=True)
     count = np.bincount(place, weight)

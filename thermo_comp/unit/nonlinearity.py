@@ -3,7 +3,7 @@
 """
 Owns the nonlinearity of the axes over specific force: terms, correction and variance.
 
-x is the reading of an axis less bias, divided by the scale factor; f is the specific force along
+x is the sample of an axis less bias, divided by the scale factor; f is the specific force along
 the sensitivity axis. With x and f in g, as in IEEE Std 1293::
 
     x = f + K2 f^2 + Kq |f| f + K3 f^3,    K = coefficient + per_kelvin (T_board - T_ref)
@@ -29,16 +29,16 @@ if TYPE_CHECKING:
     from .calibration import Calibration
 
 Kind = Literal['square', 'odd_square', 'cube']
-#: The nonlinear terms in the order of a calibration file, and the power of 1/g in the unit of each
-#: coefficient.
+#: Nonlinear terms in the order of a calibration file. The unit of a coefficient is 1/g to the
+#: power of this number.
 POWERS: dict[Kind, int] = {'square': 1, 'odd_square': 1, 'cube': 2}
 #: Prior sd of K2 [g/g^2]: above the limits of K2 in data sheets of quartz pendulum
 #: accelerometers, 20 to 60 ug/g^2.
 K2_SD = 1e-4
-#: Largest |f| / gravity at which |f| counts as gravity.
+#: Largest |f| / gravity at which |f| is taken as gravity.
 AT_REST = 1.01
-#: Largest accepted slope of the nonlinear terms up to full scale: up to this slope one step of
-#: Halley's method is accurate enough.
+#: Largest accepted slope of the nonlinear terms up to full scale, at which one step of Halley's
+#: method is still accurate enough.
 LARGEST_SLOPE = 0.2
 
 #: Index of the first coefficient of the nonlinearity in a result of `Correction.line`.
@@ -47,7 +47,7 @@ _NONLINEAR: Final = 12 + N_COEFFICIENTS
 
 @dataclass(frozen=True)
 class NonlinearTerm:
-    """One term of the nonlinearity; `coefficient` and `per_kelvin` are for x, y, z."""
+    """One term of the nonlinearity, with the coefficients of the axes x, y, z."""
 
     kind: Annotated[Kind, 'square: K2 f^2; odd_square: Kq abs(f) f; cube: K3 f^3.']
     coefficient: Annotated[
@@ -74,8 +74,8 @@ class NonlinearTerm:
 class Nonlinearity:
     """
     The nonlinearity of the three axes. Beyond the forces of the fit the polynomials continue, and
-    the covariance includes the variance of an unknown term K2 d^2, where d is the force above the
-    largest force of the fit, and K2 has the sd `beyond_sd_g_g2`.
+    the covariance includes the variance of an unknown term K2 d^2. d is the force less the largest
+    force of the fit; K2 has the sd `beyond_sd_g_g2`.
     """
 
     force_range_m_s2: Annotated[
@@ -108,7 +108,7 @@ class Nonlinearity:
                 raise broken('nonlinearity.terms', rule, got)
 
     def coefficients(self, t: Floats) -> Floats:
-        """Return K2, Kq [s^2/m], K3 [s^4/m^2] of axes at t [K] from T_ref, shape (3, 3, n)."""
+        """Return K2, Kq [s^2/m], K3 [s^4/m^2] of axes at T_ref + t [K], shape (3, 3, n)."""
         result = np.zeros((3, 3, len(t)))
         for term in self.terms:
             at, slope = np.array([term.coefficient, term.per_kelvin])[:, :, np.newaxis]
@@ -123,9 +123,9 @@ def unit_of(kind: Kind) -> float:
 
 def linearised(x: Real, k2: Real, kq: Real, k3: Real) -> Real:
     """
-    Solve ``x = f + k2 f^2 + kq |f| f + k3 f^3`` for f by one step of Halley's method from x.
-    Halley's step leaves an error of f of about (k^2 - k3) (x - f)^3, with k = k2 + kq sign(f). At
-    f = 10 g the error of f is 1e-14 g for k2 = 100 ug/g^2, and 1e-11 g for k3 = 10 ug/g^3.
+    Solve ``x = f + k2 f^2 + kq |f| f + k3 f^3`` for f by one step of Halley's method from x. The
+    error of the result is about (k^2 - k3) (x - f)^3, with k = k2 + kq sign(f). At f = 10 g the
+    error is 1e-14 g for k2 = 100 ug/g^2, and 1e-11 g for k3 = 10 ug/g^3.
     """
     r = k3 * x * x
     s = k2 * x + kq * abs(x) + r
@@ -136,7 +136,7 @@ def linearised(x: Real, k2: Real, kq: Real, k3: Real) -> Real:
 def corrected_nonlinear(
     line: Sequence[Real], misalignment: tuple[float, ...], dt: Real, x: Real, y: Real, z: Real
 ) -> tuple[Real, Real, Real, Real, Real, Real, Real, Real, Real]:
-    """Return the force of a sample and its covariance xx to zz, for nonlinear axes."""
+    """Return the force of a sample, and the elements xx to zz of its covariance."""
     bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1 = line[:12]
     k2x, kqx, k3x, k2y, kqy, k3y, k2z, kqz, k3z = line[_NONLINEAR : _NONLINEAR + 9]
     yx, zx, zy = misalignment
@@ -151,7 +151,7 @@ def corrected_nonlinear(
 def nonlinear_covariance(
     line: Sequence[Real], misalignment: tuple[float, ...], x: Real, y: Real, z: Real
 ) -> tuple[Real, Real, Real, Real, Real, Real]:
-    """Evaluate xx, xy, xz, yy, yz, zz of the force's covariance, for nonlinear axes."""
+    """Return the elements xx, xy, xz, yy, yz, zz of the covariance of the force (x, y, z)."""
     xx, xy, xz, yy, yz, zz = covariance_at(line[12:_NONLINEAR], x, y, z)
     dx, ex, fx, gx, dy, ey, fy, gy, dz, ez, fz, gz = line[_NONLINEAR + 9 :]
     yx, zx, zy = misalignment
@@ -172,8 +172,8 @@ def nonlinear_covariance(
 
 class BeyondForce(NamedTuple):
     """
-    The variance of the force due to an unknown square term that begins at the force `edge`:
-    ``growth (2 d)^4`` [m^2/s^4], with d = |x| - `edge` [m/s^2]; 0 below `edge`.
+    The variance of the force on an axis due to an unknown square term that begins at the force
+    `edge` [m/s^2]: ``growth (2 d)^4`` [m^2/s^4], with d = |x| - `edge`; 0 below `edge`.
     """
 
     edge: float
@@ -216,12 +216,12 @@ class ForceCorrection:
         return hold(board, *self._span) - self._reference
 
     def linearise(self, x: Floats, board: Floats) -> Floats:
-        """Subtract the nonlinear terms from readings (n, 3) at board temperatures (n,)."""
+        """Subtract the nonlinear terms from x (see module), (n, 3), at board temperatures (n,)."""
         k2, kq, k3 = self._nonlinearity.coefficients(self.held(board))
         return np.asarray(linearised(x.T, k2, kq, k3).T)
 
     def regressors(self, force: Floats, board: Floats) -> Floats:
-        """Differentiate readings w.r.t. k coefficients, then their changes per K, (n, 3, 2 k)."""
+        """Return derivatives of x w.r.t. k coefficients, then their changes per K, (n, 3, 2 k)."""
         size = np.abs(force)
         each = {'square': force**2, 'odd_square': size * force, 'cube': force**3}
         values = [each[term.kind] / unit_of(term.kind) for term in self._nonlinearity.terms]
@@ -230,7 +230,7 @@ class ForceCorrection:
 
     def rows(self, board: Floats, slow: Floats) -> Floats:
         """
-        Return K2, Kq, K3 of each axis, then the coefficients of x^3 to x^6 in the variance of each
+        Return K2, Kq, K3 of each axis, then coefficients of x^3 to x^6 in the variance of each
         axis, (21, n). `slow`: coefficients of x^2 to x^6 in the variance of each axis, (15, n).
         """
         k = self._nonlinearity.coefficients(self.held(board)).swapaxes(0, 1)
@@ -246,8 +246,8 @@ class ForceCorrection:
 
         The covariance of the coefficients of the k terms is ``factor @ factor.T + diag(diagonal)``
         with `factor` of shape (2 k, rank); `on_bias`, `on_scale`, (rank, n): bias and relative
-        scale due to each column of `factor`. The covariances of Kq with other parameters are
-        omitted: most of them are negative, so in most cases the result is too large.
+        scale due to each column of `factor`. Covariances of Kq with other parameters, which are
+        omitted, are mostly negative, so the result is mostly too large.
         """
         terms = self._nonlinearity.terms
         k, kinds = len(terms), [list(POWERS).index(term.kind) for term in terms]

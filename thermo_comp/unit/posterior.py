@@ -20,7 +20,7 @@ from .schema import broken
 
 #: Largest share of a parameter's variance that may be in `diagonal` instead of `factor`.
 _TOLERANCE = 1e-5
-#: Most negative eigenvalue of a correlation matrix that rounding can cause.
+#: Most negative eigenvalue of a correlation matrix that is accepted as due to rounding.
 _MOST_NEGATIVE = -1e-6
 _FLOAT32 = np.dtype('<f4')
 
@@ -50,7 +50,7 @@ class Posterior:
 
     @classmethod
     def of(cls, matrix: npt.NDArray[np.floating[Any]], variances: Floats) -> Posterior:
-        """Encode a factor, (n_parameters, rank), and the variances to add to the diagonal."""
+        """Encode the factor, (n_parameters, rank), and the diagonal of a covariance."""
         return cls(matrix.shape[1], _encoded(matrix), _encoded(variances))
 
     @property
@@ -82,9 +82,10 @@ class Posterior:
 
 class Block(NamedTuple):
     """
-    Indices of the parameters of an axis' bias or scale in the posterior. `static`, `dynamic`:
-    index of the value at T_ref in the regime; the other coefficients of the regime follow it.
-    `response`: index of the first weight of the columns; `end`: index after the last weight.
+    Indices, in the posterior, of the parameters of an axis' bias or scale.
+
+    static, dynamic: index of the regime's value at T_ref; its curve's coefficients follow
+    response: index of the first weight of the columns; end: index after the last weight
     """
 
     static: int
@@ -113,9 +114,9 @@ def lay_out(
 
 class ParameterLayout(NamedTuple):
     """
-    The order of a calibration's parameters in its posterior: for each axis bias [input units],
-    then scale [relative]; from the index `nonlinear` on, for each axis nonlinear coefficients,
-    then their changes per kelvin; from `misalignment` on M[1][0], M[2][0], M[2][1].
+    The order of a calibration's parameters in its posterior: bias [input units] and relative scale
+    of each axis. From index `nonlinear` on, each axis has nonlinear coefficients, then their
+    changes per kelvin. From index `misalignment` on, there are M[1][0], M[2][0], M[2][1].
     """
 
     bias: list[Block]
@@ -136,12 +137,12 @@ def posterior_of(covariance: Floats) -> Posterior:
     diagonal = np.diag(covariance).copy()
     if not np.all(diagonal >= 0.0):
         raise ValueError('`covariance` must not have a negative variance')
-    # The covariance is scaled to correlations: entries in counts^2 and relative^2 differ by 10
-    # orders of magnitude.
+    # Scale the covariance to correlations: variances of biases [counts^2] and of relative scales
+    # differ by 10 orders of magnitude.
     scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     with np.errstate(over='ignore'):
         correlation = (covariance + covariance.T) / 2.0 / scale / scale[:, np.newaxis]
-    # `eigh` needs finite numbers; a matrix with entries above 1 is not a correlation anyway.
+    # `eigh` needs finite numbers. A matrix with entries of 2 or more is no correlation matrix.
     is_bounded = np.abs(correlation).max(initial=0.0) < 2.0
     eigenvalues, vectors = np.linalg.eigh(correlation if is_bounded else -np.eye(1))
     if not eigenvalues[0] > _MOST_NEGATIVE:
@@ -161,7 +162,7 @@ def _encoded(numbers: npt.NDArray[np.floating[Any]]) -> str:
 
 
 def _single(numbers: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float32]:
-    # A number that overflows single precision becomes inf, which the reader refuses.
+    # A number that overflows single precision becomes inf, and `_decoded` refuses it.
     with np.errstate(over='ignore'):
         return numbers.astype(_FLOAT32)
 

@@ -6,10 +6,9 @@ unknown initial lag states, and the thermal states of a soak and of a ramp.
 
 After s seconds of a ramp of rate q each gradient is ``board_lag_s q``, a part of time constant tau
 lags the board by ``tau q (1 - exp(-s / tau))``, and the output of a play lags its input by the
-play's half-width. In a soak (q = 0) all gradients, lags and plays are 0.
-`soak_gradient_k` is added to the gradient of the first sensor and its lags in soaks and ramps. In
-a soak the static curves apply, in a ramp the dynamic curves. Predicted variances include neither
-noise nor thermometer errors.
+play's half-width. In a soak (q = 0) gradients, lags and plays are 0. The gradient of the first
+sensor by self-heating, `soak_gradient_k`, is added in soaks and ramps. The static curves apply in
+soaks, the dynamic curves in ramps. Variances include neither noise nor thermometer errors.
 """
 
 from collections.abc import Callable
@@ -39,8 +38,8 @@ class SlowUncertainty:
         self._root = start_root(lags)
         edges = [edge for part in calibration.regime_sets() for edge in part.temperature_range_c]
         self._span = max(edges) - min(edges)
-        #: Value of each lag [K] / rate of the board temperature in a ramp [K/s], (2, n_lags): row
-        #: 0 due to lags of the board in a long ramp, row 1 due to lags of gradients at the onset.
+        #: Value of each lag [K] / rate of the board temperature in a ramp [K/s], (2, n_lags). Row
+        #: 0: lags of the board in a long ramp; row 1: lags of gradients at the onset of a ramp.
         self._behind_s = np.zeros((2, len(lags)))
         for k, lag in enumerate(lags):
             for (name, tau), weight in lag.first_order_weights.items():
@@ -51,8 +50,8 @@ class SlowUncertainty:
         diagonal[layout.misalignment :] = np.square(calibration.misalignment_sd)
         if posterior is not None:
             matrix, diagonal = posterior.matrix, posterior.variances
-        #: For each axis: factor and diagonal of the covariance of the parameters of the bias, of
-        #: the scale, of the nonlinear terms. `_misalignment`: factor, diagonal of M's covariance.
+        #: For each axis: factor and diagonal of the covariances of the parameters of the bias, of
+        #: the scale, and of the nonlinear terms.
         self._blocks = [
             [(matrix[part], diagonal[part]) for part in (bias.rows, scale.rows, force)]
             for bias, scale, force in zip(layout.bias, layout.scale, layout.force, strict=True)
@@ -63,12 +62,13 @@ class SlowUncertainty:
         self, states: Floats, start_shares: Floats, start_rates: Floats | None = None
     ) -> Floats:
         """
-        Evaluate the rows of the error covariance (see `unit.covariance`) at thermal states, shape
-        (width, n). `start_shares`, (n_lags, n): share of each lag's initial state that remains;
-        `start_rates`, (n,): board rate of a ramp at the start [K/s]; None: the present rate.
-        Returns `Correction.n_slow` rows: a, b, c of each axis' error variance ``v(x) = a + b x + c
-        x^2`` [m^2/s^4], then the covariances of the pairs of errors in `BETWEEN`, then the
-        contributions of a nonlinearity to the coefficients of x^2 to x^6 of v(x).
+        Return rows of the error covariance (see `unit.covariance`) at thermal states, (width, n).
+
+        `start_shares`, (n_lags, n): share of each lag's initial state that remains; `start_rates`,
+        (n,): board rate of a ramp at the start [K/s]; None: the present rate. The rows, of number
+        `Correction.n_slow`, are a, b, c of each axis' error variance ``v(x) = a + b x + c x^2``
+        [m^2/s^4], the covariances of the pairs of errors in `BETWEEN`, and the contributions of
+        a nonlinearity to the coefficients of x^2 to x^6 of v(x).
         """
         cuts = range(_CHUNK, states.shape[1], _CHUNK)
         rates = np.abs(states[RATE]) if start_rates is None else start_rates
@@ -78,15 +78,15 @@ class SlowUncertainty:
 
     def of_start(self, states: Floats, start_shares: Floats, rates: Floats) -> Floats:
         """
-        Differentiate bias [input units] and scale [relative] w.r.t. the unknown initial lag
-        states, as variables of unit variance, shape (n_unknown, 6, n). `rates`: rate of the board
-        temperature in a ramp that is assumed at the start, (n,) [K/s].
+        Return derivatives of bias [input units] and relative scale w.r.t. the unknown initial lag
+        states, each scaled to unit variance, shape (n_unknown, 6, n). `rates`: board rate in a
+        ramp that is assumed at the start, (n,) [K/s].
         """
         table = self._correction.table
         factors, _ = table.factors(states[BOARD], states[WEIGHT])
         by_pair = self._correction.by_pairs(table.slopes(states)[0] * factors)
         by_lag = by_pair[self._correction.layout.lag_pairs] * start_shares[:, np.newaxis]
-        # The unit may have been switched on in a ramp: the sd of a lag at the start is the lag in
+        # For a unit that was switched on in a ramp, the sd of a lag at the start is the lag in
         # a ramp of rate `rates`, limited to the calibrated span of temperatures.
         behind = hold(self._behind_s[:, :, np.newaxis] * rates, -self._span, self._span)
         in_ramp = in_order(by_lag * behind[:, :, np.newaxis], 1)
@@ -145,8 +145,8 @@ def in_a_soak(
     calibration: Calibration, temperature: float | None = None
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """
-    Return bias [m/s^2], its sd, scale [units per m/s^2], its relative sd, shapes (3,), in a soak
-    at a board temperature [degC], by default the reference temperature.
+    Return bias [m/s^2], its sd, scale [input units per m/s^2] and its relative sd, shapes (3,), in
+    a soak at a board temperature [degC], by default the reference temperature.
     """
     at = np.array([calibration.reference_temperature_c if temperature is None else temperature])
     bias, sd_bias, scale, sd_scale = bias_scale_and_sd(calibration, ramp_states(calibration, at))
@@ -154,7 +154,7 @@ def in_a_soak(
 
 
 class Coefficients(NamedTuple):
-    """A nonlinear coefficient of the three axes and its sd, shapes (3,), with their unit."""
+    """A coefficient of the nonlinearity of the three axes, and its sd, shapes (3,)."""
 
     name: str
     unit: str
@@ -184,7 +184,7 @@ def nonlinear_coefficients(calibration: Calibration) -> list[Coefficients]:
 
 
 def bias_and_scale(calibration: Calibration, states: Floats) -> tuple[Floats, Floats]:
-    """Evaluate bias [m/s^2] and scale [input units per m/s^2] at thermal states, shapes (n, 3)."""
+    """Return bias [m/s^2] and scale [input units per m/s^2] at thermal states, shapes (n, 3)."""
     correction = Correction(calibration)
     bias, scale = correction.bias_scale(states.T)
     return (bias / correction.K).T, scale.T
@@ -195,8 +195,8 @@ def bias_scale_and_sd(
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """
     Return bias [m/s^2], its sd, scale [input units per m/s^2] and its relative sd at thermal
-    states, shapes (n, 3). The sds include the error of the self-heating gradient. The lack of
-    fit of an axis at 1 g may be an error of the bias or of the scale, so both sds include it.
+    states, shapes (n, 3). The sds include the error of the self-heating gradient, and the lack of
+    fit, which at 1 g may be due to the bias or to the scale.
     """
     correction = Correction(calibration)
     slow = SlowUncertainty(calibration, correction)
@@ -241,7 +241,7 @@ def ramp_states(
 
 
 def _add_gradient(states: Floats, calibration: Calibration, change_k: float) -> None:
-    """Add `change_k` [K] to the gradient of the first sensor, and to its lags, in `states`."""
+    """Add `change_k` [K] to the first sensor's gradient, and to its lags, in `states`."""
     layout = StateLayout(memory_of_unit(calibration))
     for quantity, place in layout.places.items():
         if isinstance(quantity, Gradient) and quantity.input == calibration.sensors[0]:

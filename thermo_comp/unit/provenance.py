@@ -44,8 +44,8 @@ class Source:
 @dataclass(frozen=True)
 class ResidualSummary:
     """
-    Residual ``|f| - g`` of the fitted windows of one regime or both. `raw_rms_m_s2` is the RMS if
-    only bias and scale at T_ref are corrected.
+    Residual ``|f| - g`` of the fitted windows of one regime or of both regimes. `raw_rms_m_s2` is
+    the RMS of windows corrected for bias and scale at T_ref only.
     """
 
     section: str
@@ -56,7 +56,7 @@ class ResidualSummary:
     left_out_rms_m_s2: Annotated[
         _Error | None,
         'RMS error of the magnitude of the force in positions, each corrected by a fit to the '
-        'others; null if the others do not determine this magnitude in each position.',
+        'other positions; null if these do not determine the magnitude in each position.',
     ] = None
     left_out_drift_m_s2: Annotated[
         _Error | None,
@@ -82,7 +82,7 @@ class Provenance:
 
     @property
     def date(self) -> str:
-        """The date of the test if known, else the date of the fit, else ''."""
+        """The date of the test if it is known, else the date of the fit, or ''."""
         return self.tested or self.created
 
     @property
@@ -97,6 +97,6 @@ class Provenance:
 
 
 def _of_all(values: list[tuple[str, float | None]]) -> float:
-    """Return the value of the section ``all``; NaN where unknown."""
+    """Return the value of the section ``all``; NaN if it is unknown."""
     value = dict(values).get('all')
     return math.nan if value is None else value

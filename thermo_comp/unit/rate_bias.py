@@ -50,7 +50,7 @@ class RateSet:
 
 @dataclass(frozen=True)
 class RateTerm(Column):
-    """A column (regressor) of the thermal response, with its weights on the three axes."""
+    """A column (regressor) of the thermal response, with its weights on the gyroscope's bias."""
 
     bias: Annotated[Vector, 'Weights on the bias, rad/s per unit of the column.'] = field(
         kw_only=True
@@ -60,9 +60,8 @@ class RateTerm(Column):
 @dataclass(frozen=True)
 class Gyroscope:
     """
-    Bias of the angular rate over temperature: ``w = measured - bias``. The scale factor is 1.
-
-    Parameters of `posterior`, for each axis: coefficients of each regime, then column weights.
+    Bias of the angular rate over temperature: ``w = measured - bias``. The scale factor is 1. For
+    each axis `posterior` has the coefficients of both regimes, then the weights of the columns.
     """
 
     bias_rad_s: Annotated[

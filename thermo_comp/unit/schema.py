@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the conversion of plain values to dataclasses and back: type hints are a file's schema.
+Owns the conversion of plain values to dataclasses and back: type hints are the schema of a file.
 
-Hints are float, int, bool, str, Literal, tuple, dataclass, unions of these and None, and
-``Annotated[hint, Bounds(...), 'what it means']``. The only conversions are those of a mapping to a
-dataclass, a list to a tuple and an integer to a float. Rules between keys are checked by the
-dataclass, which raises a ValueError that starts with the key in backticks.
+Hints are float, int, bool, str, Literal, tuple, dataclass, None, unions of these types, and
+``Annotated[hint, Bounds(...), 'description']``. A mapping is converted to a dataclass, a list to
+a tuple, an integer to a float; other conversions are errors. Each dataclass checks rules between
+its keys, and raises a ValueError that starts with a key in backticks.
 """
 
 import dataclasses
@@ -28,7 +28,7 @@ Value = TypeVar('Value')
 
 
 class SchemaError(ValueError):
-    """A value that breaks the schema: the key's path and the expected value."""
+    """A value that breaks the schema; `key`: path of its key; `message`: the expected value."""
 
     def __init__(self, key: str, message: str) -> None:
         self.key = key
@@ -47,13 +47,13 @@ def build(hint: type[Value], data: Any, key: str = '') -> Value:
 
 
 def broken(key: str, rule: str, got: object) -> ValueError:
-    """Return the error of a key whose value breaks a rule: '`key` must rule, got value'."""
+    """Return the error for a key whose value breaks a rule; `rule`: words after 'must'."""
     shown = f'{got:g}' if isinstance(got, float) else got
     return ValueError(f'`{key}` must {rule}, got {shown}')
 
 
 def check_ranges(value: object, **spans: Bounds) -> None:
-    """Raise ValueError, with the key's name, if a range is reversed or narrower than permitted."""
+    """Raise ValueError for a reversed range, or one narrower than `at_least` of its bounds."""
     for key, span in spans.items():
         lower, upper = getattr(value, key)
         shown = f'[{lower}, {upper}]'
@@ -118,7 +118,7 @@ def _object(cls: type, data: Any, key: str) -> Any:
     if not isinstance(data, dict):
         _refuse(key, 'must be a mapping of keys', data)
     hints, required = fields_of(cls)
-    # If a required key is misspelt, a key is unknown and a key is missing: report the unknown key.
+    # A misspelt required key is an unknown key, and a missing key: report the unknown key first.
     for name in data:
         if name not in hints:
             others = ', '.join(other for other in hints if other not in data)
@@ -181,7 +181,7 @@ def _joined(key: str, name: str) -> str:
 
 
 def _shown_name(name: str) -> str:
-    # An invalid name may be any text: unprintable text is shown by `repr`, long text is cut.
+    # An invalid name may be any text: show unprintable text by `repr`, and cut long text.
     shown = name if name.isprintable() and len(name) < _LONGEST_NAME else repr(name)
     return shown[:_LONGEST_NAME]
 

@@ -5,9 +5,9 @@ Owns the table of the kinds of regressors of the thermal response.
 
 The value of a column is ``u = form.value(x)``, ``x = (n - centre) / width``; n is a quantity of
 the thermal state (`source`) or, if `is_temperature`, ``t - source``: the temperature of a part
-that lags the board by `source`, less T_ref. Notation: ``t = T_board - T_ref``, ``g_s = T_s -
-T_board`` of a sensor s, and ``q_s = g_s - rest``. The constant `rest` is 0 or, in a unit that
-heats itself, g_s in a soak. Even functions of q_s = g_s - rest have equal values in heating and in
+that lags the board by `source`, less T_ref. Formulas contain ``t = T_board - T_ref``, the gradient
+``g_s = T_s - T_board`` of a sensor s, and ``q_s = g_s - rest``; the constant `rest` is 0 or, in a
+unit that heats itself, g_s in a soak. Even functions of q_s have equal values in heating and in
 cooling at the same rate.
 """
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class Form(NamedTuple):
-    """A function of x and its derivative; an x gives the same bits alone and in any array."""
+    """A function of x and its derivative; a single x gives the same bits as x in an array."""
 
     value: Callable[[Floats], Floats]
     slope: Callable[[Floats], Floats]
@@ -54,9 +54,9 @@ class Term:
 
     kind: name of the kind in the calibration file
     formula: formula of the value, for the description of the file
-    source: function that returns the quantity of the thermal state that a column is computed from
+    source: function of a column, returns the quantity of the thermal state that determines it
     form, is_temperature: see this module's docstring
-    order: power of temperature in the value of a column, without the column's factor t^power
+    order: power of temperature in the value u of a column
     centre_key, width_key: keys of a column with centre and width of x; '' for centre 0 and width 1
     positive: keys of a column that must be greater than 0
     bounds: range of all possible values of the kind; None: the range is that of the fitted bags
@@ -76,11 +76,11 @@ class Term:
     has_scale: bool = True
 
     def centre(self, column: Column) -> float:
-        """Return the centre in a column's ``x = (n - centre) / width`` (see this module's top)."""
+        """Return the centre in a column's ``x = (n - centre) / width`` (see module docstring)."""
         return float(getattr(column, self.centre_key, 0.0))
 
     def width(self, column: Column) -> float:
-        """Return the width in a column's ``x = (n - centre) / width`` (see this module's top)."""
+        """Return the width in a column's ``x = (n - centre) / width`` (see module docstring)."""
         return float(getattr(column, self.width_key, 1.0))
 
     def largest(self, column: Column) -> float:
@@ -90,7 +90,7 @@ class Term:
         return (column.source.largest + abs(self.centre(column))) ** self.order
 
     def steepest(self, column: Column, raw: Floats, flow_k: float) -> float:
-        """Return the largest slope of u [1/K]; for bounded u, 1 / the RMS gradient `flow_k`."""
+        """Return the largest slope of u over temperature; for bounded u, 1 / `flow_k` [1/K]."""
         if self.bounds is not None:
             return 1.0 / flow_k
         largest = float(np.abs(raw).max(initial=0.0)) ** (1.0 / self.order)
@@ -133,12 +133,12 @@ _ALL: Final = (
     # column for a part between two thermometers.
     Term('board', 'T_board - lagged T_board', _part, positive=('tau_s',)),
     Term('gradient_lag', 'lagged g_s', _lagged_gradient, positive=('tau_s',)),
-    # `square` with lag: for a curve over a part's temperature; without: squared heat flow.
+    # `square` with a lag: a term of a curve over a part's temperature; else: squared heat flow.
     Term(
         *('square', '(T_board - lagged T_board)^2, or q_s^2 without lag', _part_or_gradient),
         *(_SQUARE, 2, 'rest_k'),
     ),
-    # Cubic curve over the temperature of a part.
+    # `cube`: a term of a curve over a part's temperature.
     Term('cube', '(T_board - lagged T_board)^3', _part, _CUBE, 3, 'rest_k', positive=('tau_s',)),
     # Even functions of q_s. `size`: heat pump load; `gradient_even`: a load that saturates.
     Term('size', 'abs(q_s)', _gradient, _SIZE, centre_key='rest_k'),
@@ -149,9 +149,9 @@ _ALL: Final = (
         positive=('width_k',),
         bounds=(0.0, 1.0),
     ),
-    # Rate-independent hysteresis over temperature: a play operator of t, or of t lagged.
+    # `play`: rate-independent hysteresis over t, or over the temperature of a part.
     Term('play', 'play(t) - t', _play, positive=('width_k',), has_scale=False),
-    # Curve whose slope changes at one temperature of a part.
+    # `bend`: a curve whose slope changes at one temperature of a part.
     Term(
         *('bend', 'max(lagged t - knee_k, 0)', _part, _BEND),
         centre_key='knee_k',
