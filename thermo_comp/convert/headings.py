@@ -99,7 +99,7 @@ def read_headings(
     accel = accel or next((three for key, three in every.items() if _ROS_ACCEL.search(key)), None)
     if accel is None:
         return None
-    # A heading such as `ax_g` ends with the unit g, not with the letter of a gyroscope.
+    # Exclude the accelerometer: the g of a heading like `ax_g` is a unit, and no gyroscope.
     others = (key for key, three in triads.items() if three != accel)
     gyro = next((triads[key] for key in others if _GYRO.search(key)), None)
     time = times[-1] if times else ''

@@ -273,7 +273,7 @@ def _not_used(headings: Sequence[str], width: int, used: Container[int | None]) 
 
 
 def exact_ns(cell: object, unit: TimeUnit | None) -> int:
-    """Return the exact stamp of a number or date; `NO_STAMP` if neither, or beyond 64 bits."""
+    """Return the exact stamp of a number or date; `NO_STAMP` for other text, or beyond 64 bits."""
     text = str(cell).strip()
     try:
         number = (

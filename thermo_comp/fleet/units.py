@@ -22,7 +22,7 @@ _STAMPS = (
     *('mtime', 'LastModified', 'last_modified', 'updated', 'created'),
 )
 
-# Ends of the names of tables and logs. Folders also have other files with names in .txt.
+# Ends of the names of tables and logs; .txt is omitted, because notes beside bags end in .txt.
 _TABLES = ('.csv', '.tsv', '.mat', '.parquet', '.ulg', '.bin')
 
 
@@ -85,7 +85,7 @@ class Storage:
 
     @contextmanager
     def here(self, name: str, files: Sequence[StoredFile]) -> Iterator[Path]:
-        """Yield the path of a local bag, or of a temporary copy; OSError if the copy fails."""
+        """Yield a bag's path, or the path of a copy of a remote bag; OSError if the copy fails."""
         if self._is_local:
             yield Path(self._root, name)
             return

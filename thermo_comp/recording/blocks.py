@@ -227,8 +227,7 @@ def with_stamps(block: Block, last_ns: int) -> tuple[Block, int]:
     """
     Give each reading without a stamp the newest stamp of the samples before it, because its log
     time depends on the speed of a playback; drop readings without a stamp before the first sample.
-    `last_ns`: newest sample stamp before the block. Return the block and the newest sample stamp
-    up to its end.
+    `last_ns`: newest sample stamp before the block. Return the block and the newest sample stamp.
     """
     samples = np.concatenate(([last_ns], block.accel_stamp_ns))
     jumps = np.flatnonzero(np.diff(samples) < -_JUMP_NS) + 1

@@ -23,7 +23,7 @@ from .reader import RecordingReader, open_recording
 from .stillness import STILL_SD, CellAccumulator, Cells, still_intervals, why_restless
 from .topics import PLAIN, Topics, shown
 
-KELVINS = (180.0, 480.0)  # readings in this range are taken for kelvins: too hot for any board
+KELVINS = (180.0, 480.0)  # range of readings taken for kelvins: no board is above 180 degC
 _RAMP_WINDOW_S = 120.0  # time over which the rate of a ramp is averaged [s]
 _CELL_S, _MIN_REST_S = 0.5, 3.0  # lengths of a cell and of the shortest still interval [s]
 _GAP_INTERVALS = 5.0  # shortest gap between samples / median interval in the first block
