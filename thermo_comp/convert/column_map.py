@@ -34,7 +34,7 @@ _CELSIUS = {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}
 _STEPS_S = (5e-5, 0.5)  # range of plausible intervals between samples [s]
 _SLOW_S = 2.0  # longest plausible interval [s] if the unit turns within a block of samples
 _BLOCK, _QUIET = 12, 0.02  # number of samples of a block; largest sd of a still block [g]
-_TURN = 0.5  # turn too large for a hand in a block if the samples are 1 ms apart [rad]
+_TURN = 0.5  # turn that a hand cannot make within a block of samples at 1 kHz [rad]
 _FASTEST_RAD_S = 20.0  # largest angular rate of a unit that is turned by hand [rad/s]
 #: Range of stamps from 2000 to 2038, and largest interval between such stamps [s]. Times since
 #: power-up in us, taken for seconds, may lie in this range, but have intervals above 60 s.

@@ -33,7 +33,7 @@ from ..unit.gravity import STANDARD_GRAVITY
 
 Unit = Literal['m/s^2', 'g', 'mg', 'counts']
 
-PER_G: dict[Unit, float] = {'g': 1.0, 'm/s^2': STANDARD_GRAVITY, 'mg': 1000.0}  # |sample| at rest
+PER_G: dict[Unit, float] = {'g': 1.0, 'm/s^2': STANDARD_GRAVITY, 'mg': 1000.0}  # 1 g in each unit
 _TOLERANCE = 0.2  # relative tolerance of |sample| at rest: above the errors of cheap sensors
 _SENSITIVITIES = (2048, 4096, 8192, 16384)  # 16-bit sensors of +-16 g to +-2 g [counts/g]
 

@@ -32,7 +32,7 @@ from ..plain_yaml import load_plain_yaml
 from ..typing import Floats
 
 _ARDUPILOT_REFERENCE_C = 35.0  # temperature at which d of ArduPilot's cubic is 0 [degC]
-_ARDUPILOT_SCALE = 1e6  # ArduPilot's coefficient / coefficient in m/s^2 or rad/s per power of K
+_ARDUPILOT_SCALE = 1e6  # ArduPilot's coefficient / the same coefficient in m/s^2 or rad/s per K^n
 _NO_TEMPERATURE = -273.0  # ArduPilot's value for an unknown calibration temperature [degC]
 _AXES = ('X', 'Y', 'Z')
 _THERMAL_NOTE = (

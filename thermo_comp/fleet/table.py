@@ -41,7 +41,7 @@ class TableColumn(NamedTuple):
     """A column of the table: name with the unit of measurement, kind and meaning."""
 
     name: str
-    kind: str  # text, whole, number
+    kind: str  # 'text', 'whole' (integer) or 'number'
     meaning: str
     # The next fields describe a quantity that is compared between units; see `_COMPARED`.
     label: str = ''

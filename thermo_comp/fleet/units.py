@@ -40,7 +40,7 @@ Bags = dict[str, list[StoredFile]]
 
 @dataclass(frozen=True)
 class FoundUnit:
-    """The bags of one thermal test; `name`: their folder, or serial; `lot`: top folder, or ''."""
+    """Bags of a thermal test; `name`: folder of the bags or serial; `lot`: top folder or ''."""
 
     name: str
     lot: str

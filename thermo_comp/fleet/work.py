@@ -23,7 +23,7 @@ from ..unit.calibration_file import dump_calibration
 from .table import FAILED, REFUSED, Cell, fitted_cells, row_of
 from .units import FoundUnit, Storage, words
 
-_WAIT_S = 30.0  # time to wait for a Dask scheduler, and for its first worker
+_WAIT_S = 30.0  # time to wait for a Dask scheduler, and for its first worker [s]
 _UNIT_OF: dict[str | None, Literal['counts', 'm/s^2']] = {'counts': 'counts', 'imu': 'm/s^2'}
 
 

@@ -127,7 +127,7 @@ def survey_recording(
         topic = reader.topics.get('accel')
         total = reader.info.topics[topic][1] if topic else 0
         accumulator, causes = CellAccumulator(_CELL_S, None), CauseCounter()
-        readings: dict[str, list[Readings]] = {}  # all are kept: they are far fewer than samples
+        readings: dict[str, list[Readings]] = {}  # kept in memory: far fewer than samples
         clock = _Clock()
         for block in reader.blocks():
             for name, temperature in block.temperatures.items():
@@ -171,7 +171,7 @@ class _Clock:
     last_ns: int = 0
     newest_ns: int = 0  # newest stamp since the last restart of the clock
     step_ns: float = 0.0  # median interval of the first stamps that rise
-    n_backwards: int = 0  # number of stamps that do not exceed all earlier ones since a restart
+    n_backwards: int = 0  # number of stamps not above the newest stamp since a restart
     n_restarts: int = 0  # number of steps back by more than `LONGEST_PAUSE_NS`
     n_gaps: int = 0
     longest_gap_s: float = 0.0

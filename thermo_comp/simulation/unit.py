@@ -168,7 +168,7 @@ class Bend:
 
 @dataclass(frozen=True)
 class SwitchedLoad:
-    """Electronics that heat a part by `power` [W], on and off for random times in `spell` [s]."""
+    """Electronics that heat a part by `power` [W], on and off for times uniform in `spell` [s]."""
 
     part: str
     power: float
