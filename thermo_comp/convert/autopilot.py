@@ -45,10 +45,10 @@ T = TypeVar('T')
 
 
 class _Correction(NamedTuple):
-    """A parameter, 1 while the autopilot corrects thermal drift, and the parameter's history."""
+    """A parameter that is 1 while the autopilot corrects thermal drift, and its history."""
 
     parameter: str
-    history: Sequence[tuple[int, float]]  # (time since boot [ns], value from this time on)
+    history: Sequence[tuple[int, float]]  # time since boot [ns], value from this time on
     advice: str  # how to log samples without this correction
 
 

@@ -34,17 +34,17 @@ _CELSIUS = {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}
 _STEPS_S = (5e-5, 0.5)  # range of plausible intervals between samples [s]
 _SLOW_S = 2.0  # longest plausible interval [s] if the unit turns within a block of samples
 _BLOCK, _QUIET = 12, 0.02  # number of samples of a block; largest sd of a still block [g]
-_TURN = 0.5  # smallest turn within a block that a hand cannot make if intervals are in ms [rad]
+_TURN = 0.5  # turn that a hand cannot make within a block of samples at 1 kHz [rad]
 _FASTEST_RAD_S = 20.0  # largest angular rate of a unit that is turned by hand [rad/s]
 #: Range of stamps from 2000 to 2038, and largest interval between such stamps [s]. Times since
 #: power-up in us, taken for seconds, may lie in this range, but have intervals above 60 s.
 _SINCE_1970_S, _SINCE_1970_STEP_S = (946_684_800.0, 2_147_483_648.0), 60.0
-_FASTEST_K_S = 0.5  # largest change of temperature / duration of a log; a hair dryer: 0.1 K/s
+_FASTEST_K_S = 0.5  # largest mean rate of temperature over a log [K/s] (a hair dryer: 0.1 K/s)
 # Largest share of rows in which a temperature in whole degrees changes. A column with the numbers
 # of boards or sensors alternates from row to row, so the number changes in nearly all rows.
 _FEW_CHANGES = 0.1
 _RISING = 0.7  # smallest share of rows whose time is later than the time of the row before
-_WRAP_EDGE = 0.1  # a time step from the last to the first tenth of 32 bits counts as an overflow
+_WRAP_EDGE = 0.1  # an overflow is a step from the last to the first tenth of the 32-bit range
 _A_MAP = 'a column map: --columns MAP'
 
 
@@ -234,7 +234,7 @@ def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
     accel = values(named.accel)
     unit = named.accel_unit
     if not unit:
-        # The unit of the times is not known yet: the search for rests takes 1 s between samples.
+        # The unit of the times is not known yet: the search for rests assumes 1 s between samples.
         still = find_stillness(np.arange(len(accel)) * 10**9, accel)
         unit, reason = infer_unit(still.magnitude)
         if unit == 'unknown':

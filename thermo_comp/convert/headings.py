@@ -40,7 +40,7 @@ _OTHER = re.compile('mag|mfield|orient|euler|quat|angle|lin|free|user|grav|pos|v
 _TEMPERATURE = re.compile(
     'temp|tmp|celsius|(^|_)t_?c($|_)|^t_(board|case|imu|die|chip|sensor|air|amb|room|baro)'
 )
-_OUTSIDE = re.compile('case|air|amb|baro|bmp|aht|room|hous|env')  # thermometers off the board
+_OUTSIDE = re.compile('case|air|amb|baro|bmp|aht|room|hous|env')  # thermometers not on the board
 # Unit of a temperature at the end of a heading; words of headings that name no temperature.
 _DEGREES_END = re.compile('(^|_)(deg_?[cfk]|kelvin|fahrenheit)$')
 _NO_READING = re.compile('(^|_)(raw|adc|counts?|lsb|id|rev|status|valid|voltage|volts?|mv)(_|$)')
@@ -78,7 +78,7 @@ class Headings:
     accel_unit: str
     gyro: Triple | None
     gyro_unit: str
-    thermometers: dict[str, tuple[str, str]]  # by thermometer: its column and unit
+    thermometers: dict[str, tuple[str, str]]  # column and unit of each thermometer
 
 
 def read_headings(
@@ -99,7 +99,7 @@ def read_headings(
     accel = accel or next((three for key, three in every.items() if _ROS_ACCEL.search(key)), None)
     if accel is None:
         return None
-    # A heading such as `ax_g` ends with the unit g, not with the letter of a gyroscope.
+    # Exclude the accelerometer: the g of a heading like `ax_g` is a unit, and no gyroscope.
     others = (key for key, three in triads.items() if three != accel)
     gyro = next((triads[key] for key in others if _GYRO.search(key)), None)
     time = times[-1] if times else ''

@@ -33,12 +33,12 @@ from ..unit.gravity import STANDARD_GRAVITY
 
 Unit = Literal['m/s^2', 'g', 'mg', 'counts']
 
-PER_G: dict[Unit, float] = {'g': 1.0, 'm/s^2': STANDARD_GRAVITY, 'mg': 1000.0}  # |sample| at rest
+PER_G: dict[Unit, float] = {'g': 1.0, 'm/s^2': STANDARD_GRAVITY, 'mg': 1000.0}  # 1 g in each unit
 _TOLERANCE = 0.2  # relative tolerance of |sample| at rest: above the errors of cheap sensors
 _SENSITIVITIES = (2048, 4096, 8192, 16384)  # 16-bit sensors of +-16 g to +-2 g [counts/g]
 
 _CELL_S, _MIN_SAMPLES = 0.5, 12  # length of a cell of samples [s], least number of samples in it
-_MOVING_RATIO = 4.0  # largest sd of a still cell / lower quartile of sds; noise alone: below 2
+_MOVING_RATIO = 4.0  # largest sd of a still cell / lower quartile of sds; below 2 for noise alone
 _MERGE_NS = 10 * 10**9  # shortest rest between two separate movements [ns]
 
 NO_STAMP = np.iinfo(np.int64).min  # stands for the stamp of a row without a stamp
@@ -289,7 +289,7 @@ def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:
         return Stillness(float('nan'), float('nan'), 0.0, ())
     sd = np.sqrt(cells.variance[full].mean(axis=1))
     # The quiet level is the lower quartile and not the median of the cells' sd, because a unit may
-    # be handled for most of a log. It is at least a quantum, because smaller noise is not visible.
+    # be handled for most of a log. The smallest quiet level is a quantum: less noise is invisible.
     is_quiet = sd <= _MOVING_RATIO * max(np.quantile(sd, 0.25), cells.quantum.max())
     cell_ns = round(cells.cell_s * 1e9)
     moving: list[tuple[int, int]] = []
@@ -321,7 +321,7 @@ def infer_unit(magnitude: float) -> tuple[Unit | Literal['unknown'], str]:
 
 
 def contradiction(stated: str, magnitude: float, counts_per_g: float | None) -> str | None:
-    """Return why the norm of samples at rest excludes the stated unit; None if it agrees."""
+    """Return why the norm of samples at rest excludes the stated unit; None if it does not."""
     if not np.isfinite(magnitude):
         return None
     inferred, reason = infer_unit(magnitude)

@@ -33,12 +33,11 @@ def read_log(path: Path, **given: Any) -> ForeignLog:
     Read a table, a PX4 or ArduPilot log, or a bag with topics or units other than the node's.
 
     Table: `columns` is the path of the column map (default: a guessed map), `rate_hz` the sample
-    rate of a table without times. Log: `imu` and `baro` are numbers from 0, `allow_compensated`
-    accepts samples that the autopilot has corrected. Bag: `topic` maps ``imu``, ``board`` and
-    ``case`` to topics, `unit` is the unit of acceleration of the Imu topic.
+    rate of a table without times. Log: `imu` and `baro` are the numbers of IMU and barometer, from
+    0; `allow_compensated` accepts samples that the autopilot has corrected. Bag: `topic` maps
+    ``imu``, ``board`` and ``case`` to topics, `unit` is the unit of acceleration of the Imu topic.
 
-    Raises ValueError for a keyword that does not apply to this kind of file, RecordingError if the
-    file cannot be read.
+    Raises ValueError for a keyword of another kind of file, RecordingError for an unreadable file.
     """
     kind = kind_of(path)
     keywords = {name: value for name, value in given.items() if value is not None}

@@ -37,7 +37,7 @@ _LAYOUT_ROWS = 50  # number of rows, at the end of the first 64 KiB, that determ
 _PREAMBLE_ROWS = 1000  # largest number of rows before the table, as some loggers write
 _ROWS_AT_ONCE = 4096  # number of rows whose cells are read together
 _MOST_ROWS_PER_BYTE = 4  # largest plausible number of rows per byte of a Parquet file
-#: Powers of ten from a unit of time to nanoseconds.
+#: Exponent n of each unit of time: the unit is 10^n nanoseconds.
 STAMP_EXPONENTS: dict[TimeUnit, int] = {'s': 9, 'ms': 6, 'us': 3, 'ns': 0}
 #: Date of ISO 8601, in UTC unless an offset is given; the name of a zone may follow in brackets.
 _ISO = re.compile(
@@ -273,7 +273,7 @@ def _not_used(headings: Sequence[str], width: int, used: Container[int | None]) 
 
 
 def exact_ns(cell: object, unit: TimeUnit | None) -> int:
-    """Return the exact stamp of a number or date; `NO_STAMP` if neither, or beyond 64 bits."""
+    """Return the exact stamp of a number or date; `NO_STAMP` for other text, or beyond 64 bits."""
     text = str(cell).strip()
     try:
         number = (

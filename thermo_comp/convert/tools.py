@@ -4,7 +4,7 @@
 Owns the files of other calibration tools: `TOOLS` writes and reads the file of each tool.
 
 The thermal parameters of autopilots correct only the bias of an axis, by a cubic of the sensor's
-temperature, which is limited to a range; ``raw`` and a are in m/s^2 or (gyroscope) rad/s::
+temperature, which is limited to a range. ``a`` is the corrected reading ``raw`` [m/s^2, rad/s]::
 
     PX4        a = raw - (X0 + X1 d + X2 d^2 + X3 d^3),        d = T - TREF
     ArduPilot  a = raw - 1e-6 (p(T) - p(CALTEMP)),  p(T) = ACC1 d + ACC2 d^2 + ACC3 d^3, d = T - 35
@@ -32,7 +32,7 @@ from ..plain_yaml import load_plain_yaml
 from ..typing import Floats
 
 _ARDUPILOT_REFERENCE_C = 35.0  # temperature at which d of ArduPilot's cubic is 0 [degC]
-_ARDUPILOT_SCALE = 1e6  # ArduPilot's coefficient / coefficient in m/s^2 or rad/s per power of K
+_ARDUPILOT_SCALE = 1e6  # ArduPilot's coefficient / the same coefficient in m/s^2 or rad/s per K^n
 _NO_TEMPERATURE = -273.0  # ArduPilot's value for an unknown calibration temperature [degC]
 _AXES = ('X', 'Y', 'Z')
 _THERMAL_NOTE = (
@@ -41,7 +41,7 @@ _THERMAL_NOTE = (
 )
 _NAME = re.compile(r'\b(TC_[AG]\d_\w+|TC_[AG]_ENABLE|INS_TCAL\d_\w+|INS_(?:ACC|GYR)\d_CALTEMP)\b')
 _NUMBER = re.compile(r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?')
-#: Reference temperature and range [degC] for files of imu_tk, imu_calib, Kalibr: these have none.
+#: Assumed reference temperature and range [degC]: imu_tk, imu_calib and Kalibr state neither.
 _REFERENCE_C, _RANGE_C = 20.0, (-60.0, 120.0)
 _TRIAD_NOTE = 'imported: constants of one temperature, used at all temperatures; no uncertainty'
 _HEADING = re.compile(r'\s*(#|Misalignment Matrix|Scale Matrix|Bias Vector)')
@@ -52,7 +52,7 @@ class Content:
     """Content of a tool's file: ``a = matrix (N - bias)``, with the reading N."""
 
     matrix: Floats  # shape (3, 3); the identity in an autopilot's file
-    bias: Floats  # cubic over temperature of each axis: coefficients in units of N, (3, 4)
+    bias: Floats  # coefficients of each axis' cubic over temperature [unit of readings], (3, 4)
     reference_c: float  # temperature at which the argument of the cubics is 0
     range_c: tuple[float, float]
     notes: list[str]  # parts of the calibration that are lost or missing

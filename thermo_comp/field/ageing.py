@@ -252,7 +252,7 @@ class Model:
 
 
 def usual(calibration: Calibration) -> Ageing:
-    """Return the prior medians of `Ageing`, from the fit's residual sd or, if this is 0, noise."""
+    """Return prior medians of `Ageing` by the fit's residual sd, or by noise if the sd is 0."""
     residual = max(axis.residual_sd_m_s2 for axis in calibration.static.axes())
     turn_on = max(residual or max(calibration.noise_density_m_s2_sqrt_hz), _LEAST_TURN_ON)
     walk = _WALK_SHARE * turn_on
@@ -286,7 +286,8 @@ def learn(
             changes += (best,)
         model = Model(rows, calibration, since, changes)
         inverse = model.inverse(ageing)
-        deviation = (inverse @ rows.y) / np.sqrt(np.diag(inverse))  # of row from prediction [sds]
+        # Deviation of each row from the prediction by all other rows, in sds.
+        deviation = (inverse @ rows.y) / np.sqrt(np.diag(inverse))
         is_outlier = np.isin(used.start, rows.start[np.abs(deviation) > 5.0])
         # If more than 10 % of the rests would be left out, the model is wrong: keep all rests.
         if not 0 < is_outlier.sum() <= 0.1 * len(used):

@@ -30,7 +30,7 @@ _SPACING = ((360, 30), (60, 6), (0, 1))
 
 #: Thermal state, and the fraction of each lag's unknown initial state that has not yet decayed.
 _State = tuple[Sequence[float], Sequence[float]]
-#: Returns the present thermal state, or None while the samples cannot be corrected.
+#: Function that returns the thermal state, or None while the samples cannot be corrected.
 StateNow = Callable[[], _State | None]
 
 

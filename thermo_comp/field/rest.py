@@ -27,9 +27,9 @@ _OF_START, _OF_REST = b' {', b' ['
 @dataclass(frozen=True)
 class Start:
     """
-    A start of the node, with unit, gravity, thermal state and the calibration's SHA-256. After a
-    change of calibration or gravity the log has another `Start` with the same `start_ns`, which
-    identifies the start of the node and is no date, because the clock may be set later.
+    A start of the node; `sha256`: hash of the calibration, `memory`: contents of thermal states.
+    After a change of calibration or gravity the log has another `Start` with the same `start_ns`,
+    which identifies the start and is no date, because the clock may be set later.
     """
 
     start_ns: int

@@ -5,10 +5,10 @@ Owns rests as measurements of the error of a calibration: ``|f| - g`` and its de
 
 A rest at an unknown attitude measures one number, |f|. Let x be the forces along the axes, f = M
 x, u = f / |f| and v = M^T u. If the bias of axis i is d_bias [input units] too large, and its
-scale K_i d_scale too large, |f| changes by ``-v_i (d_bias + K_i x_i d_scale) / scale_i``; K_i is
-the scale factor at the reference temperature, scale_i at the rest. To first order ``|f| - g`` is
-noise plus H times the errors of all parameters (true less calibrated); H has the derivatives of
-|f| by these errors.
+scale K_i d_scale too large, |f| changes by ``-v_i (d_bias + K_i x_i d_scale) / scale_i``; K_i and
+scale_i are the scale factors at the reference temperature and at the rest. To first order,
+``|f| - g`` is noise plus H times the errors of all parameters (true less calibrated); H has the
+derivatives of |f| by these errors.
 """
 
 from __future__ import annotations
@@ -38,9 +38,8 @@ from ..unit.provenance import Source
 from .rest import SUFFIX, Rest, Start, rests_of
 
 _DAY_NS = 86_400e9
-# Texts in the name of an update's source.
-_UNTIL = 'rests until '  # before the time of the last rest
-_AGED = ', claim aged '  # before the number of days of ageing that the covariance includes
+_UNTIL = 'rests until '  # text before the time of the last rest in the name of an update's source
+_AGED = ', claim aged '  # text before the days of ageing in the name of an update's source
 
 
 @dataclass(frozen=True)
@@ -191,8 +190,8 @@ def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
     Return the time of a calibration, the time up to which its covariance includes ageing [both in
     days since 1970], and whether the calibration is an update.
 
-    The time of an update is its last rest, the time of another calibration the date of its test
-    or file; without a date, both returned times are -inf.
+    The time of an update is the time of its last rest. The time of any other calibration is the
+    date of its test or file; without a date, both returned times are -inf.
     """
     every = (source.name for source in calibration.provenance.sources)
     names = [name for name in every if name.startswith(_UNTIL)]
@@ -290,7 +289,7 @@ def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
 
     The windows of a group belong to one start of the node and differ from the group's first window
     by less than 1e-3 in each component of the force's unit vector, and by less than 1 K on the
-    board. The mean of unit vectors within an angle a of one vector has a norm >= 1 - a^2 / 2.
+    board. The mean of such unit vectors is shorter than a unit vector by less than 1.5e-6.
     """
     direction = force / np.sqrt((force**2).sum(axis=1, keepdims=True))
     group = np.zeros(len(start), dtype=np.int64)

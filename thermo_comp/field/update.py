@@ -28,11 +28,10 @@ from ..unit.provenance import Provenance, ResidualSummary, Source
 from .ageing import Ageing, Change, Model, Solution, learn, solve
 from .series import RestSeries, last_rest, valid_since
 
-#: Names of conclusions that `--allow` excludes: gravity is not as stated; another unit's rests.
+#: Conclusions that `--allow` excludes: wrong gravity is stated, or another unit logged the rests.
 OVERRIDES = ('gravity', 'unit')
-# The rests of a node start are taken for another unit's rests if the RMS of |f| - g exceeds both
-# limits.
-_LARGEST_PART = 1e-3  # relative to gravity: 1 mg, as after a shock
+# If the RMS of |f| - g at a node start exceeds both limits, another unit logged the rests.
+_LARGEST_PART = 1e-3  # RMS / gravity: 1 mg, as after a shock
 _LARGEST_SIGMAS = 30.0  # RMS / claimed sd: 30 claimed sds are some milli-g for a poor sensor
 
 

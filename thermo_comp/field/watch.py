@@ -250,7 +250,7 @@ def passage(
     size, vectors = np.linalg.eigh(covariance + np.outer(mean, mean) + walk @ walk.T)
     onto = vectors[:, size > 1e-6 * size[-1]].T
     mean, covariance = onto @ mean, onto @ covariance @ onto.T
-    # With a square factor of its covariance the walk takes one normal variable per direction.
+    # A square factor of the walk's covariance needs one normal variable per direction.
     walk = np.transpose(np.linalg.qr((onto @ walk).T, mode='r'))
     values, vectors = np.linalg.eigh(covariance)
     initial = vectors * np.sqrt(np.maximum(values, 0.0))

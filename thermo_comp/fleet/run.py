@@ -207,7 +207,7 @@ class Results:
             raise ThermoCompError(f'{folder}: cannot be created: {error.strerror}') from error
 
     def folder_of(self, name: str, with_prior: object = False) -> Path:
-        """Return the folder of a unit's files, which is in the folder of results for any name."""
+        """Return the folder of a unit's files; no name leads out of the folder of results."""
         kind = 'with_prior' if with_prior else 'units'
         return self.folder.joinpath(kind, *map(_safe, name.split('/')))
 

@@ -17,15 +17,14 @@ from ..judging.verdicts import Verdict
 from ..typing import Bools, Floats
 from .table import COLUMNS, Row, TableColumn, is_fitted
 
-# Probability of one or more false outliers, and of one or more false drifts, in a fleet.
-_FALSE_ALARMS = 0.05
+_FALSE_ALARMS = 0.05  # probability of any false outlier, and of any false drift, in a fleet
 _UNITS_NEEDED = 8  # smallest number of units of a fleet that is searched for outliers
 # Efficiency of the median absolute deviation relative to the sample sd, for a normal distribution.
 _MAD_EFFICIENCY = 0.37
-# Largest sd by the fit of a value that a unit's data determine / spread over the units; a value
-# with a larger sd is about the prior mean of the fit.
+# Largest sd of a value by the fit / spread of the values over the units, for a value that the
+# unit's data determine; a value with a larger sd is near the prior mean of the fit.
 _LARGEST_SD = 5.0
-# Residuals [ug] and noises [ug/sqrt(Hz)] are raised to this value before their logarithm is taken.
+# Smallest residual [ug] or noise [ug/sqrt(Hz)] in a logarithm; it replaces smaller values.
 _LEAST = 1e-12
 #: Columns of the table in which units are compared.
 QUANTITIES = tuple(column for column in COLUMNS if column.label)

@@ -41,7 +41,7 @@ class TableColumn(NamedTuple):
     """A column of the table: name with the unit of measurement, kind and meaning."""
 
     name: str
-    kind: str  # text, whole, number
+    kind: str  # 'text', 'whole' (integer) or 'number'
     meaning: str
     # The next fields describe a quantity that is compared between units; see `_COMPARED`.
     label: str = ''
@@ -68,7 +68,7 @@ _TABLE = (
     ('n_samples', 'whole', 'number of accelerometer samples'),
     ('n_bytes', 'whole', 'size of the bags in bytes'),
     ('model', 'text', 'model of the fit'),
-    ('is_whole', 'whole', '1 if the bags determine all parameters; a prior uses only such units'),
+    ('is_whole', 'whole', '1 if the bags determine all parameters; prior.yaml needs such units'),
     ('prior', 'text', 'SHA-256 of the prior.yaml used in the fit'),
     ('start', 'text', 'time of the first sample, UTC'),
     ('hours', 'number', 'total duration of the bags'),

@@ -22,7 +22,7 @@ _STAMPS = (
     *('mtime', 'LastModified', 'last_modified', 'updated', 'created'),
 )
 
-# Ends of the names of tables and logs. Folders also have other files with names in .txt.
+# Ends of the names of tables and logs; .txt is omitted, because notes beside bags end in .txt.
 _TABLES = ('.csv', '.tsv', '.mat', '.parquet', '.ulg', '.bin')
 
 
@@ -40,7 +40,7 @@ Bags = dict[str, list[StoredFile]]
 
 @dataclass(frozen=True)
 class FoundUnit:
-    """The bags of one thermal test; `name`: their folder, or serial; `lot`: top folder, or ''."""
+    """Bags of a thermal test; `name`: folder of the bags or serial; `lot`: top folder or ''."""
 
     name: str
     lot: str
@@ -85,7 +85,7 @@ class Storage:
 
     @contextmanager
     def here(self, name: str, files: Sequence[StoredFile]) -> Iterator[Path]:
-        """Yield the path of a local bag, or of a temporary copy; OSError if the copy fails."""
+        """Yield a bag's path, or the path of a copy of a remote bag; OSError if the copy fails."""
         if self._is_local:
             yield Path(self._root, name)
             return

@@ -23,7 +23,7 @@ from ..unit.calibration_file import dump_calibration
 from .table import FAILED, REFUSED, Cell, fitted_cells, row_of
 from .units import FoundUnit, Storage, words
 
-_WAIT_S = 30.0  # time to wait for a Dask scheduler, and for its first worker
+_WAIT_S = 30.0  # time to wait for a Dask scheduler, and for its first worker [s]
 _UNIT_OF: dict[str | None, Literal['counts', 'm/s^2']] = {'counts': 'counts', 'imu': 'm/s^2'}
 
 
@@ -127,7 +127,7 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
         how = replace(options.fit, input=next(iter(kinds)), serial=serial)
         row, calibration, page = _fitted(row, list(bags.values()), how, options.certificates)
     except FitError as refusal:
-        # A fit with a prior is useful for incomplete data, and would hide contradictory data.
+        # If `is_whole` is 0, a fit with a prior may follow, which would hide contradictory data.
         is_whole = 0 if isinstance(refusal, UndeterminedError) else None
         row.update(verdict=REFUSED, problem=one_line(str(refusal)), is_whole=is_whole)
     except ThermoCompError as failure:
@@ -166,7 +166,7 @@ def dask_setup(_worker: object) -> None:
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Let workers started in the `with` block ignore Ctrl-C; raise Ctrl-C after the block."""
+    """Let workers started in the `with` block ignore Ctrl-C; delay a Ctrl-C to the block's end."""
     received: list[int] = []
     # Workers inherit the ignored SIGINT (Ctrl-C) from the fork server.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -31,7 +31,7 @@ BLOCK_MESSAGES = 1 << 15  # messages per block: many, so that the overhead per b
 NO_STAMP_NS = -(2**31) * 10**9  # marks a missing stamp: the earliest stamp of a header [ns]
 _JUMP_NS = 10**9  # a backward step of the stamps by more than this is a jump of the clock [ns]
 LONGEST_PAUSE_NS = 3600 * 10**9  # longer jumps of the stamps are shortened to this length [ns]
-_MOST_JUMPS = 100  # largest number of jumps of the stamps by over an hour; more are refused
+_MOST_JUMPS = 100  # largest number of jumps by over an hour in the stamps of a valid bag
 _FEWEST_STAMPS = 10  # smallest number of stamps for a warning about their clock
 _APART_S = 10.0  # largest median time between readings and adjacent samples of one clock [s]
 _REPEAT_NS = 10 * 10**9  # `Readings.thinned` keeps a repeated reading after this time [ns]
@@ -55,8 +55,8 @@ class BagFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path  # the path stated in error messages
-        self.topics: dict[int, Topic] = {}  # by channel number
-        self.definitions: dict[str, tuple[str, str]] = {}  # encoding and text by message type
+        self.topics: dict[int, Topic] = {}  # topic of each channel number
+        self.definitions: dict[str, tuple[str, str]] = {}  # encoding and text of each type
         self.metadata: dict[str, str] = {}
         self.start_ns: int | None = None
         self.end_ns: int | None = None
@@ -69,12 +69,12 @@ class RecordingInfo:
 
     path: Path
     storage: str
-    topics: Mapping[str, tuple[str, int]]  # by topic: type (types joined by ' | '), message count
+    topics: Mapping[str, tuple[str, int]]  # type ('A | B' for two types) and number of messages
     start_ns: int  # first log time, 0 without messages
     end_ns: int  # last log time, 0 without messages
     truncated: str | None = None  # description of missing parts
     metadata: Mapping[str, str] = field(default_factory=dict)  # keys and values stored in the bag
-    input: Literal['counts', 'imu'] | None = None  # input whose topic has the samples
+    input: Literal['counts', 'imu'] | None = None  # kind of the samples
     chosen: str | None = None  # notes on topics selected by their type, and on stamps
 
     @property
@@ -140,9 +140,9 @@ class Block:
     accel: Floats  # counts per conversion cycle, or m/s^2 of sensor_msgs/Imu, shape (n, 3)
     frame_id: str
     imu: ImuColumns | None  # fields of sensor_msgs/Imu besides the acceleration
-    temperatures: Mapping[str, Readings]  # by thermometer
+    temperatures: Mapping[str, Readings]  # readings of each thermometer
     log_ns: Mapping[Role, Ints]
-    raw: Mapping[Role, Messages] = field(default_factory=dict)  # serialized, if requested
+    raw: Mapping[Role, Messages] = field(default_factory=dict)  # serialized messages, if requested
 
     def __len__(self) -> int:
         """Return the number of accelerometer messages."""
@@ -227,8 +227,7 @@ def with_stamps(block: Block, last_ns: int) -> tuple[Block, int]:
     """
     Give each reading without a stamp the newest stamp of the samples before it, because its log
     time depends on the speed of a playback; drop readings without a stamp before the first sample.
-    `last_ns`: newest sample stamp before the block. Return the block and the newest sample stamp
-    up to its end.
+    `last_ns`: newest sample stamp before the block. Return the block and the newest sample stamp.
     """
     samples = np.concatenate(([last_ns], block.accel_stamp_ns))
     jumps = np.flatnonzero(np.diff(samples) < -_JUMP_NS) + 1
@@ -285,7 +284,7 @@ def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
     n_jumps = n_messages = span_ns = 0
     for block in blocks:
         thermometers = block.temperatures.values()
-        # Sort readings and samples in the bag's order: by the number of samples before them.
+        # Sort readings and samples in the bag's order: a reading follows `after` samples.
         places = [*(thermometer.after for thermometer in thermometers), np.arange(len(block))]
         stamps = np.concatenate([*(part.stamp_ns for part in thermometers), block.accel_stamp_ns])
         order = np.argsort(np.concatenate(places), kind='stable')

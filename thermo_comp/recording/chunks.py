@@ -80,7 +80,7 @@ def translated(path: Path, *, is_foreign: bool = False) -> Iterator[None]:
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """Part of a file: 'chunk', 'torn' (a chunk without its end), 'loose' (no chunk: messages)."""
+    """Part of a file: 'chunk', 'torn' (a chunk without its end), 'loose' (messages, no chunk)."""
 
     position: int
     length: int  # number of bytes, without the message indexes after the part

@@ -4,8 +4,8 @@
 Owns the reading of a number inside messages of any type, by the definition of the message type.
 
 A field is named ``TOPIC:FIELD``, as for ``ros2 topic echo --field``. In plain CDR a number begins
-at a multiple of its size after the encapsulation. A string or sequence begins with its length, a
-uint32, then comes its content. A field is read in all messages of a batch at once.
+at a multiple of its size, counted from the end of the encapsulation. A string or sequence is its
+length, a uint32, followed by its content. A field is read in all messages of a batch at once.
 """
 
 import re

@@ -31,7 +31,7 @@ _NEVER_NS = 2**63 - 1
 _LEFT = re.compile(r'\.(?P<number>\d+)\.(?P<process>\d+)-[0-9a-f]+\.partial\.mcap')
 _SHARE = 0.2  # largest ratio of the duration of a pass over the bag to the pause after the pass
 
-#: A new block with its serialized messages; the description of its bag, None for live topics.
+#: A block of new messages, also serialized, and the description of its bag (live topics: None).
 News = tuple[Block, RecordingInfo | None]
 
 

@@ -49,7 +49,7 @@ _CUTS = {
 }
 #: Types of the records that are read besides messages, by opcode.
 _KINDS: Any = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.METADATA: Metadata}
-_new_stream: Any = ReadDataStream  # type hints differ between versions of the `mcap` library
+_new_stream: Any = ReadDataStream  # `Any`, because type hints differ between versions of `mcap`
 
 
 class McapFile(BagFile):
@@ -196,7 +196,7 @@ class McapFile(BagFile):
                     raise DamagedError(f'the record at byte {at} is not complete')
                 ending = _CUTS.get(opcode, _CUTS[-1]).format('{}', at=at)
                 if opcode == 0 and at == last.position + last.length:
-                    # Add zero bytes to the span, so that `scan_records` drops the last message.
+                    # `scan_records` drops the last message before zeros: add zeros to the span.
                     kind = last.kind if last.kind == 'loose' else 'torn'
                     spans[-1] = replace(last, length=last.length + PREFIX.size, kind=kind)
                 elif opcode == Opcode.CHUNK:

@@ -42,8 +42,7 @@ _COMPRESSORS: Mapping[Compression, Callable[[Any, int], Any]] = {
 #: Transient-local topics (a late subscriber gets the last message), without their namespace.
 _LATCHED = tuple(topic.name for topic in OUTPUTS if topic.is_latched)
 _INFINITE = {'sec': 9223372036, 'nsec': 854775807}  # stands for no time limit in a QoS profile
-# The type is any callable, because type hints differ between versions of the `mcap` library.
-_new_builder: Callable[[], Any] = RecordBuilder
+_new_builder: Callable[[], Any] = RecordBuilder  # type hints differ between versions of `mcap`
 #: Head of a message record: opcode, length, channel, sequence, log time, publish time.
 _RECORD_HEAD = np.dtype('u1, <u8, <u2, <u4, <i8, <i8')
 _INDEX_ROW = np.dtype([('log', '<u8'), ('offset', '<u8')])

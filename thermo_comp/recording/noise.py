@@ -23,9 +23,9 @@ _SDS = 25.0  # smallest distance of a glitch from the mean of its neighbours, in
 # Smallest distance of a glitch from the mean of its neighbours, divided by the samples' norm. A
 # change by one count, from the remainder that a converter adds to its next cycle, is no glitch.
 _LEAST = 0.02
-_FEWEST = 30  # smallest number of samples that determines the noise, to search for glitches
+_FEWEST = 30  # smallest number of samples that are searched for glitches
 _TENTH, _NEVER = -1.2816, 6.7  # standard normal quantiles of the probabilities 0.1 and 1 - 1e-11
-_COLOURED = 0.5  # below this ratio of its degrees of freedom to white noise's, noise is coloured
+_COLOURED = 0.5  # noise with less than this share of white noise's degrees of freedom is coloured
 _FEWEST_FREE = 2.0  # smallest number of degrees of freedom of a cell
 _ITERATIONS = 30  # iterations in `spread_of_variances`; trial values in `roughest_at_rest`
 

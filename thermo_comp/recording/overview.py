@@ -23,7 +23,7 @@ from .reader import RecordingReader, open_recording
 from .stillness import STILL_SD, CellAccumulator, Cells, still_intervals, why_restless
 from .topics import PLAIN, Topics, shown
 
-KELVINS = (180.0, 480.0)  # readings in this range are taken for kelvins: too hot for any board
+KELVINS = (180.0, 480.0)  # range of readings taken for kelvins: no board is above 180 degC
 _RAMP_WINDOW_S = 120.0  # time over which the rate of a ramp is averaged [s]
 _CELL_S, _MIN_REST_S = 0.5, 3.0  # lengths of a cell and of the shortest still interval [s]
 _GAP_INTERVALS = 5.0  # shortest gap between samples / median interval in the first block
@@ -127,7 +127,7 @@ def survey_recording(
         topic = reader.topics.get('accel')
         total = reader.info.topics[topic][1] if topic else 0
         accumulator, causes = CellAccumulator(_CELL_S, None), CauseCounter()
-        readings: dict[str, list[Readings]] = {}  # all are kept: they are far fewer than samples
+        readings: dict[str, list[Readings]] = {}  # kept in memory: far fewer than samples
         clock = _Clock()
         for block in reader.blocks():
             for name, temperature in block.temperatures.items():
@@ -171,7 +171,7 @@ class _Clock:
     last_ns: int = 0
     newest_ns: int = 0  # newest stamp since the last restart of the clock
     step_ns: float = 0.0  # median interval of the first stamps that rise
-    n_backwards: int = 0  # number of stamps that do not exceed all earlier ones since a restart
+    n_backwards: int = 0  # number of stamps not above the newest stamp since a restart
     n_restarts: int = 0  # number of steps back by more than `LONGEST_PAUSE_NS`
     n_gaps: int = 0
     longest_gap_s: float = 0.0

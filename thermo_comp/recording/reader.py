@@ -3,8 +3,8 @@
 """
 Owns the reader of recordings: opens a bag of any storage, describes it, reads it as columns.
 
-Messages are read in the order of a ROS player: by log time, with equal log times by the position
-in the file. The files of a split bag are read in the order in its metadata.yaml.
+Messages are read in the order of a ROS player: by log time, and in file order if log times are
+equal. The files of a split bag are read in the order in its metadata.yaml.
 """
 
 import re
@@ -42,8 +42,8 @@ from .serialized import Messages
 from .topics import WHOLE, Selected, Topics, select_topics, shown
 from .wire import decode_blocks
 
-_MAX_BYTES = 1 << 24  # largest size of metadata.yaml [bytes], and largest number of its nodes
-#: Compression by the `compression_mode` of metadata.yaml.
+_MAX_BYTES = 1 << 24  # largest size of metadata.yaml [bytes], and its largest number of YAML nodes
+#: What is compressed (file, message, or nothing), by the `compression_mode` of metadata.yaml.
 _COMPRESSIONS = {'none': '', 'file': 'file', 'message': 'message'}
 #: Largest batch that is decoded at a time from a `ForeignFile`: messages, bytes, time [ns].
 _BATCH_MESSAGES, _BATCH_BYTES, _BATCH_NS = 1 << 14, 1 << 23, 10 * 10**9
@@ -83,7 +83,7 @@ class RecordingReader(ExitStack):
             raise
         self._part = topics.part
         self.since_s = 0.0  # time from the bag's first sample to the first sample read [s]
-        self.apart = ''  # warning of `clocks_apart`: equal stamps, or two clocks
+        self.apart = ''  # warning about equal stamps, or about two clocks (`clocks_apart`)
 
     def _fields(self, selected: Selected) -> Iterator[tuple[Role, Field]]:
         for role, path in selected.fields.items():
@@ -183,7 +183,7 @@ class RecordingReader(ExitStack):
                     yield file.path, channels, messages
 
     def blocks_on_one_clock(self) -> Iterator[Block]:
-        """Read the bag with jumps of the stamps by over an hour shortened to an hour."""
+        """Read the bag; a jump of the stamps by over an hour becomes a gap of an hour."""
         if self._part.is_stamped:
             return without_jumps(self.blocks(), self.info.path)
         return self._cut(without_jumps(self._blocks(), self.info.path))
@@ -276,7 +276,7 @@ def _described(path: Path) -> _Description:
 
 
 def _read_metadata(directory: Path) -> _Description | None:
-    """Read a bag's metadata.yaml; None for a missing or empty file, as after a recorder's kill."""
+    """Read a bag's metadata.yaml; None if the file is missing or empty (recorder killed)."""
     path = directory / 'metadata.yaml'
     try:
         text = read_bounded(path, _MAX_BYTES)

@@ -33,8 +33,8 @@ _ROTATION_S = 10.0  # `without_rotation` subtracts the median angular rate over 
 _STEP_SDS = 8.0  # smallest step between adjacent cells that ends a rest, in robust sd of steps
 _DRIFT_STEPS, _DRIFT = 9, 5e-5  # number of steps whose median is the drift; largest drift [g/s]
 _QUANTUM_SAMPLES = 20000  # number of samples that are searched for a quantum
-_STEPS_NEEDED = 10  # smallest number of changes that prove a quantum if each is a multiple of it
-STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # whole cells fill one of these numbers of windows exactly
+_STEPS_NEEDED = 10  # smallest number of changes that prove a quantum, if all are its multiples
+STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # numbers of windows that a whole number of cells may fill
 _LONGEST_CELL_NS = 86400e9  # largest length of a cell, reached only with wrong stamps [ns]
 MIN_SAMPLES = 30  # usual smallest number of samples in a cell
 _LARGEST = 1e100  # largest valid sample: squares of larger samples may overflow
@@ -75,7 +75,7 @@ class Cells:
 
 class CellAccumulator:
     """
-    Reduces streamed samples to cells that last `cell_s`, or as long as `least` samples if longer.
+    Reduces streamed samples to cells that last `cell_s`, or longer to have `least` samples.
     Whole cells fill `window_s`, or 2 to 60 times `window_s` if a cell is longer than `window_s`.
     Samples of `full_scale` or more are saturated and dropped.
     """
@@ -305,10 +305,10 @@ def still_runs(
     drift = _drift(cells, plausible)
     level = np.quantile(cells.variance[plausible], 0.1, axis=0)
     colour = spread_of_variances(cells, plausible, level)
-    # A sensor that repeats one number does not show its noise; samples that toggle between two
-    # adjacent numbers have a variance of a quarter quantum squared. For white noise, 1.3 times
-    # the tenth percentile of the variances equals the mean variance if cells have 60 samples, and
-    # 0.9 times the mean variance if cells have 32 samples.
+    # A sensor that repeats one number does not show its noise, so the noise variance is at least a
+    # quarter quantum squared, as for samples that toggle between two adjacent numbers. For white
+    # noise, 1.3 times the tenth percentile of the variances is 1.0 (cells of 60 samples) or 0.9
+    # (cells of 32 samples) times the mean variance.
     noise = np.maximum(1.3 * level * colour, 0.25 * cells.quantum**2)
     # A drift of d within a cell has a variance of d^2 / 12; twice this variance allows for noise.
     within = np.concatenate((drift[:1], (drift[1:] + drift[:-1]) / 2.0, drift[-1:]))

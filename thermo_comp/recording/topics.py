@@ -15,7 +15,7 @@ from ..text import one_line
 from ..topics import BOARD, CASE, COUNTS, FLAGS, IMU_IN, IMU_OUT, INPUTS, TEMPERATURE, thermometer
 from .blocks import Input, Role
 
-#: Message types of a thermometer for which no field need be named, with the field that is read.
+#: Message types of thermometers, each with the field that is read if the user names no field.
 PLAIN = {TEMPERATURE: '', 'std_msgs/msg/Float32': 'data', 'std_msgs/msg/Float64': 'data'}
 
 _TYPES = {key: topic.type for key, topic in INPUTS.items()}
@@ -34,7 +34,7 @@ TWINS = (
 _MAX_LISTED = 20  # largest number of topics in a message
 _MAX_SHOWN = 80  # largest length of a name in a message [characters]
 
-_FIRST_STAMP_S = 1e8  # a limit of a `BagPart` of at least this time [s] is a stamp (after 1973)
+_FIRST_STAMP_S = 1e8  # a limit of a `BagPart` is a stamp if it is this time [s] (1973) or later
 
 Present = Mapping[str, tuple[str, int]]  # type and number of messages of each topic of a bag
 
@@ -67,10 +67,7 @@ class BagPart:
         return max(self.begin or 0.0, self.end or 0.0) >= _FIRST_STAMP_S
 
     def limits_ns(self, first_ns: float) -> tuple[float, float]:
-        """
-        Return the part's begin and end as stamps; `first_ns`: the bag's first stamp, inf if not
-        known.
-        """
+        """Return begin and end as stamps; `first_ns`: the bag's first stamp, inf if unknown."""
         origin = 0 if self.is_stamped else first_ns
         begin = -inf if self.begin is None else origin + round(self.begin * 1e9)
         return begin, inf if self.end is None else origin + round(self.end * 1e9)
@@ -90,8 +87,9 @@ class Topics:
     Topics of the inputs in a bag, the choice of counts or Imu, and the part to read.
     A name matches with or without its leading slash and, if only one topic fits, with any
     namespace. An input other than `case` without a topic of its default name uses the only topic
-    of its type; for samples, an Imu (imu/data_raw first) before counts. `further` and topics
-    ``temperature/<name>`` in the board topic's namespace are thermometers besides board and case.
+    of its type; samples are read from an Imu topic (imu/data_raw first) rather than from counts.
+    Topics in `further`, and topics ``temperature/<name>`` in the board topic's namespace, are
+    thermometers besides board and case.
     A thermometer's reading may be a field, ``TOPIC:FIELD``, as for ``ros2 topic echo --field``.
     """
 
@@ -101,12 +99,12 @@ class Topics:
     case: str = CASE.name
     further: Mapping[str, str] = field(default_factory=dict)
     part: BagPart = WHOLE
-    input: Input = 'auto'  # 'auto': counts by the topic's name, else Imu, else counts by type
+    input: Input = 'auto'  # 'auto': a topic named as `counts`, else an Imu, else counts by type
 
     @classmethod
     def named(cls, names: Mapping[str, str], **others: Any) -> 'Topics':
         """
-        Build from topics by input: ``counts``, ``imu``, ``board``, ``case``, ``temperature/NAME``.
+        Build from the topic of each input: counts, imu, board, case, temperature/NAME.
         If the topic of only one of ``counts`` and ``imu`` is given, this input is read.
         """
         roles: dict[str, Any] = {}
@@ -146,7 +144,7 @@ class Selected(NamedTuple):
 
 
 def read_names(path: str | Path) -> dict[str, str]:
-    """Read topics by input from a YAML file, like those in config/drivers."""
+    """Read the topic of each input from a YAML file like the files in config/drivers."""
     names = read_plain_yaml(path)
     if not isinstance(names, dict) or not all(isinstance(name, str) for name in names.values()):
         raise ThermoCompError('expected lines INPUT: TOPIC, like board: /imu/temperature', path)
@@ -206,7 +204,7 @@ def select_topics(
             name = _of_type(present, names[key], _TYPES[key], getattr(topics, key))
             if present[name][1]:
                 name_of[role], keys[role] = name, key
-                among = "driver's" if is_called(name, _RAW) else 'only'  # by REP 145, or by type
+                among = "driver's" if is_called(name, _RAW) else 'only'
                 chosen.append(choice_note(name, key, getattr(topics, key), among))
             elif role in require:
                 raise RecordingError('the topic has no messages', key=shown(name))

@@ -35,7 +35,7 @@ IMU_COLUMNS = (slice(0, 4), slice(4, 13), slice(13, 16), slice(16, 25), slice(28
 IMU_ACCELERATION = slice(25, 28)
 
 HEAD_BYTES = 16  # number of bytes before the characters of frame_id
-_MAX_PADDING = 7  # largest number of bytes after the numbers
+_MAX_PADDING = 7  # largest number of padding bytes at the end of a message
 _NS = 1_000_000_000  # nanoseconds per second
 
 

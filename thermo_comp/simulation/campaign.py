@@ -207,7 +207,7 @@ def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
         raise ValueError(f'`name` must be one of {", ".join(PLAN_NAMES)}, got {name!r}')
     rng = generator(seed, Stream.CYCLOGRAM, PLAN_NAMES.index(name))
     if name == 'held-out':
-        # No axis is near the vertical or the horizontal, unlike the attitudes of other plans.
+        # No axis is near the vertical or the horizontal, unlike in a tumble.
         ups = rng.uniform(0.3, 1.0, (3, 3)) * rng.choice((-1.0, 1.0), (3, 3))
         return _positions(parse_cyclogram('held-out'), ups)
     if name in ('centrifuge', 'rate-table'):

@@ -103,7 +103,7 @@ def _thermostatted(draw: Specimen) -> UnitModel:
         # temperature of a bandgap reference.
         PartEffect('reference', scale=draw.axes(40.0, 0.15), scale_curvature=draw.axes(0.02, 0.5)),
         # Each axis' potted integrator has dielectric absorption and charge injection; the leakage
-        # of the integrator's switches, with positive curvature, is on the board.
+        # of the integrator's switches depends on the temperature of the board.
         PartEffect('integrator', scale=draw.normal(3.0), bias=draw.signed(6.0, 14.0)),
         PartEffect('board', bias=draw.normal(1.0), bias_curvature=draw.normal(0.03)),
         PartEffect('head', scale=draw.axes(80.0, 0.1), bias=draw.signed(0.3, 5.0)),

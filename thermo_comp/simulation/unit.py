@@ -168,7 +168,7 @@ class Bend:
 
 @dataclass(frozen=True)
 class SwitchedLoad:
-    """Electronics that heat a part by `power` [W], on and off for random times in `spell` [s]."""
+    """Electronics that heat a part by `power` [W], on and off for times uniform in `spell` [s]."""
 
     part: str
     power: float
@@ -183,9 +183,8 @@ class UnitModel:
     Per axis, ``counts = K * scale(T) * s + bias(T) + noise``, converted to whole counts; ``s =
     inverse(M) @ f`` is the specific force along the sensitivity axes, plus the terms of `bend`.
     `scale_factor` K [counts/cycle per m/s^2] and bias [counts/cycle] hold at the reference
-    temperature.
-    `noise_density` is in ug/sqrt(Hz): the mean over T seconds has the standard deviation
-    ``noise_density / sqrt(T)``; `bias_walk` is in ug/sqrt(h).
+    temperature. `noise_density` is in ug/sqrt(Hz): the mean over T seconds has the standard
+    deviation ``noise_density / sqrt(T)``; `bias_walk` is in ug/sqrt(h).
     """
 
     serial: str
