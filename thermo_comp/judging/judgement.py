@@ -21,7 +21,7 @@ from . import verdicts
 from .verdicts import Section, Sections, Verdict
 from .windows import JudgedWindows
 
-# Without a tolerance, a valid calibration is WIDE if the RMS claimed sd exceeds this [m/s^2].
+# Without a tolerance, a valid calibration is WIDE above this RMS of the claimed sd [m/s^2].
 _WIDE_CLAIM = 1e3 * MICRO_G
 #: Smallest significant shift or change of a constant, in standard deviations.
 SIGNIFICANT_SDS = 3.0

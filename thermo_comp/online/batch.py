@@ -28,7 +28,7 @@ from .status import DROPPED
 _Arrivals: TypeAlias = list[tuple[int, int, str, int, float]]
 #: Segments of the correction, each with its number of samples.
 Segments: TypeAlias = list[tuple[Segment, int]]
-#: Corrects samples: from `Correction.line` results, time since segment start [s], and x, y, z.
+#: Corrects samples; takes results of `Correction.line`, time since segment start [s], x, y, z.
 _Arithmetic: TypeAlias = Callable[..., Sequence[Floats]]
 #: Code of the reason for which a sample is dropped; the code 0 marks a published sample.
 _REASONS = {name: number for number, name in enumerate(DROPPED, 1)}
@@ -214,7 +214,7 @@ def _apply(
 
 
 def _lines(model: Model, segments: Segments) -> tuple[Floats, Floats, Bools]:
-    """Evaluate `Model.lines`, with the slowly varying variance once for each `SlowState`."""
+    """Evaluate `Model.lines`; evaluate the slowly varying variance once per `SlowState`."""
     _, _, _, excess, start, end, slow = zip(*(segment for segment, _ in segments), strict=True)
     distinct = {id(state): state for state in slow}
     places = {key: place for place, key in enumerate(distinct)}

@@ -51,7 +51,7 @@ CONTINUED: Final = (
     f'{TANGENT_SPANS:g} of the range, then constant'
 )
 
-#: Variances of a rate that is not finite: -1 as first variance means no rate (sensor_msgs/Imu).
+#: Variances of an angular rate that is not finite; the first, -1, means no rate in an Imu.
 NO_RATE: Final = (-1.0, 0.0, 0.0)
 
 #: Specific force x, y, z [m/s^2] and the covariance xx, xy, xz, yy, yz, zz [m^2/s^4].

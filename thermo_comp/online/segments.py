@@ -62,7 +62,7 @@ class Segment(NamedTuple):
     noise_excess: float  # relative excess of the noise variance because of the samples' rate
     start: tuple[float, ...]  # thermal state at the start of the segment
     end: tuple[float, ...]  # thermal state at the end of the segment
-    slow: SlowState  # one object for successive segments with equal arguments
+    slow: SlowState  # the same object in successive segments with equal arguments
 
 
 _NO_STATE: Final = SlowState((), [], 0.0)

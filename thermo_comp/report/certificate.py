@@ -65,7 +65,7 @@ class Contribution(NamedTuple):
     """One line of the uncertainty budget: a standard uncertainty of |f| [m/s^2]."""
 
     name: str
-    evaluation: str  # type A or B, as in the GUM
+    evaluation: str  # type A (statistical) or B (other), see the GUM, JCGM 100
     standard: float | None  # None if the uncertainty is not stated
     basis: str
 

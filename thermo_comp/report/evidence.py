@@ -349,7 +349,7 @@ def span_of(bag: ReducedBag) -> tuple[int, float]:
 
 
 def widest(bags: Sequence[ReducedBag]) -> int:
-    """Return the index of the bag with the widest range of T_board; if several, the longest."""
+    """Return the index of the bag with the widest range of T_board; of several, the longest."""
     spans = [float(np.ptp(bag.board.value)) if len(bag.board.value) else 0.0 for bag in bags]
     # Of bags with equal range (within 5 %) and duration (in whole minutes), take the first.
     candidates = [i for i, span in enumerate(spans) if span >= 0.95 * max(spans)]
