@@ -84,8 +84,7 @@ def open_bags(
         bag = reduce_source(source, window_s=sum_length(window_s), **(default | limits))
         if 'board' in require and not len(bag.board.value):
             raise RecordingError(
-                'no reading of the board temperature, which the calibration needs: name the topic '
-                'with --topic board=TOPIC',
+                'no reading of the board temperature: name the topic with --topic board=TOPIC',
                 path=str(path),
             )
         if text := in_kelvins(bag):
