@@ -24,7 +24,7 @@ DEPTH_LIMIT = 12  # largest number of nested lists and mappings
 #: Largest number of keys, values, lists and mappings of a file: three times the number in a file
 #: with all columns of `unit.columns.bank` for two thermometers, except the kind `bend`.
 NODE_LIMIT = 20_000
-_FILE_LIMIT = 1 << 16  # size limit of YAML files written by hand [bytes]; usual: a few kB
+_FILE_LIMIT = 1 << 16  # size limit of hand-written YAML files [bytes], which usually have a few kB
 _INVALID = 'not valid YAML'
 _INTEGER_DIGITS = 20  # digits of the longest integer accepted; a float64 needs no more
 _INTEGER = re.compile(r'[-+]?[0-9]+')

@@ -4,7 +4,7 @@
 Owns the state of a test during recording: its positions, the expected accuracy, missing data.
 
 Blocks of samples are added in the order of arrival. A rest whose force direction differs from the
-direction of the present position begins the next position; earlier samples are not part of it.
+direction of the present position begins the next position, which has no earlier samples.
 """
 
 import math
@@ -23,16 +23,15 @@ from ..unit.gravity import STANDARD_GRAVITY
 
 # Minimum length of a rest [s], unless the wanted soak is shorter.
 _REST_S = 10.0
-# Shortest length of a cell, whose samples are averaged [s]; number of first samples from whose
-# interval the length of a cell is computed.
+# Shortest length of a cell [s]; number of first samples whose interval gives the cells' length.
 _CELL_S, _SAMPLES_TO_BEGIN = 0.5, 30
 # Number of earlier cells that each search for rests includes, besides the new cells.
 _LOOKED_BACK = 200
 # Sd of a position's mean force due to hysteresis, mounting and drift, even in a long rest [g].
 _FLOOR_SD = 2e-5
 # A position is 'restless' if its noise is above `_RESTLESS` times the median of all positions.
-# A still interval after the known rests is a rest if its noise is below `_NOISIEST` times their
-# noise.
+# A still interval after the known rests is a rest if its noise is below `_NOISIEST` times the
+# noise of the known rests.
 _RESTLESS, _NOISIEST = 3.0, 10.0
 # Smallest backward step of the stamps that shows a restart of the driver [ns].
 _STEP_BACK_NS = 10**9
@@ -46,7 +45,7 @@ Surveys = Mapping[str, ThermometerSurvey]
 class Position:
     """
     A position: direction of the specific force (NaN before the first rest), total time at rest,
-    number of rests, sd of the mean force [g], thermometers, reason for not counting ('': none).
+    number of rests, sd of the mean force [g], thermometers, why the position is not good, or ''.
     """
 
     up: Floats
@@ -62,10 +61,11 @@ class Account:
     """
     State of a test, and the missing data.
     The last of the `positions` is unfinished. `worst_sd_g` is the sd of the corrected force in
-    the attitude with the largest sd, `constants_sd` the sds of bias [g], scale and misalignment
-    [rad]. `now` is the direction of the newest sample, NaN without samples. `next_up` is the
-    direction recommended for the next position; `next_deg` is its angle to `now` [deg]. The
-    direction `farthest_up` has the largest angle to the nearest position, `farthest_deg` [deg].
+    the attitude with the largest sd; `constants_sd` are the sds of bias [g], scale and
+    misalignment [rad]. `now` is the direction of the newest samples, NaN without samples.
+    `next_up` is the direction recommended for the next position, `next_deg` the angle between
+    `next_up` and `now` [deg]. `farthest_up` is the direction with the largest angle to the nearest
+    position, `farthest_deg` this angle [deg].
     """
 
     positions: tuple[Position, ...]

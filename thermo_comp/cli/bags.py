@@ -27,7 +27,7 @@ _LEFT_OUT = {
         '(linear_acceleration_covariance[0] = -1)'
     ),
     'n_saturated': 'samples at the full scale of the calibration',
-    'n_out_of_order': 'samples whose stamp is not later than all earlier stamps, or too far ahead',
+    'n_out_of_order': 'samples whose stamp is not after all earlier stamps, or far in the future',
     'n_no_temperature': 'samples before the first board temperature',
     'n_stale': 'samples with a board temperature older than --temperature-timeout',
     'n_stuck': 'samples that repeat earlier values for too long, or are 0 on all axes',
@@ -46,8 +46,8 @@ def info(
     Describe a bag or a calibration.
 
     For a bag, prints topics, rate, range of temperatures, ramps and gaps, and
-    whether a fit can use the bag; for a calibration, the unit, the ranges, the
-    sets of coefficients, the residuals and the nonlinear terms.
+    whether a fit can use the bag; for a calibration, the unit, the sets of
+    coefficients with their ranges, the residuals and the nonlinear terms.
 
     Example:
       thermo_comp info chamber.mcap

@@ -138,8 +138,8 @@ def _print_conversion(out: Output, report: 'ConversionReport', output: Path) -> 
 
 def print_guess(out: Output, log: 'ForeignLog', printed: dict[str, str]) -> None:
     """
-    Print the guessed column map and the unused columns of a table. `printed`: for each text
-    printed so far, its table; instead of a map printed before, the name of its table is printed.
+    Print the guessed column map and the unused columns of a table. `printed`: texts printed so
+    far, each with its first table; the name of this table replaces a repeated column map.
     """
     from ..convert.column_map import column_map_text
     from ..convert.headings import map_lines

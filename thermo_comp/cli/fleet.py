@@ -107,7 +107,7 @@ def _print_result(out: Output, result: 'FleetResult', with_prior: bool) -> None:
     )
     out.sources((row['name'], str(row['chosen']), None) for row in result.rows)
     for row in result.rows:
-        # A nonempty cell `reservations` also names the bags that were left out.
+        # `left_out` is printed only without `reservations`, which also name the left-out bags.
         text = (row['problem'], row['reservations'] or row['left_out'])
         out.points(f'{row["name"]}: {problem}' for problem in text if problem)
     out.points(

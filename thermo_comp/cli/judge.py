@@ -132,7 +132,7 @@ def _print_axes(out: Output, judged: 'Judgement') -> None:
 
 
 def _print_expectations(out: Output, judged: 'Judgement') -> None:
-    """If the file has errors on data left out of the fit, print these beside the found errors."""
+    """Print errors found and expected, if the calibration states errors on left-out data."""
     names = {'norm': '|f| - g', 'drift': 'drift of an axis'}
     parts = {names[key]: part for key, part in judged.expectations.items()}
     if any(isfinite(part.expected_rms) for part in parts.values()):
@@ -301,9 +301,9 @@ def update(
     The calibration is the prior; the ageing since the fit is estimated from the
     rests, which may be in any attitude. Old and new calibration are compared on
     days left out of the update. The new calibration is written only if the rests
-    determine an axis and the mean decrease of (|f| - g)^2 on left-out days
-    exceeds its standard error; else the exit code is 3, and the command prints
-    the sd of each axis with ageing.
+    determine bias and scale of an axis, and if the mean decrease of (|f| - g)^2
+    on left-out days exceeds its standard error; else the exit code is 3, and the
+    command prints the sd of each axis with ageing.
 
     Example:
       thermo_comp update unit42.yaml rests -o unit42_new.yaml

@@ -199,7 +199,7 @@ def _duration(text: str) -> float:
 def _print_account(
     out: Output, account: 'Account', problems: Sequence[str], printed: dict[str, str]
 ) -> None:
-    """Print the texts about the test that differ from those in `printed`, by name."""
+    """Print each new text about the test; `printed`: the last text printed, by name."""
     news = {'problem': ', '.join(problems)} if problems else {}
     if not problems:
         printed.pop('problem', None)

@@ -84,8 +84,7 @@ def open_bags(
         bag = reduce_source(source, window_s=sum_length(window_s), **(default | limits))
         if 'board' in require and not len(bag.board.value):
             raise RecordingError(
-                'no reading of the board temperature, which the calibration needs: name the topic '
-                'with --topic board=TOPIC',
+                'no reading of the board temperature: name the topic with --topic board=TOPIC',
                 path=str(path),
             )
         if text := in_kelvins(bag):
@@ -139,8 +138,8 @@ def evaluate(
     Judge calibrations of a unit, given with their names, on recordings of the unit.
 
     Gravity [m/s^2] and topics default to the first calibration's; `tolerance`: largest
-    accepted RMS of ``|f| - g`` [m/s^2]; `serial`: serial of the unit, None: as in the recordings,
-    '': any serial; `force`: the user's options about rests at which |f| is not g.
+    accepted RMS of ``|f| - g`` [m/s^2]; `serial`: serial of the unit (None: the serial in the
+    recordings; '': any serial); `force`: the user's options about rests at which |f| is not g.
 
     Raises RecordingError if a recording cannot be read, or no window at rest is corrected, and
     CalibrationError if a calibration is for another unit.
@@ -206,8 +205,8 @@ class Drift:
 
 def history_of(calibrations: Sequence[Calibration]) -> tuple[Epoch, ...]:
     """
-    Sort by date the calibrations with the serial number of the first given calibration. Of several
-    calibrations from the same bags only the first is kept: the others show no change in time.
+    Sort by date the calibrations with the serial number of the first given calibration. A second
+    calibration from the same bags is left out, because it shows no change in time.
     """
     seen: set[tuple[Source, ...]] = set()
     ordered: list[Calibration] = []

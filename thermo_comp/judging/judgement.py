@@ -21,7 +21,7 @@ from . import verdicts
 from .verdicts import Section, Sections, Verdict
 from .windows import JudgedWindows
 
-# Without a tolerance, a valid calibration is WIDE if the RMS claimed sd exceeds this [m/s^2].
+# Without a tolerance, a valid calibration is WIDE above this RMS of the claimed sd [m/s^2].
 _WIDE_CLAIM = 1e3 * MICRO_G
 #: Smallest significant shift or change of a constant, in standard deviations.
 SIGNIFICANT_SDS = 3.0
@@ -56,7 +56,7 @@ class Judgement:
     """
     The judgement of a calibration on recordings: the verdict, and a sentence with its numbers.
 
-    `left_out_rms`: RMS of |f| - g on positions left out of the fit, NaN if the bags are not those
+    `left_out_rms`: RMS of |f| - g on positions left out of the fit, NaN unless the bags are those
     of the fit; `tolerance`: the user's limit on RMS values [m/s^2]. `shifts`: shift of bias and
     scale of each axis, empty with fewer than six distinct positions; `moved`: text of each
     significant shift; `axis_rms`: RMS drift of each regime and axis; `rate`: judgement of the
@@ -84,7 +84,7 @@ class Judgement:
 
     @property
     def exit_code(self) -> int:
-        """0 for a valid calibration unless a gyroscope is `RECALIBRATE` or `NO_BETTER`, else 1."""
+        """0 if valid, and the gyroscope's verdict is not `RECALIBRATE` or `NO_BETTER`, else 1."""
         is_wrong = self.rate and self.rate.kind in (Verdict.RECALIBRATE, Verdict.NO_BETTER)
         return 0 if self.is_valid and not is_wrong else 1
 

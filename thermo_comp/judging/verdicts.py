@@ -23,7 +23,7 @@ LARGEST_RATIO = 2.0
 WIDE_PART = 0.5
 # Smallest number of windows of a regime that is judged separately.
 _FEWEST_WINDOWS = 6
-# Windows sorted by known |f| are split where successive |f| differ by a larger ratio than this.
+# Windows sorted by known |f| are split where successive |f| differ by more than this ratio.
 _LEVEL_RATIO = 1.02
 
 SECTIONS = ('static', 'dynamic', 'all', 'outside')

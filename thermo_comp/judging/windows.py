@@ -42,8 +42,8 @@ class JudgedWindows:
     """
     Windows at rest of all bags, in the order of bags and time; arrays of n rows.
 
-    A window lasts exactly `window_s` from `start_ns`; `time`: from the bag's first sample to the
-    window's middle [s]; `count`, `mean`: number and mean of the window's raw samples. A position
+    A window lasts exactly `window_s` from `start_ns`; `time`: middle of the window, from the bag's
+    first sample [s]; `count`, `mean`: number and mean of the window's raw samples. A position
     is a still interval, numbered through all bags. `rate`: rate of the board temperature [K/s].
     `is_dynamic`: the coefficients of the dynamic regime have more than half the weight;
     `is_inside`: the window is entirely inside the calibrated ranges; `is_swapped`: the board

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the correction of arrays of samples; the result equals that of single samples bit for bit.
+Owns the correction of arrays of samples, bit for bit equal to the correction of single samples.
 
 Temperature readings are applied one by one. The intervals of linear correction between readings
 are collected and evaluated together; then all samples are corrected by the same operations as
@@ -28,7 +28,7 @@ from .status import DROPPED
 _Arrivals: TypeAlias = list[tuple[int, int, str, int, float]]
 #: Segments of the correction, each with its number of samples.
 Segments: TypeAlias = list[tuple[Segment, int]]
-#: Corrects samples: from `Correction.line` results, time since segment start [s], and x, y, z.
+#: Corrects samples; takes results of `Correction.line`, time since segment start [s], x, y, z.
 _Arithmetic: TypeAlias = Callable[..., Sequence[Floats]]
 #: Code of the reason for which a sample is dropped; the code 0 marks a published sample.
 _REASONS = {name: number for number, name in enumerate(DROPPED, 1)}
@@ -93,7 +93,7 @@ def process_block(
 
 
 def _runs(compensator: Compensator, stamps: Stamps, arrivals: _Arrivals) -> list[Ints]:
-    """Find the samples whose stamps are in order, split into runs where time jumps back."""
+    """Find the samples whose stamps are in order, split into runs where stamps jump back."""
     before_ns, leap_ns = compensator.last_ns, compensator.leap_ns
     steps = np.diff(stamps, prepend=stamps[:1] if before_ns == EVER_NS else before_ns)
     is_plain = compensator.leapt_ns is None and (steps[before_ns == EVER_NS :] > 0).all()
@@ -127,7 +127,7 @@ def _push(
         _, _, name, stamp_ns, celsius = arrivals.pop()
         if len(thermal.queue) >= PENDING_LIMIT:
             # If the queue is full, apply its readings up to `DISORDER_NS` before the new reading,
-            # as the node does without samples; after the first sample, only those up to `due_ns`.
+            # as the node does without samples; after the first sample, none after `due_ns`.
             limit_ns = NEVER_NS if compensator.now_ns is None else due_ns
             thermal.flush(min(limit_ns, stamp_ns - DISORDER_NS))
         thermal.push(name, stamp_ns, celsius)
@@ -214,7 +214,7 @@ def _apply(
 
 
 def _lines(model: Model, segments: Segments) -> tuple[Floats, Floats, Bools]:
-    """Evaluate `Model.lines`, with the slowly varying variance once for each `SlowState`."""
+    """Evaluate `Model.lines`; evaluate the slowly varying variance once per `SlowState`."""
     _, _, _, excess, start, end, slow = zip(*(segment for segment, _ in segments), strict=True)
     distinct = {id(state): state for state in slow}
     places = {key: place for place, key in enumerate(distinct)}
@@ -261,7 +261,7 @@ def _judge(
     # Reason for which all samples of a segment are dropped, or 0.
     reason = _REFUTED if compensator.is_refusing else 0
     for (segment, count), begin, stamp_ns, row in pieces:
-        # The check of |f| uses the first sample of a new segment if it is valid, even if dropped.
+        # The check of |f| uses the valid first samples of new segments, even if they are dropped.
         is_bad = bool(reasons[begin])
         if segment.is_too_fast:
             reason = _TOO_FAST

@@ -61,9 +61,9 @@ REFUTING_WINDOWS: Final = 3
 RESTORING_WINDOWS: Final = 2
 #: Time at rest between a step of |f| and the judgement of the step [ns].
 STEP_NS: Final = 300_000_000
-#: An error of |f| after motion is due to the platform's acceleration, as in a coordinated turn, if
-#: the force has turned by less than this angle [rad] and at most this time [ns] has passed since
-#: |f| agreed with gravity: an error of the calibration depends on the direction of the force.
+#: An error of |f| after motion counts as an acceleration of the platform, as in a coordinated
+#: turn, if the force has turned by less than this angle [rad], at most this time [ns] after |f|
+#: agreed with gravity: an error of the calibration depends on the direction of the force.
 SAME_DIRECTION: Final = 0.05
 LONGEST_MANOEUVRE_NS: Final = 60_000_000_000
 #: A residual of |f| above the tolerance plus this number of its sd refutes the calibration.

@@ -51,7 +51,7 @@ CONTINUED: Final = (
     f'{TANGENT_SPANS:g} of the range, then constant'
 )
 
-#: Variances of a rate that is not finite: -1 as first variance means no rate (sensor_msgs/Imu).
+#: Variances of an angular rate that is not finite; the first, -1, means no rate in an Imu.
 NO_RATE: Final = (-1.0, 0.0, 0.0)
 
 #: Specific force x, y, z [m/s^2] and the covariance xx, xy, xz, yy, yz, zz [m^2/s^4].
@@ -80,7 +80,7 @@ class CompensatorStatus:
     is_board_lost: bool = True
     is_case_lost: bool = True
     excess: Excess = Excess(0.0, 0.0, 0.0, 0.0)  # noqa: RUF009 - it is immutable
-    #: Whether the board temperature leads that of the case in a ramp, as with swapped topics.
+    #: Whether the board temperature leads the case temperature in a ramp, as with swapped topics.
     is_lead_reversed: bool = False
     gravity: GravityResidual | None = None  # residual at rest, or None before the first rest
     #: Whether nothing is published, as the error of |f| at rest exceeds the tolerance plus 5 sd.
@@ -102,7 +102,7 @@ class Compensator:
         self._use(model.calibration)
         self.stuck = self._stuck_check()
         self.last_ns = self.event_ns = EVER_NS
-        #: Stamp of a sample far ahead of all earlier stamps, not yet confirmed by a second sample.
+        #: Stamp of a sample long after all earlier stamps, not yet confirmed by a second sample.
         self.leapt_ns: int | None = None
         self.reading_ns = EVER_NS  # the latest stamp of a reading
         #: The present segment: start [ns], result of `Correction.line`, and misalignment.
@@ -239,7 +239,7 @@ class Compensator:
         if not is_new:
             return row
         if self.gravity.is_refuted and not is_too_fast:
-            # The |f| of dropped samples is checked: output resumes when it agrees with gravity.
+            # The |f| of dropped samples is checked: output resumes once |f| agrees with gravity.
             self.is_refusing = True
             if row is not None:
                 counters.n_out -= 1
@@ -261,7 +261,7 @@ class Compensator:
         return False
 
     def jump_back(self, stamp_ns: int) -> None:
-        """Restart at a sample before which time has jumped back, as in a bag that loops."""
+        """Restart at a sample before which the stamps have jumped back, as in a looped bag."""
         # Waiting readings with later stamps belong to the time before the backward jump.
         self.thermal.queue.keep(lambda entry: entry[0] <= stamp_ns)
         self.thermal.reset()
@@ -274,7 +274,7 @@ class Compensator:
         self.last_ns = stamp_ns - 1
 
     def take_flags(self) -> list[tuple[int, bool]]:
-        """Return regime flags since the last call: stamp of a reading [ns], whether dynamic."""
+        """Return regime flags since the last call: stamp of a reading [ns], True if dynamic."""
         flags, self.thermal.flags = self.thermal.flags, []
         return flags
 

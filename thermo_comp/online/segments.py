@@ -34,7 +34,7 @@ from .status import CompensatorConfig, Counters
 #: Longest segment [ns].
 SEGMENT_NS: Final = 1_000_000_000
 SLOW_NS: Final = 10_000_000_000  # longest time a `SlowState` and its variance are used [ns]
-YOUNG_READINGS: Final = 30  # board readings after which the estimate of their rate is precise
+YOUNG_READINGS: Final = 30  # number of board readings that give a precise rate of the board
 EVER_NS: Final = -NEVER_NS  # a stamp earlier than any real stamp
 #: Sd of the temperature of a unit without thermometer about the reference temperature [K].
 UNMEASURED_SD_K: Final = 10.0
@@ -62,7 +62,7 @@ class Segment(NamedTuple):
     noise_excess: float  # relative excess of the noise variance because of the samples' rate
     start: tuple[float, ...]  # thermal state at the start of the segment
     end: tuple[float, ...]  # thermal state at the end of the segment
-    slow: SlowState  # one object for successive segments with equal arguments
+    slow: SlowState  # the same object in successive segments with equal arguments
 
 
 _NO_STATE: Final = SlowState((), [], 0.0)
@@ -85,7 +85,7 @@ class Model:
         self.inputs = (BOARD_INPUT, *calibration.sensors)
 
     def slow_rows(self, slow: Sequence[SlowState]) -> Floats:
-        """Return the slowly varying variances: `n_slow` rows of force, then those of the rate."""
+        """Return the slowly varying variances: `n_slow` rows of force, then the angular rate's."""
         states, shares, rates = (np.array(part).T for part in zip(*slow, strict=True))
         return np.concatenate([part.at(states, shares, rates) for part in self.uncertainty])
 
@@ -204,7 +204,7 @@ class ThermalSide:
         return not self.model.needs_temperature and self.tracker.board.stamp_ns is None
 
     def sample(self, stamp_ns: int) -> tuple[float, ...]:
-        """Return the thermal state at a stamp; if `is_unmeasured`, a soak at T_ref."""
+        """Return the thermal state at a stamp, or of a soak at T_ref if `is_unmeasured`."""
         if self.is_unmeasured:
             gradients = (0.0, 0.0) * len(self.calibration.sensors)
             reference = self.calibration.reference_temperature_c

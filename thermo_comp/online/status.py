@@ -20,7 +20,7 @@ class CompensatorConfig(ThermalConfig):
     #: Gravity at the place of use [m/s^2]; 0 = the gravity of the calibration.
     local_gravity_m_s2: NotNegative = 0.0
     #: Largest accepted error of |f| at rest [m/s^2], beyond 5 sd; after a larger error, as with a
-    #: calibration of another unit or a reversed axis, nothing is published; 0 = no limit.
+    #: calibration of another unit, nothing is published; 0 = no limit.
     gravity_tolerance_m_s2: NotNegative = 0.5
 
 

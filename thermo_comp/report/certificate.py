@@ -65,7 +65,7 @@ class Contribution(NamedTuple):
     """One line of the uncertainty budget: a standard uncertainty of |f| [m/s^2]."""
 
     name: str
-    evaluation: str  # type A or B, as in the GUM
+    evaluation: str  # type A (statistical) or B (other), see the GUM, JCGM 100
     standard: float | None  # None if the uncertainty is not stated
     basis: str
 
@@ -107,7 +107,7 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
     claimed = noise
     if calibration.has_uncertainty:
         x, y, z = (windows.force / np.linalg.norm(windows.force, axis=1, keepdims=True)).T
-        # Derivatives of |f| w.r.t. M[1][0], M[2][0] and M[2][1] at |f| = g.
+        # Derivatives of |f| with respect to M[1][0], M[2][0] and M[2][1] at |f| = g.
         by_element = np.stack((x * y, x * z, y * z)) * windows.gravity
         attitude = _rms(np.linalg.norm(by_element.T * calibration.misalignment_sd, axis=1))
         claimed = _rms(windows.claimed_sd)
@@ -253,7 +253,7 @@ def conformity(evidence: Evidence) -> tuple[str, str]:
         f'The unit {does} to the limit of {limit} µg.',
         'Rule: simple acceptance. Within the calibrated ranges the RMS of |f| − g of each regime '
         'and, if known, on positions left out of the fit is at most the limit. If the correction '
-        'depends on temperature, the overall RMS of |f| − g is below that without correction. '
+        'depends on temperature, the overall RMS of |f| − g is below the raw RMS. '
         'The uncertainty is not subtracted from the limit (guard band 0).',
     )
 
@@ -302,7 +302,7 @@ def curves(calibration: Calibration) -> list[Curve]:
 
 
 def slopes(soak: Curve) -> Floats:
-    """Fit a straight line to each column of a soak and give its slope per kelvin, shape (6,)."""
+    """Fit a straight line to each column of a soak; return the slopes per kelvin, shape (6,)."""
     return np.asarray(np.polyfit(soak.temperature, soak.value, 1)[0])
 
 

@@ -51,7 +51,7 @@ _MOST_POINTS = 4000
 
 @dataclass(frozen=True)
 class Position:
-    """A still position: force direction in the output frame, RMS of |f| - g of each correction."""
+    """A still position: force direction in the output frame, RMS of |f| - g by correction."""
 
     number: int
     bag: int
@@ -85,7 +85,7 @@ class ShownBag:
 
     @property
     def leader(self) -> str:
-        """The leading sensor: the case's if the bag has a case thermometer, else the board's."""
+        """The leading sensor: 'case' if the bag has a case thermometer, else 'board'."""
         return 'case' if len(self.bag.case.value) else 'board'
 
 
@@ -232,7 +232,7 @@ class Evidence:
 
     @property
     def left_out_text(self) -> str:
-        """The meaning of the left-out errors: |f| - g or, if that is not determined, drift."""
+        """The meaning of the left-out errors: |f| - g or, if |f| is not determined, drift."""
         drift = 'RMS drift of an axis (force less its mean in the position)'
         if self.n_directions == 1:
             return f'{drift} on data left out of the fit'
@@ -349,7 +349,7 @@ def span_of(bag: ReducedBag) -> tuple[int, float]:
 
 
 def widest(bags: Sequence[ReducedBag]) -> int:
-    """Return the index of the bag with the widest range of T_board; if several, the longest."""
+    """Return the index of the bag with the widest range of T_board; of several, the longest."""
     spans = [float(np.ptp(bag.board.value)) if len(bag.board.value) else 0.0 for bag in bags]
     # Of bags with equal range (within 5 %) and duration (in whole minutes), take the first.
     candidates = [i for i, span in enumerate(spans) if span >= 0.95 * max(spans)]

@@ -30,8 +30,8 @@ _LONGEST_MESSAGE = 1024
 _ENCAPSULATION = b'\0\1\0\0'
 _HEADER = struct.Struct('<4siI4x')
 # Number of bytes of an Imu that are passed on: orientation 4 + 9 and angular velocity 3 + 9
-# float64 values; linear acceleration 3 + 9 follow. `_UNKNOWN`: these bytes for counts, with the
-# mark -1 of quantities that are not measured.
+# float64 values; linear acceleration 3 + 9 follow. `_UNKNOWN`: these bytes of an
+# Imu made from counts, in which -1 marks the quantities that are not measured.
 _PASSED = 8 * 25
 _UNKNOWN = struct.Struct('<25d').pack(*[0.0] * 3, 1.0, -1.0, *[0.0] * 11, -1.0, *[0.0] * 8)
 #: Offset of the angular rate in the `_PASSED` bytes; formats of the rate with the first element of
@@ -55,7 +55,7 @@ class Traffic:
 
 
 class SampleConverter:
-    """Converts serialized samples to serialized Imu; with `frame_id` '' in the input's frame."""
+    """Converts serialized samples to serialized Imu; `frame_id` '': the input's frame."""
 
     def __init__(self, kind: Any, frame_id: str = '', traffic: Traffic | None = None) -> None:
         self._kind, self._frame_id = kind, frame_id
@@ -108,7 +108,7 @@ class SampleConverter:
     def _learn(self, data: bytes) -> bytes:
         """Store a message's layout; return the message as plain CDR, b'' if it is unreadable."""
         is_imu = self._kind is Imu
-        # An Imu ends with the covariance of its acceleration, of which the first element is read.
+        # An Imu ends with nine covariances of the acceleration, and only the first is read.
         skip, n_read, n_after = (_PASSED, 4, 64) if is_imu else (0, 3, 0)
         size = skip + 8 * n_read + n_after
         given, (data, start) = data, _plain(data, size, self._kind)

@@ -31,11 +31,11 @@ from .reader import LoadedCalibration
 from .relay import Relay
 from .waitloop import WaitLoop
 
-# After this time without samples [s] readings are used alone; Fast DDS may deliver 3 s late.
+# Time without samples [s] after which readings are used alone; Fast DDS may deliver 3 s late.
 IDLE_S = 5.0
-#: Readings with stamps ahead of the samples' stamps by more than this time [s] have another clock.
+#: Readings with stamps more than this time [s] after the samples' stamps are of another clock.
 AHEAD_S = 5.0
-#: Samples have stopped if none arrives for the longer of these conversion cycles and time [s].
+#: Samples have stopped if none arrives for this number of conversion cycles and this time [s].
 SILENT_CYCLES, SILENT_S = 5.0, 0.5
 #: Time for which the level of the diagnostics must stay below the logged level before the lower
 #: level is logged [s]; a fault that comes and goes then does not fill the log.
@@ -140,8 +140,7 @@ class Reporter:
             self._level_s = now_s
         if message.level > self._level or (is_lower and now_s - self._level_s >= RELIEF_S):
             self._level, self._level_s, log = message.level, now_s, self._node.get_logger()
-            # rclpy refuses a line of source that logs with a second severity, so each severity has
-            # a separate line.
+            # rclpy refuses a second severity from one line of source: each has a separate line.
             if message.level == DiagnosticStatus.OK:
                 log.info(message.message)
             elif message.level == DiagnosticStatus.WARN:

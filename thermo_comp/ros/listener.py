@@ -72,7 +72,7 @@ class LiveTopics:
         return sum(topic.n_lost for topic in self._inputs.values())
 
     def blocks(self, wait: Callable[[float], bool]) -> Iterator[News | None]:
-        """Yield received blocks, then None, after each call of `wait` until it returns True."""
+        """Yield received blocks and then None after each `wait`, until `wait` returns True."""
         is_over = False
         while not is_over:
             is_over = wait(BLOCK_S)

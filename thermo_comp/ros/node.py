@@ -3,7 +3,7 @@
 """
 Owns the node `thermo_comp`: samples and temperatures in; force, regime flag, diagnostics out.
 
-The output equals that of the offline replay of the same messages in the same order bit for bit.
+The output equals, bit for bit, the offline replay of the same messages in the same order.
 Parameters are checked when they are set, and applied between two wake-ups of the node's loop.
 """
 
@@ -37,7 +37,7 @@ NODE_NAME = 'thermo_comp'
 #: sample takes.
 PAUSE_S = 0.2e-3
 
-#: Time after a signal at which a process is ended even if a call hangs [s].
+#: Time from a signal to the end of the process if a call hangs [s].
 ENDING_S = 1.8
 
 USAGE = f"""\

@@ -45,7 +45,7 @@ def _parameter(default: Any, description: str, bounds: tuple[float, ...] = (), *
 
 @dataclass(frozen=True, slots=True)
 class NodeConfig:
-    """The node's parameters; those without `is_fixed` can be set while the node runs."""
+    """The node's parameters; a parameter without `is_fixed` can be set while the node runs."""
 
     calibration_file: str = _parameter(
         '',

@@ -7,9 +7,9 @@ time or as fast as the subscribers acknowledge messages.
 Topics have the relative names of the node's inputs. Messages keep the bag's order and their bytes;
 ROS 1 messages are rewritten in CDR, temperatures in messages of any type as
 sensor_msgs/Temperature. After `WINDOW` messages of a topic the player waits until every reliable
-subscriber has acknowledged them. Fast DDS requests acknowledgements every 3 s, but with every
-message while a history is full; therefore the histories are small, and transient-local durability
-keeps them full.
+subscriber has acknowledged these messages. Fast DDS requests acknowledgements every 3 s, and with
+every message while the history of a publisher is full. The histories are therefore small, and
+transient-local durability keeps each history full.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ from .waitloop import separate_node, wait_until
 
 NODE_NAME = 'thermo_comp_player'
 
-#: Largest number of unacknowledged messages of a topic; depth of its history.
+#: Largest number of unacknowledged messages of a topic; depth of the publisher's history.
 WINDOW: dict[Role, int] = defaultdict(lambda: 50, accel=200)
 CLOCK_PERIOD = 0.01  # wall time between two messages on `/clock` [s]
 #: Interval of the checks for acknowledgements, which Fast DDS sends within some 5 ms [s].
 ACKNOWLEDGEMENT_NAP = 0.0005
-#: Time for subscribers to discover the player, which the middleware does not report [s].
+#: Time for subscribers to discover the player [s]; the middleware reports no discovery.
 SETTLING = 0.3
 PATIENCE = 30.0  # longest wait for the acknowledgement of all sent messages of a topic [s]
 
@@ -116,7 +116,7 @@ class Player:
     def run(
         self, progress: Callable[[float], None], throttle: Callable[[int], object] = lambda _: None
     ) -> PlayReport:
-        """Send the bag; after each window call `throttle` with the number of samples sent."""
+        """Send the bag; after every `WINDOW` samples call `throttle` with the number sent."""
         reader, n_sent = self._reader, dict.fromkeys(self._publishers, 0)
         total = sum(reader.info.topics[name][1] for name in reader.topics.values())
         topics = {publisher.topic_name: role for role, publisher in self._publishers.items()}

@@ -77,7 +77,7 @@ class SignalWatch:
             self._is_over = True
             self._stop()
             end = None if self._ending_s is None else time.monotonic() + self._ending_s
-            # `ros2 launch` without a terminal repeats a signal that the process group received.
+            # Ignore signals until `end`: `ros2 launch` without a terminal repeats a signal.
             while select.select(
                 [self._reader], [], [], None if end is None else max(end - time.monotonic(), 0.0)
             )[0]:

@@ -32,7 +32,7 @@ from ..unit.calibration_file import SIZE_LIMIT, parse_calibration
 LIMIT_S = 10.0
 _ENDING_S = 0.5  # time to wait for a killed process [s]
 _PR_SET_PDEATHSIG = 1  # option of Linux prctl: the signal sent when the parent ends
-NICENESS = 5  # added to the niceness of the process, so that samples have priority
+NICENESS = 5  # added to the niceness of the reading process, so that samples have priority
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +90,7 @@ def read_within(name: str, directory: str, limit_s: float = LIMIT_S) -> LoadedCa
         except Exception as error:  # noqa: BLE001 - raised by `result`
             answer.set_exception(error)
 
-    # Use a daemon thread, so that the process can end while a file hangs.
+    # Use a daemon thread, so that the process can end while the reading hangs.
     threading.Thread(target=run, name='first reading', daemon=True).start()
     if not wait([answer], limit_s).done:
         raise _hanging(name, limit_s)
@@ -161,7 +161,7 @@ def serve(handle: int, parent: int) -> None:
     os.nice(NICENESS)
     pipe = Connection(handle)
     with suppress(AttributeError, OSError):
-        # The kernel kills the reading process when the node ends, even while a file hangs.
+        # The kernel kills the reading process when the node ends, even if the reading hangs.
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         return

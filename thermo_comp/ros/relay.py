@@ -41,7 +41,7 @@ _Reading = tuple[int, tuple[str, int, float]]
 
 @dataclass(frozen=True, slots=True)
 class Running:
-    """All objects that a reload replaces, by exchanging a reference between two samples."""
+    """All objects that a change of calibration or parameters replaces, between two samples."""
 
     loaded: LoadedCalibration
     config: NodeConfig
@@ -105,7 +105,7 @@ class Relay:
             raise ThermoCompError(reason, key=output)
 
     def follow_types(self) -> None:
-        """Subscribe to a thermometer in its publisher's type, if this is not Temperature."""
+        """Subscribe to a thermometer with the type that it publishes, if not Temperature."""
         for name, raw in list(self.thermometers.items()):
             if self._fields[name].kind is not Temperature or raw.count_publishers():
                 continue
@@ -214,7 +214,7 @@ class Relay:
                 self._readings.append((received, (name, *reading)))
 
     def _relay_with_readings(self, messages: list[bytes], received_ns: list[int]) -> list[bytes]:
-        """Relay samples and readings by arrival; return the samples after the last reading."""
+        """Relay data in order of arrival; return the samples after the last reading."""
         start, push = 0, self.running.compensator.push
         self._readings.sort(key=itemgetter(0))
         n = bisect_right(self._readings, received_ns[-1], key=itemgetter(0))

@@ -25,7 +25,7 @@ from ..online.compensator import Compensator
 from ..typing import Floats, Stamps
 from .reader import LoadedCalibration
 
-#: Number of waiting messages at which the rest log sums them; it also sums every second.
+#: Number of waiting messages at which the messages are summed; else they are summed every second.
 BLOCK = 1024
 #: Largest size of the file of a day, and of the folder [bytes]; a month takes at most 10 MB.
 DAY_BYTES, FOLDER_BYTES = 320_000, 64_000_000
@@ -65,7 +65,7 @@ class RestLog:
         self._thread.start()
 
     def put(self, stamp_ns: int, start: bytes, rest: bytes) -> None:
-        """Queue a rest's line; where needed, the line of the node's `start` is written first."""
+        """Queue a rest's line; in a file, the line of a node's `start` precedes its rests."""
         day = np.datetime64(stamp_ns, 'ns').astype('datetime64[D]')
         try:
             self._lines.put_nowait((str(day), start, rest))
@@ -204,9 +204,9 @@ class RestKeeper:
 
 
 def samples_of(messages: Sequence[bytes], *, is_imu: bool) -> tuple[Stamps, Floats]:
-    """Read stamps [ns] and samples of the little-endian messages that are as long as the last."""
+    """Read stamps [ns] and samples of the little-endian messages as long as the last message."""
     size = len(messages[-1]) if messages else 0
-    # A message shorter than one with an empty frame_id is malformed.
+    # A message shorter than a message with an empty frame_id is malformed.
     if size < _SHORTEST[is_imu]:
         return np.zeros(0, np.int64), np.zeros((0, 3))
     content = b''.join([message for message in messages if len(message) == size])

@@ -268,7 +268,7 @@ class WaitLoop:
                     served = [self._guarded(serve) for serve in ready]
                     # After a request the next request may wait already: look again at once.
                     poll_ns = 0 if any(served) else woken_ns + OTHERS_PERIOD_NS
-                # The interval of messages is 0 if the middleware gives no arrival times.
+                # Without arrival times from the middleware the interval is 0: do not pause.
                 if waking and 0 < waking.interval_ns < dense_ns:
                     left_ns = woken_ns + pause_ns - now_ns()
                     if left_ns > 0:
