@@ -42,12 +42,12 @@ A calibration file describes one unit in YAML, and is written by `thermo_comp fi
 `config/calibration.example.yaml` is an annotated example, `config/calibration.schema.json` the JSON
 Schema; this page is generated from the schema.
 
-A file is refused if it has unknown or missing keys, text in place of a number, NaN or infinity,
-ranges that do not rise, functions that are not normalised at the reference temperature, a relative scale that could leave
-the range 0.1 to 10, a posterior of the wrong size, another `format_version` than 2, YAML aliases or tags, or a size above 8
-MiB. The error message names the file, the key, the value and the expected value. Numbers are written with all digits and
-the posterior in single precision, so that no number changes if a file is read and written. The last line of a written file
-is `...`: if such a file is cut, for example by a copy that has not ended, it is refused.
+A file is refused if it has unknown or missing keys, text in place of a number, NaN or infinity, ranges that do not rise,
+functions that are not normalised at the reference temperature, a relative scale that could leave the range 0.1 to 10, a
+posterior of the wrong size, another `format_version` than 2, YAML aliases or tags, or a size above 8 MiB. The error message
+names the file, the key, the value and the expected value. Numbers are written with all digits and the posterior in single
+precision, so that no number changes if a file is read and written. The last line of a written file is `...`: a written file
+that was cut, for example by a copy that has not ended, is refused.
 
 The main keys:
 
@@ -184,7 +184,7 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | a board temperature that leads the case temperature in ramps (swapped topics) | the covariance is increased, ERROR |
 | counts constant for `stuck_timeout` and more than 50 samples, on all axes, or on one axis while the other axes change or show their noise; samples of three zeros | dropped, counted, ERROR |
 | counts that come faster than their conversion cycle | dropped, counted, ERROR |
-| a magnitude of the specific force at rest that differs from gravity by more than `gravity_tolerance`, also a smooth acceleration that turns the force by over 3 degrees or follows a rest after over 60 s of motion | nothing is published, ERROR |
+| a magnitude of the specific force at rest that differs from gravity by more than `gravity_tolerance` plus 5 sd; a smooth acceleration has this effect if the force has turned by over 3 degrees, or over 60 s have passed, since its magnitude last agreed with gravity | nothing is published, ERROR |
 | a constant force along the force at the last rest but larger or smaller, after motion, as in a coordinated turn | published: the platform accelerates |
 | a second publisher of a topic | the topic is not used, ERROR, until one publisher is left or for one second all messages are from one publisher (WARN while the middleware still lists a killed publisher, for 20 s) |
 | a sample without a finite correction | dropped, counted, ERROR |
