@@ -155,7 +155,7 @@ coefficients of a calibration are not parameters: parameters arrive one at a tim
 coefficients gives a wrong correction.
 
 If lags, play operators and `detector` of the new calibration equal those of the running calibration, as after `update`, the
-estimates of temperatures and regime go on. With a calibration of a new fit the estimation restarts from the last
+estimates of temperatures and regime continue. With a calibration of a new fit the estimation restarts from the last
 temperatures: after a reload in a ramp the output may step, with a larger covariance until `memory settled` in `/diagnostics`
 is True. Load a calibration of a new fit when the temperature has been constant for an hour.
 
@@ -171,13 +171,13 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | counts at full scale | dropped, counted, ERROR while such counts arrive |
 | no board temperature yet | nothing is published, ERROR |
 | no board temperature, and a calibration without temperature correction | the constants are applied; the covariance includes the effect of an unknown temperature, with an sd of 10 K |
-| board temperature older than `temperature_timeout` | nothing is published, ERROR (WARN from half of the time-out on, or earlier) |
+| board temperature older than `temperature_timeout` | nothing is published, ERROR (WARN from half of the time-out or, if shorter, five reading intervals on) |
 | case temperature older than `case_timeout` | the board decides the regime, the covariance is increased, WARN |
 | board temperature outside the calibrated range | curves continue along their tangent for a quarter of the range, and are constant beyond; the covariance is increased, WARN with the distance |
 | gradient or rate outside the calibrated range | the value is limited to the range, the covariance is increased, WARN with the distance |
 | a temperature that is NaN, below -273.15 or above 1000 degC | dropped, counted |
 | readings that jump faster than the temperature of any part can change | the readings are not used until they are plausible again or the thermometer counts as lost; if the readings stay at the new value, the jump adds to the covariance until a jump back, WARN |
-| a temperature that is constant while that of the second thermometer changes | the constant readings are not used: the last used value is held, then the thermometer counts as lost |
+| a temperature that is constant while the temperature of the second thermometer changes | the constant readings are not used: the last used value is held, then the thermometer counts as lost |
 | both temperatures constant over at least 20 readings and 5 s | the temperatures are used with a growing covariance, WARN |
 | ten changed readings in a row of the case that repeat the readings of the board (one topic for both) | the readings are used; the expected difference of case and board temperature adds to the covariance, WARN |
 | a sample whose stamp goes back by a second or more, after the force at rest has refuted the calibration | nothing is published until the force at rest agrees with gravity in two windows, ERROR |
@@ -185,7 +185,7 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | counts constant for `stuck_timeout` and more than 50 samples, on all axes, or on one axis while the other axes change or show their noise; samples of three zeros | dropped, counted, ERROR |
 | counts that come faster than their conversion cycle | dropped, counted, ERROR |
 | a magnitude of the specific force at rest that differs from gravity by more than `gravity_tolerance` plus 5 sd; a smooth acceleration has this effect if the force has turned by over 3 degrees, or over 60 s have passed, since its magnitude last agreed with gravity | nothing is published, ERROR |
-| a constant force along the force at the last rest but larger or smaller, after motion, as in a coordinated turn | published: the platform accelerates |
+| after motion, a constant force in the direction of the force at the last rest, but larger or smaller, as in a coordinated turn | published: the platform accelerates |
 | a second publisher of a topic | the topic is not used, ERROR, until one publisher is left or for one second all messages are from one publisher (WARN while the middleware still lists a killed publisher, for 20 s) |
 | a sample without a finite correction | dropped, counted, ERROR |
 | a message of more than 1 kB (a very long `frame_id`) | dropped, counted |
