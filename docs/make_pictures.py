@@ -103,16 +103,16 @@ def draw_afternoon(axes: Axes) -> None:
     for row in range(1, len(minute)):
         chip[row] = chip[row - 1] + 0.1 / 9.0 * (outside[row] - chip[row - 1])
     axes.plot(minute, outside, color=GREY, lw=1, label='surroundings')
-    axes.plot(minute, chip, color=BLUE, lw=2, label='the chip: what is measured')
+    axes.plot(minute, chip, color=BLUE, lw=2, label='chip, as measured')
     begins = np.concatenate(([0.0], ends[:-1]))
-    names = {'desk': 'on the desk', 'freezer': 'in the freezer', 'dryer': 'hair dryer, from afar'}
+    names = {'desk': 'on the desk', 'freezer': 'in the freezer', 'dryer': 'hair dryer'}
     for (name, _, long), begin in zip(legs, begins, strict=True):
         axes.axvspan(
             begin, begin + long, color='#F2F6F9' if name == 'desk' else '#DCE8F0', zorder=0
         )
         axes.text(begin + long / 2.0, 53.0, names[name], ha='center', fontsize=7)
     axes.set_ylim(-20.0, 60.0)
-    axes.set_xlabel('minutes; nobody touches the unit meanwhile')
+    axes.set_xlabel('time, min')
     axes.set_ylabel('degC')
     axes.legend(loc='lower right', fontsize=8, frameon=False)
 

@@ -42,12 +42,12 @@ A calibration file describes one unit in YAML, and is written by `thermo_comp fi
 `config/calibration.example.yaml` is an annotated example, `config/calibration.schema.json` the JSON
 Schema; this page is generated from the schema.
 
-A file is refused if it has unknown or missing keys, text in place of a number, NaN or infinity,
-ranges that do not rise, functions that are not normalised at the reference temperature, a relative scale that could leave
-the range 0.1 to 10, a posterior of the wrong size, another `format_version` than 2, YAML aliases or tags, or a size above 8
-MiB. The error message names the file, the key, the value and the expected value. Numbers are written with all digits and
-the posterior in single precision, so that no number changes if a file is read and written. The last line of a written file
-is `...`: if such a file is cut, for example by a copy that has not ended, it is refused.
+A file is refused if it has unknown or missing keys, text in place of a number, NaN or infinity, ranges that do not rise,
+functions that are not normalised at the reference temperature, a relative scale that could leave the range 0.1 to 10, a
+posterior of the wrong size, another `format_version` than 2, YAML aliases or tags, or a size above 8 MiB. The error message
+names the file, the key, the value and the expected value. Numbers are written with all digits and the posterior in single
+precision, so that no number changes if a file is read and written. The last line of a written file is `...`: a written file
+that was cut, for example by a copy that has not ended, is refused.
 
 The main keys:
 
@@ -97,9 +97,9 @@ BOUNDS = """\
 Each number in a calibration is one of the quantities in the table. The bounds are wider than any instrument needs; a
 calibration within them gives finite results and a positive definite covariance. The bias at the reference temperature, and
 its change over temperature, must each be within twice the full scale of the unit. The relative scale, plus or minus the sum
-of the largest effects of its columns, must stay between 0.1 and 10. The largest effect of a column on the bias must be at most
-a million times the limit of the bias. The effect of a parameter's sd on the bias, or on the relative scale, must be at most
-a million times the limit of the bias, or of the relative scale.
+of the largest effects of its columns, must stay between 0.1 and 10. The largest effect of a column on the bias must be at
+most a million times the limit of the bias. The effect of a parameter's sd on the bias, or on the relative scale, must be at
+most a million times the limit of the bias, or of the relative scale.
 """
 
 INTERFACE = """\
@@ -121,8 +121,8 @@ parameters.
 With Fast DDS the node uses a profile with `nackSupressionDuration` = 20 ms for its publishers, as no ROS QoS setting has
 this parameter. With the default of `nackSupressionDuration`, 0 s, a thread of the middleware wakes about four times for each
 sample to a reliable subscriber, and takes a quarter of the node's CPU time. With NACKs suppressed for 20 ms, a lost sample
-is resent up to 20 ms later than without. A user's profile (`FASTRTPS_DEFAULT_PROFILES_FILE`, or
-`DEFAULT_FASTRTPS_PROFILES.xml` in the working directory) replaces that of the node: repeat `nackSupressionDuration` there.
+is resent up to 20 ms later. A user's profile (`FASTRTPS_DEFAULT_PROFILES_FILE`, or `DEFAULT_FASTRTPS_PROFILES.xml` in the
+working directory) replaces the profile of the node: repeat `nackSupressionDuration` in this file.
 
 `linear_acceleration_covariance` is a full 3x3 matrix: noise of the sample plus uncertainty of the calibration at the
 present thermal state. Without an angular rate or an orientation in the input, the first element of the covariance of the
@@ -132,17 +132,17 @@ from `angular_velocity`, and `angular_velocity_covariance` is the noise of a mes
 ## The topics of a driver
 
 The parameter `topics` names the driver's topics, like the option `--topic` of the offline commands:
-`topics:=imu=/imu/data,board=/fmu/out/sensor_accel:temperature`, or a file of such lines, as in
-[config/drivers](drivers.md). `TOPIC:FIELD` is a number inside a message, written as for `ros2 topic echo --field`. The node
-takes the message type from the publisher; the driver's message package must be installed. A reading without a header gets
-the stamp of the newest sample before it. `output=TOPIC` names the output, for a driver that publishes `imu/data_raw` itself;
-the node refuses an output that is its input.
+`topics:=imu=/imu/data,board=/fmu/out/sensor_accel:temperature`, or a file of such lines, as in [config/drivers](drivers.md).
+`TOPIC:FIELD` is a number inside a message, written as for `ros2 topic echo --field`. The node takes the message type from
+the publisher; the driver's message package must be installed. A reading without a header gets the stamp of the newest sample
+before the reading. `output=TOPIC` names the output, for a driver that publishes `imu/data_raw` itself; the node refuses an
+output topic that is one of its inputs.
 
 ## Recording a test
 
 `thermo_comp record` runs a separate node, `thermo_comp_record`, which subscribes to the inputs of the compensating node and
-to every further `temperature/<name>`, once the topic has a publisher; the subscription is reliable if the publisher is.
-`thermo_comp_record` publishes no topic. See [Recording](recording.md#recording).
+to every further `temperature/<name>`, once the topic has a publisher; the subscription is reliable if the publisher is
+reliable. `thermo_comp_record` publishes no topic. See [Recording](recording.md#recording).
 
 ## Parameters
 
@@ -155,7 +155,7 @@ coefficients of a calibration are not parameters: parameters arrive one at a tim
 coefficients gives a wrong correction.
 
 If lags, play operators and `detector` of the new calibration equal those of the running calibration, as after `update`, the
-estimates of temperatures and regime go on. With a calibration of a new fit the estimation restarts from the last
+estimates of temperatures and regime continue. With a calibration of a new fit the estimation restarts from the last
 temperatures: after a reload in a ramp the output may step, with a larger covariance until `memory settled` in `/diagnostics`
 is True. Load a calibration of a new fit when the temperature has been constant for an hour.
 
@@ -171,21 +171,21 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | counts at full scale | dropped, counted, ERROR while such counts arrive |
 | no board temperature yet | nothing is published, ERROR |
 | no board temperature, and a calibration without temperature correction | the constants are applied; the covariance includes the effect of an unknown temperature, with an sd of 10 K |
-| board temperature older than `temperature_timeout` | nothing is published, ERROR (WARN from half of the time-out on, or earlier) |
+| board temperature older than `temperature_timeout` | nothing is published, ERROR (WARN from half of the time-out or, if shorter, five reading intervals on) |
 | case temperature older than `case_timeout` | the board decides the regime, the covariance is increased, WARN |
 | board temperature outside the calibrated range | curves continue along their tangent for a quarter of the range, and are constant beyond; the covariance is increased, WARN with the distance |
 | gradient or rate outside the calibrated range | the value is limited to the range, the covariance is increased, WARN with the distance |
 | a temperature that is NaN, below -273.15 or above 1000 degC | dropped, counted |
-| a temperature that changes faster than that of any part can | the readings are not used until they are plausible again or the thermometer counts as lost; if they stay, the jump adds to the covariance until a jump back, WARN |
-| a temperature that is constant while that of the second thermometer changes | the constant readings are not used: the last used value is held, then the thermometer counts as lost |
+| readings that jump faster than the temperature of any part can change | the readings are not used until they are plausible again or the thermometer counts as lost; if the readings stay at the new value, the jump adds to the covariance until a jump back, WARN |
+| a temperature that is constant while the temperature of the second thermometer changes | the constant readings are not used: the last used value is held, then the thermometer counts as lost |
 | both temperatures constant over at least 20 readings and 5 s | the temperatures are used with a growing covariance, WARN |
-| case readings that repeat those of the board (one topic for both), ten changed readings in a row | the readings are used; the gradient expected of the case adds to the covariance, WARN |
+| ten changed readings in a row of the case that repeat the readings of the board (one topic for both) | the readings are used; the expected difference of case and board temperature adds to the covariance, WARN |
 | a sample whose stamp goes back by a second or more, after the force at rest has refuted the calibration | nothing is published until the force at rest agrees with gravity in two windows, ERROR |
 | a board temperature that leads the case temperature in ramps (swapped topics) | the covariance is increased, ERROR |
-| counts constant for `stuck_timeout` and more than 50 samples, on all axes or on one axis while the others change or show their noise; samples of three zeros | dropped, counted, ERROR |
+| counts constant for `stuck_timeout` and more than 50 samples, on all axes, or on one axis while the other axes change or show their noise; samples of three zeros | dropped, counted, ERROR |
 | counts that come faster than their conversion cycle | dropped, counted, ERROR |
-| a magnitude of the specific force at rest that differs from gravity by more than `gravity_tolerance`, also a smooth acceleration that turns the force by over 3 degrees or follows a rest after over 60 s of motion | nothing is published, ERROR |
-| a constant force along the force at the last rest but larger or smaller, after motion, as in a coordinated turn | published: the platform accelerates |
+| a magnitude of the specific force at rest that differs from gravity by more than `gravity_tolerance` plus 5 sd; a smooth acceleration has this effect if the force has turned by over 3 degrees, or over 60 s have passed, since its magnitude last agreed with gravity | nothing is published, ERROR |
+| after motion, a constant force in the direction of the force at the last rest, but larger or smaller, as in a coordinated turn | published: the platform accelerates |
 | a second publisher of a topic | the topic is not used, ERROR, until one publisher is left or for one second all messages are from one publisher (WARN while the middleware still lists a killed publisher, for 20 s) |
 | a sample without a finite correction | dropped, counted, ERROR |
 | a message of more than 1 kB (a very long `frame_id`) | dropped, counted |
