@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A fit reports what initial lag states, tilts, offsets and slow noise explain in its bags."""
+"""A fit reports the sizes of initial lag states, tilts, offsets and slow noise in its bags."""
 
 from dataclasses import fields, replace
 
@@ -18,7 +18,7 @@ from thermo_comp.fitting.initial_triad import within_positions
 from thermo_comp.fitting.unknowns import Noise
 from thermo_comp.unit.gravity import MICRO_G
 
-#: A tilt sd without visible effect, but not 0, so that all truths draw the same random numbers.
+#: This sd of tilts has no visible effect, but is not 0: all truths draw equal random numbers.
 NOTHING = Truth(tilt_sd=1e-15)
 
 
@@ -43,8 +43,8 @@ def settled(truth):
     [
         ('initial_lag_states', {'start_sd': 0.5, 'on_bias': 5.0 * NOTHING.on_bias}, 0.05),
         ('support_tilt', {'tilt_sd': 5e-6}, 0.05),
-        # |f| determines 24 combinations of the 72 offsets, of which 9 act like changes of the
-        # constants: the sd of 15 numbers is uncertain by 1 / sqrt(2 * 15) = 18 %.
+        # |f| determines 24 combinations of the 72 offsets. 9 of them act like changes of the
+        # constants; from the other 15 the sd is known to 1 / sqrt(2 * 15) = 18 %.
         ('mounting_offsets', {'offset_sd': 30.0 * MICRO}, 0.36),
     ],
 )
@@ -101,7 +101,7 @@ def test_starts_and_tilts_larger_than_the_response_are_findings(name, value, exp
     if expected:
         assert 'explain 90 ug RMS' in found[0].message
         assert 'thermal response of the unit, 60 ug' in found[0].message
-    # Effects below the white noise of a window give no finding.
+    # An effect below the white noise of a window gives no finding.
     assert not list(judge_contributions(values, 100.0 * MICRO_G))
 
 

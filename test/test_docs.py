@@ -20,7 +20,7 @@ pytestmark = pytest.mark.usefixtures('equal_fits_once', 'no_figures')
 
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))]
 TUTORIAL = ROOT / 'docs' / 'tutorial.ipynb'
-# Commands that other files test: `play` takes minutes, and `record` waits for 18 positions.
+# Other files test these commands: `play` takes minutes, `record` waits for 18 positions.
 ELSEWHERE = (
     'thermo_comp play bags/held_out.mcap --rate 20',
     'thermo_comp record session --positions 18 --soak 45min -o bags/unit42',
