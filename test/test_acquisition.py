@@ -226,7 +226,6 @@ def test_a_direction_is_proposed_if_positions_are_near_all_directions(rng):
 
 
 def test_a_mean_reading_of_zero_has_no_direction_and_hides_none():
-    # WHY: after a mean reading of zero, which has no direction, no other direction was counted.
     means = np.vstack([np.zeros(3), FACES, FACES])
     assert coverage.n_directions(means) == coverage.n_directions(means[::-1]) == 6
 

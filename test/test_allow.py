@@ -128,7 +128,6 @@ def in_whole_degrees(rest):
     ],
 )  # fmt: skip
 def test_bags_without_usable_numbers_are_refused_with_a_message(rng, spoil, text, options):
-    # WHY: the fit to bags without usable numbers ended with a traceback.
     with pytest.raises(FitError, match=text):
         fit(sources_of(rests_of(rng), spoil), options)
 

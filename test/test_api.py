@@ -208,7 +208,6 @@ def test_arrays_that_cannot_be_fitted_and_doubled_bags_are_refused(tmp_path):
 
 
 def test_tc_read_keeps_the_known_force_of_a_bag_and_refuses_to_fit_a_rotation(tmp_path):
-    # WHY: `fit(read(bag))` took gravity as |f| in a bag whose metadata state another |f|.
     source = read_recording(ROOT / 'bags' / 'held_out.mcap').columns
     for number, facts in enumerate(
         (

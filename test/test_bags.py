@@ -36,7 +36,6 @@ def test_the_commands_in_the_readme_of_the_bags_make_the_sample_bags(command, tm
     for path in made:
         shipped = read_recording(ROOT / path.relative_to(tmp_path))
         anew = read_recording(path)
-        # Only the version in `simulated_by` may differ between shipped and new bags.
         new, old = (dict(bag.info.metadata) for bag in (anew, shipped))
         assert new.pop('simulated_by').split()[0] == old.pop('simulated_by').split()[0]
         assert new == old, path.name

@@ -16,7 +16,6 @@ pytestmark = pytest.mark.usefixtures('equal_fits_once', 'no_figures')
 
 
 def leaves(group, prefix=''):
-    """Return every command and sub-command by its full name, such as `group command`."""
     collected = {}
     for name, command in group.commands.items():
         inner = hasattr(command, 'commands')

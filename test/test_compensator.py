@@ -264,7 +264,6 @@ def test_another_transition_time_during_a_transition_causes_no_step_of_the_outpu
 
 
 def test_a_new_transition_time_does_not_restart_the_checks_of_gravity_and_sample_rate(rng):
-    # WHY: a changed parameter restarted the check of |f|: a wrong |f| was published for 13 s.
     compensator = Compensator(calibration(), CompensatorConfig())
 
     def published(seconds, size):

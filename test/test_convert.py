@@ -117,7 +117,6 @@ def test_times_of_a_counter_of_32_bits_continue_after_its_overflow(tmp_path, uni
 
 
 def test_readings_stay_among_samples_after_a_restart_of_the_clock(tmp_path):
-    # WHY: after a restart of the clock the bag contained all readings before all samples.
     path, _ = table(tmp_path / 'log.csv')
     lines = path.read_text().splitlines()
     for k in range(201, 401):

@@ -98,7 +98,6 @@ def test_a_table_is_read_by_its_headings(tmp_path, rng, kind, headings, unit, on
 
 @pytest.mark.parametrize('kind', ['dates', 'text', 'numbers'])
 def test_a_parquet_table_is_read_by_its_headings(tmp_path, rng, kind):
-    # WHY: a Parquet table was read only with a column map, although it has headings.
     pa = pytest.importorskip('pyarrow', reason='pyarrow is the extra `parquet`')
     import pyarrow.parquet as pq
 

@@ -41,7 +41,6 @@ def cubic():
 
 @pytest.mark.parametrize('to', get_args(Tool))
 def test_a_serial_with_line_breaks_adds_no_line_to_an_export(cubic, to):
-    # WHY: a serial with a line break added a parameter to the parameter file of a vehicle.
     assert get_args(Tool) == tuple(TOOLS)
     clean = export_calibration(cubic, to).text
     unit = replace(cubic.unit)

@@ -138,7 +138,6 @@ def test_a_killed_command_leaves_the_old_file(folder, point):
 
 @pytest.mark.parametrize('name', ['bag.mcap', 'rows.csv'])
 def test_a_command_ended_by_sigterm_leaves_no_file(folder, name):
-    # WHY: a command that was ended by SIGTERM left a hidden file as large as the bag.
     listed = set(folder.iterdir())
     ended = killed_replay(KILLED.replace('SIGKILL', 'SIGTERM'), 'writing', name, folder)
     assert (ended.returncode, ended.stderr) == (143, b'')

@@ -313,7 +313,6 @@ def test_rests_of_one_mounting_do_not_show_how_well_mountings_repeat(rng):
 
 
 def test_two_bags_without_a_pause_between_them_count_as_one_turn_on(rng):
-    # WHY: if recordings were cut into two bags, the claimed sd of the bias was half the true sd.
     def cut(source, at, pause_s):
         (whole,) = source.blocks()
         arrays = [
@@ -355,7 +354,6 @@ def test_stamps_give_the_date_and_samples_after_a_clock_that_was_set_back_are_co
 
 
 def test_the_sd_of_turn_ons_in_a_prior_is_used_for_six_positions(rng):
-    # WHY: a prior with a mounting sd of 8 ug had no effect: the fitted sd was 43 ug.
     known = fit([turned(rng, positions(18, 3))], replace(OPTIONS, mounting_sd=2e-4)).calibration
     assert known.static.x.residual_sd_m_s2 == pytest.approx(2e-4)
     six = [turned(rng, positions(6, 4))]

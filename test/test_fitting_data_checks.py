@@ -84,7 +84,6 @@ def test_missing_data_of_a_test_are_reported(good, name, changed, message):
 
 
 def test_exchanged_thermometers_in_one_bag_of_many_are_reported_with_its_name(good):
-    # WHY: with one exchanged bag of twelve, the fit took the mean of the two temperatures.
     windows, up = good
     data = replace(windows.data, bag=windows.data.position // 6)
     names = [f'{k // 6}.mcap' for k in range(18)]
@@ -96,7 +95,6 @@ def test_exchanged_thermometers_in_one_bag_of_many_are_reported_with_its_name(go
 
 
 def test_the_noise_of_soaks_is_not_taken_for_a_ramp_or_for_exchanged_sensors(good, rng):
-    # WHY: bags of soaks were refused: noise gave rates and gradients like exchanged thermometers.
     windows, up = good
     noise = rng.standard_normal(len(windows.rate))
     soaks = 5.0 + 15.0 * (windows.data.position % 3)

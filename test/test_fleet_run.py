@@ -101,7 +101,6 @@ def test_all_units_are_fitted_despite_a_killed_worker_and_only_once(client, flee
 
 @pytest.mark.slow
 def test_unreadable_bags_leave_earlier_results_in_place(scheduler, tmp_path):
-    # WHY: when bags could not be read, a second run deleted the results of the first run.
     bags = write_unit(tmp_path / 'bags' / 'unit', 1)
     options = replace(OPTIONS, certificates=True)
     first = fit_fleet(str(tmp_path / 'bags'), tmp_path / 'out', options, scheduler=scheduler)
@@ -152,7 +151,6 @@ def children_of(pid):
 
 @pytest.mark.slow
 def test_ctrl_c_while_workers_start_prints_no_traceback(tmp_path):
-    # WHY: after Ctrl-C each starting worker and Dask printed a traceback.
     write_unit(tmp_path / 'bags' / 'u', 1, 1)
     words = ['fleet', 'fit', 'bags', '-o', 'out', '--gravity', '9.81', '--workers', '1']
     process = subprocess.Popen(

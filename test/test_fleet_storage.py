@@ -173,7 +173,6 @@ class TestDiscovery:
         assert [name for unit in units for name in unit.bags] == ['unit/1.mcap']
 
     def test_a_folder_that_cannot_be_read_is_named(self, tmp_path, monkeypatch):
-        # WHY: a unit whose folder was not readable was left out, and the exit code was 0.
         unread = '.hidden', 'lost+found'
         write_unit(tmp_path / 'u1', 1, 1)
         for name in ('u2', *unread):

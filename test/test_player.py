@@ -101,7 +101,7 @@ print(digest.hexdigest())
 
 
 def test_the_player_waits_for_a_slow_subscriber_which_loses_no_message(tmp_path, rng):
-    # More messages than the middleware stores (5000) are sent faster than the subscriber reads.
+    # The player sends more messages (7000) than the middleware stores, faster than they are read.
     with BagWriter(tmp_path / 'bag.mcap') as writer:
         stamps = START_NS + np.arange(7000) * CYCLE_NS
         writer.write_counts(TOPICS.counts, stamps, rng.integers(-9, 9, (7000, 3)), 'imu_link')

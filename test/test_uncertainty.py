@@ -67,7 +67,6 @@ def test_the_claimed_sd_of_lags_covers_a_start_in_a_ramp():
 
 
 def test_without_case_readings_the_gradient_is_that_at_rest():
-    # WHY: without case readings a gradient of 0 K was assumed, although the board is 1 K warmer.
     of_gradient = (term('gradient', (30.0, 0.0, 0.0)),)
     soak = np.full(2000, 20.0)
     _, corrected, _ = at_1_hz(calibration(response=of_gradient), soak, soak[:1500] - 1.0)

@@ -153,7 +153,6 @@ def test_only_an_attitude_to_which_the_unit_was_returned_is_a_pose():
 
 
 def test_rests_in_one_pose_use_the_mounting_sd_that_the_user_stated():
-    # WHY: a fit of rests in one pose used a smaller sd of mountings than the user had stated.
     for axis in strangers.fitted(next(cases.returned(1)), mounting_sd=0.01).static.axes():
         assert axis.residual_sd_m_s2 == pytest.approx(0.01)
 
