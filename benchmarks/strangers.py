@@ -140,8 +140,8 @@ def score(outs: Sequence[Corrected], bags: Sequence[Minutes], *, is_drift: bool)
     forces = [out.force for out in outs]
     plain = error_of(forces, bags, is_drift=is_drift)
     if is_drift:
-        # A mounting's bias offset cancels in the drift: subtract the smallest claimed variance,
-        # that at the reference temperature, from all claimed variances of a bag.
+        # A mounting's bias offset cancels in the drift. Therefore subtract the smallest claimed
+        # variance, which is at the reference temperature, from all claimed variances of a bag.
         variances = [np.diagonal(out.claim, axis1=1, axis2=2) for out in outs]
         sd = np.sqrt(np.concatenate(
             [v - v.min(axis=0) + out.white for v, out in zip(variances, outs, strict=True)]
