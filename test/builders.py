@@ -26,10 +26,17 @@ from thermo_comp.unit.rate_bias import Gyroscope, RateCurve, RateSet, RateTerm
 
 GRAVITY = 9.80665
 SECOND_NS = 1_000_000_000
+#: The beginning of 2026, at which bags of tests begin [ns].
+START_NS = 1_767_225_600 * SECOND_NS
+FACES = np.vstack((np.eye(3), -np.eye(3)))
 #: Indices of the six distinct elements among the nine of a 3 x 3 covariance.
 UNIQUE = [0, 1, 2, 4, 5, 8]
 #: Settings of a compensator that does not check for stuck samples, nor |f| against gravity.
 UNCHECKED = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def axis_set(bias=(0.0,), scale=(1.0,), **keys):

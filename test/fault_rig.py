@@ -9,14 +9,13 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from builders import GRAVITY, SECOND_NS, axis_set, calibration, regime_set, term
+from builders import GRAVITY, START_NS, axis_set, calibration, regime_set, term
 
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.online.status import CompensatorConfig
 from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
 from thermo_comp.unit.calibration import Axes, AxisReference, Unit
 
-START_NS = 1_767_225_600 * SECOND_NS
 RATE_HZ = 12.5
 READINGS_HZ = 2.5
 DURATION_S = 320.0

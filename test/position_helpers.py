@@ -28,6 +28,13 @@ class Imu:
     linear_acceleration_covariance = angular_velocity_covariance
 
 
+def source(accel, gyro=None, name='log'):
+    """Make a source of samples at 100 Hz, without temperatures."""
+    stamp_ns = START_NS + np.arange(len(accel)) * 10_000_000
+    block = ArrayBlock(stamp_ns, accel, imu=None if gyro is None else Imu(gyro))
+    return FitSource(name, lambda: [block])
+
+
 @dataclass
 class Rest:
     """A sensor at rest with specific force `level`; its board cools from `warm` by `fall`."""

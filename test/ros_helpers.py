@@ -6,6 +6,7 @@ import threading
 from contextlib import contextmanager, suppress
 
 import rclpy
+from builders import SECOND_NS, START_NS
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Vector3Stamped
 from live_node import node_in_thread  # noqa: F401 - for the tests
@@ -16,9 +17,8 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu, Temperature
 
-SECOND_NS = 1_000_000_000
-#: Stamp of the first sample of a test [ns], and interval between samples [ns].
-START_NS, CYCLE_NS = 1_767_225_600 * SECOND_NS, 10_000_000
+#: Interval between the samples of a test [ns].
+CYCLE_NS = 10_000_000
 #: Time limit for any event on DDS [s]; after this time the test fails.
 TIMEOUT = 30.0
 DEEP = QoSProfile(depth=5000, reliability=ReliabilityPolicy.RELIABLE)

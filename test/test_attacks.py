@@ -11,7 +11,7 @@ import xml.etree.ElementTree as ET
 
 import numpy as np
 import pytest
-from builders import calibration
+from builders import START_NS, calibration
 from conftest import ROOT, ran
 
 from thermo_comp.errors import CalibrationError, RecordingError
@@ -19,8 +19,6 @@ from thermo_comp.recording.reader import inspect_recording
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.unit.calibration import Unit
 from thermo_comp.unit.calibration_file import load_calibration, save_calibration
-
-START_NS = 1_767_225_600_000_000_000
 
 
 def saved(path, serial='T-1'):

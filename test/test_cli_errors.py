@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 import pytest
-from builders import axis_set, calibration, equal_axes, regime_set, rich_calibration
+from builders import START_NS, axis_set, calibration, equal_axes, regime_set, rich_calibration
 from conftest import ROOT, parsed
 
 from thermo_comp.recording.topics import Topics
@@ -14,7 +14,6 @@ from thermo_comp.recording.writer import BagWriter
 from thermo_comp.unit.calibration_file import save_calibration
 
 TOPICS = Topics()
-START_NS = 1_767_225_600_000_000_000
 
 
 def bag(path, *, counts=True, board=True, case=True, serial='', n=600, up=(0.6, 0.0, 0.8)):

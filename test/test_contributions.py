@@ -7,6 +7,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import strangers_units as units
+from builders import rms
 from fitting_truth import GRAVITY, MICRO, NOMINAL, Truth, begin, candidates_of, prior_of, table_of
 from simulation_helpers import sources_of
 from strangers_cases import HALF
@@ -20,10 +21,6 @@ from thermo_comp.unit.gravity import MICRO_G
 
 #: This sd of tilts has no visible effect, but is not 0: all truths draw equal random numbers.
 NOTHING = Truth(tilt_sd=1e-15)
-
-
-def rms(values):
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def table(truth):
@@ -55,7 +52,6 @@ def test_the_size_of_an_effect_is_the_rms_that_it_adds_to_the_readings(name, eff
     true = (table(truth)[0].mean - without.mean) / NOMINAL
     if name == 'support_tilt':
         true = within_positions(true, windows.position)
-    # The noise of a mean over 60 windows is 0.26 ug.
     hidden = truth.sigma[0] / np.sqrt(60.0)
     assert rms(true) > 5.0 * hidden
     assert getattr(found, name) == pytest.approx(rms(true), rel=tolerance)
@@ -101,7 +97,6 @@ def test_starts_and_tilts_larger_than_the_response_are_findings(name, value, exp
     if expected:
         assert 'explain 90 ug RMS' in found[0].message
         assert 'thermal response of the unit, 60 ug' in found[0].message
-    # An effect below the white noise of a window gives no finding.
     assert not list(judge_contributions(values, 100.0 * MICRO_G))
 
 

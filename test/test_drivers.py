@@ -7,7 +7,7 @@ import re
 
 import numpy as np
 import pytest
-from builders import axis_set, calibration, equal_axes, regime_set
+from builders import START_NS, axis_set, calibration, equal_axes, regime_set
 from conftest import ROOT, parsed
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -18,7 +18,6 @@ from thermo_comp.unit.calibration import Unit
 from thermo_comp.unit.calibration_file import save_calibration
 
 FILES = sorted((ROOT / 'config' / 'drivers').glob('*.yaml'))
-START_NS = 1_767_225_600 * 10**9
 IMU, TEMPERATURE = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/Temperature'
 MAGNETIC, VECTOR = 'sensor_msgs/msg/MagneticField', 'geometry_msgs/msg/Vector3Stamped'
 FLOAT, PRESSURE = 'std_msgs/msg/Float64', 'sensor_msgs/msg/FluidPressure'

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from builders import source_of
-from position_helpers import GRAVITY, MG, START_NS, Rest
+from builders import FACES, source_of
+from position_helpers import GRAVITY, MG, START_NS, Rest, source
 
 import thermo_comp as tc
 from thermo_comp.fitting import FitOptions, fit
@@ -35,7 +35,6 @@ def left_by(**options):
     # After a fit to two positions an axis is uncertain by > 1 mg (sd) in a third position.
     sd = np.sqrt(np.nanmedian(np.einsum('nii->ni', corrected.covariance), axis=0))
     assert (sd > 1000.0 * MICRO_G).any()
-    # A minute has 15 of these means over 4 s.
     force = corrected.specific_force[np.isfinite(corrected.specific_force).all(axis=1)]
     minutes = force[: len(force) // 15 * 15].reshape(-1, 15, 3).mean(axis=1)
     return minutes.std(axis=0) / MICRO_G
@@ -52,7 +51,6 @@ def test_two_positions_determine_the_thermal_response():
 
 OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2')
 UP = np.array([0.48, -0.6, 0.64])
-FACES = np.vstack((np.eye(3), -np.eye(3)))
 SLOPE = np.array([1.0, -0.5, 2.0])
 SOAK_SLOPE = 0.1 * MG * SLOPE  # [m/s^2/K]
 
@@ -73,7 +71,7 @@ def turned(rng, ups, rest_s=20.0):
         still = GRAVITY * up + (0.1, -0.2, 0.3) + 0.02 * rng.standard_normal((n, 3))
         parts += [still, GRAVITY * rng.standard_normal((100, 3))]
     accel = np.concatenate(parts)
-    return source_of(START_NS + np.arange(len(accel)) * 10_000_000, accel, name='turned')
+    return source(accel, name='turned')
 
 
 @cache
@@ -161,8 +159,8 @@ def test_rests_at_three_temperatures_give_the_bias_slope_despite_a_warm_up_of_th
     # |f| of a rest has a noise of 1 ug; the warm-up makes its temperature uncertain by 0.1 K.
     np.testing.assert_allclose(slopes, SOAK_SLOPE, atol=0.002 * MG)
     assert 'misfit' not in findings_of(result)
-    # Soaks do not determine the weights of lags, which may be as large as the bias slope: the root
-    # of the sum of the weights' variances is 0.5 to 1 times the bias slope.
+    # Soaks leave the weights of lags undetermined: their joint sd is 0.5 to 1 times the bias
+    # slope.
     variance, layout = np.diag(calibration.posterior.covariance()), parameter_layout(calibration)
     of_lags = [variance[block.response : block.end].sum() for block in layout.bias]
     assert 0.5 < np.sqrt(np.mean(of_lags) / np.mean(slopes**2)) < 1.0
@@ -171,7 +169,6 @@ def test_rests_at_three_temperatures_give_the_bias_slope_despite_a_warm_up_of_th
 @pytest.mark.slow
 def test_the_drift_error_of_a_sensor_that_follows_half_of_a_warm_up_is_within_three_claimed_sd():
     # WHY: a curve fitted to the drifts within rests had an error of 7 claimed sd over the range.
-    # The turn-on offsets of 0.1 mg leave only the drifts within rests to determine the curve.
     bags = soaks(np.random.default_rng(2), positions(6, 3), share=0.5, turn_on=0.1 * MG)
     assert (ratios_of(fit(bags, OPTIONS).calibration, -15.0, 15.0, SOAK_SLOPE) < 3.0).all()
 
@@ -258,8 +255,7 @@ def test_the_bias_sd_of_one_recording_contains_the_sd_of_a_turn_on(rng):
 
 @pytest.mark.slow
 def test_the_claimed_variance_of_a_curve_contains_that_of_turn_ons_at_each_temperature(rng):
-    # WHY: turn-on offsets at three temperatures were taken for errors of the mean bias alone, so
-    # the claimed variance was only 1.6 to 1.9 times the variance of a turn-on.
+    # WHY: turn-on offsets at three temperatures were taken for errors of the mean bias alone.
     turn_on, ups, dwell = 5e-3, positions(9, 3), 600
     bags, biases = [], []
     for celsius in (-15.0, 20.0, 55.0):
@@ -284,8 +280,7 @@ def test_the_claimed_variance_of_a_curve_contains_that_of_turn_ons_at_each_tempe
 
 @pytest.mark.slow
 def test_nine_recordings_claim_a_bias_sd_for_usual_turn_ons(rng):
-    # WHY: nine |f| do not show the sd of turn-on offsets, and the claim assumed a small sd; for
-    # turn-ons that repeat to 4 mg the bias error was 3.0 claimed sd (RMS).
+    # WHY: nine |f| do not show the sd of turn-ons, and the bias error was 3.0 claimed sd (RMS).
     ups, turn_on, ratios = positions(9, 3), 4e-2, []
     for _ in range(8):
         offsets = turn_on / GRAVITY * rng.standard_normal((9, 3))
@@ -388,8 +383,7 @@ def test_an_update_by_three_positions_has_errors_near_the_claimed_sd(rng):
 
 @pytest.mark.parametrize('size', [1, 6])
 def test_turn_ons_between_six_faces_are_not_taken_for_a_misalignment(rng, size):
-    # WHY: turn-on offsets of sd 1 mg were fitted as misalignments of 20 mrad. For six faces in
-    # three turn-ons the fit assumed 18 independent offsets: the claimed sd of M was 5 to 12 mrad.
+    # WHY: turn-on offsets of sd 1 mg were fitted as misalignments of 20 mrad.
     M = np.array([[1.0, 0.0, 0.0], [2e-3, 1.0, 0.0], [-2e-3, 1e-3, 1.0]])
     sensed = np.linalg.inv(M)
     ups = np.tile(FACES, (3, 1)) + 0.03 * rng.standard_normal((18, 3))

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from builders import ArrayBlock, arrays_of, source_of
+from builders import FACES, ArrayBlock, arrays_of, source_of
 from scipy.signal import lfilter
 from triads import triad
 
@@ -27,7 +27,6 @@ from thermo_comp.unit.metrics import norm_residual, residual_statistics
 
 RATE_HZ = 4.0
 PROGRAM = parse_cyclogram('20 20min, 45@1.5 30min, 5@1.5 30min, 20@1.5 20min')
-FACES = np.vstack((np.eye(3), -np.eye(3)))
 
 
 def records_of(unit, ups, seed, program=PROGRAM):
@@ -157,8 +156,7 @@ def test_the_error_of_the_compensator_is_that_stated_by_the_fit(response):
 
 
 def test_slow_noise_for_an_unmodelled_drift_leaves_the_white_noise():
-    # WHY: the file stated a white noise of 0.3 instead of 5 ug/sqrt(Hz), so that no window of the
-    # node's check of |f| counted as still.
+    # WHY: the stated white noise was 0.3, not 5 ug/sqrt(Hz): the node's check found no rest.
     paper = fitted(OWN_LAGS, positions(2, 1), 1, model='golovach')
     stated = np.array(paper.calibration.noise_density_m_s2_sqrt_hz) / MICRO_G
     np.testing.assert_allclose(stated, 5.0, rtol=0.4)
@@ -327,8 +325,7 @@ def test_a_named_group_without_columns_is_reported(rng):
 
 @pytest.mark.parametrize(('ratio', 'is_reported'), [(1.0, False), (1.0005, True)])
 def test_a_stated_norm_that_the_fit_ignores_is_reported(rng, ratio, is_reported):
-    # WHY: bags with a stated |f| of 9.8155 m/s^2 and gravity of 9.80665 m/s^2 gave scale factors
-    # with an error of 902 ppm, without a message.
+    # WHY: a stated |f| other than gravity gave scale factors with an error of 902 ppm, silently.
     known = KnownForce('stated', (Section(0.0, np.inf, ratio * STANDARD_GRAVITY, 0.0),))
     bags = [
         replace(recorded(rng, up, f'p{k}', (20.0, 30.0, 20.0)), force=known)

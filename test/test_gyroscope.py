@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders import calibration, rich_calibration, warm
+from builders import START_NS, calibration, rich_calibration, rms, warm
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -32,7 +32,6 @@ from thermo_comp.unit.prediction import bias_and_scale, bias_scale_and_sd, ramp_
 from thermo_comp.unit.rate_bias import MILLIDEGREE, RateCurve
 
 OPTIONS = FitOptions(gravity=STANDARD_GRAVITY, input='m/s^2')
-START_NS = 1_767_225_600_000_000_000
 RATE_HZ, MINUTE = 1.0, 60
 #: Sd of a mean over 60 s of the simulated gyroscope's white noise [rad/s].
 FLOOR = 5.0 * MILLIDEGREE / np.sqrt(60.0)
@@ -51,10 +50,6 @@ def block_of(record, K, rate=None):
 
 def source_of(record, K, rate=None, name='bag'):
     return FitSource(name, lambda: [block_of(record, K, rate)])
-
-
-def rms(values):
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 @pytest.fixture(scope='module')

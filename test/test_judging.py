@@ -8,7 +8,7 @@ import json
 
 import numpy as np
 import pytest
-from builders import GRAVITY, axis_set, calibration, equal_axes, regime_set
+from builders import GRAVITY, START_NS, axis_set, calibration, equal_axes, regime_set
 from conftest import ROOT
 
 from thermo_comp.cli.output import micro_g
@@ -30,7 +30,6 @@ from thermo_comp.unit.gravity import MICRO_G, parse_acceleration, ug_text
 from thermo_comp.unit.provenance import Provenance, ResidualSummary, Source
 
 TOPICS = Topics()
-START_NS = 1_767_225_600_000_000_000
 K = 300.0
 SLOPE = 2.0  # drift of the z axis [counts/K]
 
@@ -72,7 +71,6 @@ def corrected_by(slope, claim=0.0, **changes):
 
 
 def of_noise(sd):
-    """Make a calibration whose samples at 10 Hz have white noise of sd `sd` [m/s^2]."""
     unit = dataclasses.replace(calibration().unit, cycle_time_s=0.1)
     return calibration(unit=unit, noise_density_m_s2_sqrt_hz=(sd * np.sqrt(0.1),) * 3)
 

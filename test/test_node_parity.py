@@ -12,7 +12,7 @@ from recording_helpers import imu_columns
 
 pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 
-from builders import rich_calibration
+from builders import START_NS, rich_calibration
 from live_node import through_the_node
 from rosbags.highlevel import AnyReader
 
@@ -26,7 +26,6 @@ from thermo_comp.unit.calibration import Unit
 from thermo_comp.unit.calibration_file import save_calibration
 
 TOPICS = Topics()
-START_NS = 1_767_225_600_000_000_000
 RATE_HZ = 1
 MINUTES = 18
 UNIT = Unit('T-1', 'counts', 32767.0, 1.0 / RATE_HZ)

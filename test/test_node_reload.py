@@ -12,13 +12,13 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 
 import rclpy
-from builders import calibration
+from builders import SECOND_NS, START_NS, calibration
 from live_node import lossless
 from node_process import NodeProcess
 from rcl_interfaces.srv import GetParameters
 from rclpy.context import Context
 from rclpy.parameter import Parameter
-from ros_helpers import SECOND_NS, TIMEOUT, Driver, node_in_thread, stamp_of, standing
+from ros_helpers import CYCLE_NS, TIMEOUT, Driver, node_in_thread, stamp_of, standing
 from sensor_msgs.msg import Imu
 
 from thermo_comp.online.compensator import Compensator
@@ -27,8 +27,6 @@ from thermo_comp.thermal.settings import DetectorSettings
 from thermo_comp.unit.calibration import Axes, AxisReference, Unit
 from thermo_comp.unit.calibration_file import dump_calibration, save_calibration
 
-START_NS = 1_767_225_600 * SECOND_NS
-CYCLE_NS = 10_000_000
 K = 300.0
 
 

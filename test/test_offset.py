@@ -6,23 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders import source_of
-from position_helpers import START_NS
+from position_helpers import GRAVITY, source
 
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.coverage import rough_centre
 from thermo_comp.fitting.fit import with_code_offset
 from thermo_comp.simulation.campaign import positions
 
-GRAVITY = 9.80665
 OPTIONS = FitOptions(gravity=GRAVITY)
 K = np.array((4130.0, 4080.0, 4200.0)) / GRAVITY
 BIAS = np.array((120.0, -340.0, 55.0))
 M = np.array(((1.0, 0.0, 0.0), (0.004, 1.0, 0.0), (-0.006, 0.003, 1.0)))
-
-
-def source(words, name='words'):
-    return source_of(START_NS + np.arange(len(words)) * 10_000_000, words, name=name)
 
 
 def words_of(ups, rng, seconds=20.0):
@@ -72,7 +66,7 @@ def test_a_bag_per_position_needs_no_other_bag_for_the_offset(rng):
     # Only readings above 32767 show that 16-bit words are unsigned; some bags have none.
     ups = positions(10, 3)
     ups[0] = -np.full(3, 3.0**-0.5)
-    bags = [source(words_of([up], rng) + 32768.0, f'bag{k}') for k, up in enumerate(ups)]
+    bags = [source(words_of([up], rng) + 32768.0, name=f'bag{k}') for k, up in enumerate(ups)]
     result = fit(bags, OPTIONS)
     bias, scale = constants(result)
     np.testing.assert_allclose(bias - 32768.0, BIAS, atol=2.0)

@@ -12,6 +12,7 @@ import second_simulator
 import strangers
 import strangers_cases as cases
 from accuracy import errors, fit_and_correct
+from builders import FACES
 from simulation_helpers import slow
 from strangers_baselines import minutes
 from strangers_cases import program
@@ -27,7 +28,6 @@ from thermo_comp.unit.functions import Polynomial
 HEADER = 'time_s,accel_x,accel_y,accel_z,temperature_board,temperature_case'
 PARTS_S = np.array([520.0, 910.0, 1400.0])
 MEMS_SCALE = {'full_scale': 32767.0}
-FACES = np.vstack((np.eye(3), -np.eye(3)))
 #: Programs of held-out bags: those of strangers_cases.py with shorter soaks, to save time.
 HELD = program(12, 20, (31, 0.7, 30), (17, 1.5, 15)), program(30, 20, (8, 1.2, 30), (24, 0.6, 15))
 SOAKS = tuple(program(celsius, 25.0) for celsius in (8.0, 19.0, 34.0))
@@ -104,8 +104,7 @@ def test_the_fitted_lag_of_each_axis_is_that_of_its_part_and_the_results_are_pri
 
 @pytest.mark.slow
 def test_an_axis_without_a_determined_lag_does_not_exclude_the_lags_of_the_other_axes():
-    # WHY: one axis had a bias that hardly changed with temperature and so no determined lag. The
-    # fit then gave no axis a lag of its part.
+    # WHY: the bias of one axis hardly changed with temperature, and no axis got a lag of its part.
     curve = np.array([[15.0, -12.0, 0.05], [0.05, -0.04, 0.0]])
     scale = np.array([[60.0, 40.0, 0.5], [0.1, 0.1, 0.0]])
     given = {'part_s': PARTS_S, 'bias_curve': curve, 'scale_curve': scale}
@@ -214,8 +213,7 @@ def test_no_lag_is_fitted_to_a_unit_without_lags():
 
 @pytest.mark.slow
 def test_the_lags_of_parts_are_found_beside_an_effect_of_the_gradient():
-    # WHY: an effect of the gradient was fitted by a lag of 223 s instead of 163 s. In a soak the
-    # force error was 167 ug, its claimed sd 15 ug.
+    # WHY: an effect of the gradient was fitted as a lag: the force error was 11 claimed sd.
     (study,) = cases.gradient(1)
     calibration = strangers.fitted(study)
     assert {term.group for term in calibration.response} == {'part', 'gradient'}
@@ -339,8 +337,7 @@ def test_a_bias_decay_after_power_on_is_not_fitted_by_a_lag():
 
 @pytest.mark.slow
 def test_lags_of_a_unit_with_a_hidden_node_or_in_soaks_only_are_those_of_the_bank():
-    # The bias of each axis depends on its part and on a hidden node without a thermometer. Six
-    # stated groups of columns make the fit 1.5 times as fast as a selection of groups.
+    # The bias of each axis depends on its part and on a hidden node without a thermometer.
     groups = ('curve', 'part', 'board', 'gradient_lag', 'product', 'square')
     for study, n, options in (
         (next(cases.third_node(0)), 8, {'groups': groups}),
@@ -349,8 +346,7 @@ def test_lags_of_a_unit_with_a_hidden_node_or_in_soaks_only_are_those_of_the_ban
         calibration = strangers.fitted(replace(study, bags=study.bags[:n]), **options)
         lags = {term.tau_s for term in calibration.response if term.kind == 'board'}
         assert lags <= {*FINE_TAUS}
-    # Soaks do not show how much case and board differ in ramps. A large difference in a later ramp
-    # must not be reported as a loose thermometer.
+    # Soaks do not show how much case and board differ in ramps, so no limit may be set.
     assert calibration.rest_gradient_range_k is None
 
 

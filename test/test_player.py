@@ -15,7 +15,7 @@ pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from recording_helpers import imu_columns
-from ros_helpers import TIMEOUT
+from ros_helpers import START_NS, TIMEOUT
 from rosbags.highlevel import AnyReader
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, Temperature
@@ -26,7 +26,6 @@ from thermo_comp.recording.writer import BagWriter
 from thermo_comp.ros import player
 from thermo_comp.ros.player import play
 
-START_NS = 1_767_225_600_000_000_000
 CYCLE_NS = 2_500_000
 TOPICS = Topics()
 UNLIMITED = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders import axis_set, calibration, regime_set, term
+from builders import FACES, axis_set, calibration, regime_set, term
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from position_helpers import GRAVITY, Rest
@@ -110,7 +110,6 @@ def test_a_model_of_all_columns_of_two_thermometers_can_be_saved_and_of_three_no
 
 #: Six faces do not determine the sd of bias changes between mountings, so it is stated.
 OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2', groups=('curve',), mounting_sd=1e-6)
-FACES = np.vstack((np.eye(3), -np.eye(3)))
 
 
 def fitted(rng, ups):

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import yaml
-from builders import UNCHECKED, rich_calibration
+from builders import START_NS, UNCHECKED, rich_calibration
 from fault_rig import unit
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
@@ -26,13 +26,11 @@ from thermo_comp.unit.calibration import Calibration
 from thermo_comp.unit.calibration_file import dump_calibration, parse_calibration
 from thermo_comp.unit.schema import SchemaError, build
 
-START_NS = 1_767_225_600_000_000_000
 UNITS = (rich_calibration(), unit())
 TREE = yaml.safe_load(dump_calibration(rich_calibration()))
 
 
 def leaves(tree, path=()):
-    """List the path of every value of a calibration file, including nested values."""
     items = tree.items() if isinstance(tree, dict) else enumerate(tree)
     for key, value in items:
         yield (*path, key)

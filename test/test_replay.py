@@ -8,7 +8,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from builders import calibration, equal_axes, rich_calibration
+from builders import SECOND_NS, START_NS, calibration, equal_axes, rich_calibration
 from recording_helpers import BOOL, OTHER, Message, imu_columns, regular_messages, write_rosbag1
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
@@ -22,8 +22,6 @@ from thermo_comp.topics import IMU_OUT, REGIME
 from thermo_comp.unit.calibration import Unit
 
 TOPICS = Topics()
-START_NS = 1_767_225_600_000_000_000
-SECOND_NS = 1_000_000_000
 
 
 def thermal_test(path, minutes=30.0, rate_hz=5.0, serial='', is_imu=False):

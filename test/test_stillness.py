@@ -6,24 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders import ArrayBlock, source_of
-from position_helpers import GRAVITY, MG, START_NS, Imu, Rest
+from builders import source_of
+from position_helpers import GRAVITY, MG, START_NS, Rest, source
 from scipy.signal import lfilter
 
 from thermo_comp.errors import FitError
-from thermo_comp.fitting import FitOptions, FitSource, fit, reduce_bag
+from thermo_comp.fitting import FitOptions, fit, reduce_bag
 from thermo_comp.fitting.jumps import find_jumps
 from thermo_comp.fitting.reduction import reduce_source
 from thermo_comp.simulation.campaign import positions
 
 RATE_HZ = 100.0
 OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2')
-
-
-def source(accel, gyro=None):
-    stamps = START_NS + np.rint(np.arange(len(accel)) * 1e9 / RATE_HZ).astype(np.int64)
-    block = ArrayBlock(stamps, accel, imu=None if gyro is None else Imu(gyro))
-    return FitSource('log', lambda: [block])
 
 
 def time_of(seconds):
