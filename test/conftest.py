@@ -25,8 +25,7 @@ from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# Each process has one BLAS thread, because on a busy machine BLAS threads wait for each other.
-# numpy reads this variable when it is imported.
+# BLAS threads wait for each other on a busy machine, so numpy gets one when it is imported.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 # Each worker of a test run uses its own DDS domain, limited to this machine. The id of the run and

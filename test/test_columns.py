@@ -121,8 +121,7 @@ def test_bends_have_slopes_and_go_on_along_their_tangent_beyond_the_range():
     assert not np.any(table.slopes(state))
     flow = ColumnTable([Column('gradient', 'gradient', **WIDE)], MemorySpec(), 20.0)
     assert flow.slopes(np.zeros((7, 1)))[1] is None
-    # WHY: `bend` columns became constant at different temperatures; the slope was wrong by 200
-    # ug/K.
+    # WHY: `bend` columns became constant at different temperatures: slopes erred by 200 ug/K.
     columns = [Column('bend', 'bend', knee_k=k, range=(-12.0 - k, 8.0 - k)) for k in (2.0, 6.0)]
     table = ColumnTable(columns, MemorySpec(), 20.0)
     states = np.zeros((StateLayout(MemorySpec()).width, 3))

@@ -295,7 +295,6 @@ def test_a_new_transition_time_does_not_restart_the_checks_of_gravity_and_sample
         samples = zip(stamps, *force.T, strict=True)
         return sum(compensator.process(*sample) is not None for sample in samples)
 
-    # Samples at four times the converter's rate are published for a short time, then refused.
     assert published(3) > 0
     assert published(4) == 0
     other = replace(compensator.config, transition_time_s=50.0)

@@ -122,7 +122,6 @@ def test_messages_quoted_on_the_pages_are_in_the_source():
     quoted = re.findall(r'^\| `([^`]+)` \|', text, re.MULTILINE)
     assert len(quoted) > 10
     sources = ''.join(path.read_text() for path in (ROOT / 'thermo_comp').rglob('*.py'))
-    # Join adjacent string literals, which form one message.
     plain = re.sub(r"'\s+f?'", '', sources)
     for sentence in quoted:
         # Numbers and '...' stand for values at run time: compare the longest text between values.

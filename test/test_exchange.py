@@ -158,8 +158,7 @@ def test_px4_offsets_are_in_m_s2_and_contain_scale_errors_in_a_stated_attitude(c
     assert any('the driver must divide counts by K' in note for note in ours.notes)
     for name, value in numbers(expected.text, '\t').items():
         assert numbers(ours.text, '\t')[name] == pytest.approx(value, rel=1e-8, abs=1e-12)
-    # WHY: PX4 takes readings as m/s^2 and subtracts the offset. The offset for a stated attitude
-    # must contain the effect of the scale error.
+    # WHY: PX4 subtracts offsets in m/s^2; for a stated attitude they must contain the scale error.
     scaled = replace(cubic, axes=axes_of(0.995, (0.1, -0.2, 0.3)))
     plain = export_calibration(scaled, 'px4')
     for name, value in numbers(expected.text, '\t').items():
@@ -168,7 +167,6 @@ def test_px4_offsets_are_in_m_s2_and_contain_scale_errors_in_a_stated_attitude(c
     up = (0.6, 0.0, 0.8)
     level = numbers(export_calibration(scaled, 'px4', up=up).text, '\t')
     for axis in range(3):
-        # In the attitude `up` at the reference temperature, reading - offset must be gravity.
         d = 20.0 - level['TC_A0_TREF']
         reading = 0.995 * 9.81 * up[axis] + (0.1, -0.2, 0.3)[axis]
         offset = sum(level[f'TC_A0_X{power}_{axis}'] * d**power for power in range(4))

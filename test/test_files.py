@@ -156,7 +156,6 @@ def test_permissions_of_an_output_follow_the_umask(folder, cli, mask):
     for name in ('private.yaml', 'private.mcap', 'private/private_0.mcap'):
         assert stat.S_IMODE((folder / name).stat().st_mode) == 0o666 & ~mask, name
     assert stat.S_IMODE((folder / 'private').stat().st_mode) == 0o777 & ~mask
-    # A replaced file keeps its permissions.
     (folder / 'private.yaml').chmod(0o640)
     save_calibration(calibration(), folder / 'private.yaml')
     assert stat.S_IMODE((folder / 'private.yaml').stat().st_mode) == 0o640

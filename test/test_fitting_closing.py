@@ -140,16 +140,14 @@ def score(drift, norms=(), by_thermometer=0.0, by_offsets=0.0):
 
 
 def test_neither_few_norms_nor_errors_of_a_coarse_thermometer_select_a_model():
-    # WHY: only four left-out |f| of a MEMS on six faces could be predicted both with and without a
-    # curve. Because of these four the fit rejected the curve: the force error was 7 mg.
+    # WHY: only four left-out |f| of six faces were predicted, and these rejected a right curve.
     constants = score(20.0, [22.4, 457.7, 54.6, 26.1])
     curve = score(20.0, [16.8, 21.0, 22.5, 25.2])
     assert not is_better(constants, curve)
     assert is_undecided(constants, curve)
     assert not is_undecided(curve, constants)
     assert is_better(constants, score(20.0, [2.0, 40.0, 5.0, 2.0]))
-    # WHY: readings in steps of 1 K have equal errors in all bags of a temperature program. Knees
-    # fitted to these errors doubled the drift error in other programs.
+    # WHY: knees fitted errors of readings in steps of 1 K, which are equal in all bags.
     by_thermometer = 49.0
     curve, parts, bends = (score(drift, (), by_thermometer) for drift in (120.0, 46.0, 20.0))
     assert is_better(curve, parts)
@@ -161,8 +159,7 @@ def test_neither_few_norms_nor_errors_of_a_coarse_thermometer_select_a_model():
 
 
 def test_left_out_norms_that_stated_offsets_explain_do_not_reject_a_model():
-    # WHY: with a stated mounting sd of 300 ug, random differences of left-out |f| rejected the
-    # lags of parts, which reduce the left-out drift from 9.4 to 1.0 ug.
+    # WHY: random differences of left-out |f| rejected lags that reduce the drift from 9.4 to 1 ug.
     norms = np.array([1016.0, 142.0, 1258.0, 244.0, 647.0, 467.0])
     for by_offsets, is_accepted in ((700.0, True), (300.0, False)):
         curve = score(9.4, norms, by_offsets=by_offsets)

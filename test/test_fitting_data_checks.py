@@ -224,8 +224,7 @@ def test_options_out_of_range_are_refused(change, message):
 
 
 def test_the_gradient_of_a_soak_does_not_depend_on_the_ramps(good, rng):
-    # Self-heating makes the board 3 K warmer than the case. The board lags the case by 600 s in
-    # ramps, and by 1500 s at the beginning of a soak.
+    # The board is 3 K warmer than the case, and lags it by 600 s in ramps, 1500 s early in a soak.
     windows, _ = good
     t = windows.data.time
     rate = np.where(t < 3000.0, 1.0 / 60.0, 0.02 / 60.0 * np.exp(-(t - 3000.0) / 600.0))

@@ -52,8 +52,7 @@ def test_the_claimed_sd_covers_effects_that_the_model_lacks(effect_sd):
 
 
 def test_three_attitudes_determine_their_norms_as_well_as_mountings_repeat(rng):
-    # WHY: three attitudes do not separate bias and scale: both depended by percents on the
-    # mounting sd, so the claimed sd of |f| was up to 10 times the sd of a mean over mountings.
+    # WHY: for three attitudes the claimed sd of |f| was 10 times the sd of a mean over mountings.
     kappa, bias = np.array([1.03, 0.97, 1.02]), np.array([0.3, -0.2, 0.5])
     truth = fitting_truth.Truth(kappa, bias, offset_sd=2.0 * fitting_truth.MICRO)
     up = np.repeat(np.eye(3) + 0.02 * rng.standard_normal((3, 3)), 4, axis=0)
@@ -72,8 +71,8 @@ def test_three_attitudes_determine_their_norms_as_well_as_mountings_repeat(rng):
 
 
 def test_the_claimed_sd_covers_the_weight_of_a_column_that_the_model_lacks():
-    # WHY: after soaks the weight of a lag was some sd from 0. The claim contained only this sd,
-    # and in ramps the errors were 4 claimed sd.
+    # WHY: after soaks a lag was claimed with the sd of its weight: errors of 4 claimed sd in
+    # ramps.
     ratios = [ratios_without_a_column(3e-5, seed) for seed in range(6)]
     # The prior sd of the weight equals the sd by the data, so the fit prefers half of the weight:
     # weight / claimed sd is 2 if the weight is large. The RMS of 18 ratios is uncertain by 5 %.

@@ -211,8 +211,7 @@ def refit_of(whole, regression, prior, kept):
     return replace(mode, weights=mode.weights / units)
 
 
-#: The left-out score linearises the model. The result is exact for the groups LINEAR; for PRODUCTS
-#: it neglects (change of initial lag state) * (change of the weight of the lag).
+#: The left-out score linearises the model: it is exact for LINEAR, and approximate for PRODUCTS.
 LINEAR, PRODUCTS = ('curve',), ('curve', 'board')
 
 
@@ -348,7 +347,6 @@ def test_published_huygens_coefficients_come_back(rng):
         got = np.polynomial.Polynomial(scale)(shifted).coef * GRAVITY / counts_per_ampere
         printed = [f'{each:.5e}' for each in got[:3]]
         assert printed == ['1.30675e-03', '-1.35046e-07', '4.02821e-10']
-        # The published offset [g] is the fitted bias / (counts per g).
         powers = np.append(mode.bias[axis], mode.weights[0, axis] / regression.rms)
         bias = K0 * polynomial.polyval(t[:40], powers)
         ratio = bias / (polynomial.polyval(t[:40], scale) * GRAVITY)

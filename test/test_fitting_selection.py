@@ -116,8 +116,7 @@ def test_a_group_that_explains_one_bag_or_section_is_not_chosen(where):
 
 @pytest.mark.parametrize(('n_positions', 'step_s'), [(10, 120.0), (12, 60.0), (12, 240.0)])
 def test_a_lag_is_found_although_a_curve_without_the_lag_is_rejected(n_positions, step_s):
-    # WHY: a bias that depends on a lagged temperature needs the groups 'curve' and 'board'
-    # together. 'curve' without 'board' was rejected, so the lag was not found.
+    # WHY: a bias that follows a lagged temperature needs two groups; the first alone was rejected.
     slope = 2e-5 * np.array([1.0, -2.0, 1.5])
     on_bias = np.outer(slope, [1.0, 0.0, 0.0, -1.0, 0.0, 0.0])
     truth = Truth(on_bias=on_bias, on_scale=np.zeros((3, 6)))
@@ -177,8 +176,7 @@ def test_rounding_removes_no_correlation_time_from_the_search():
 
 
 def test_the_prior_sd_of_columns_is_that_of_true_weights_below_the_steepest_plausible_slope(calm):
-    # The prior variance of a column is the sum of its squared weights / 3. The hyperprior moves ln
-    # sd towards its centre by 3 % of the distance.
+    # The prior variance of a column is its mean squared weight; a hyperprior moves ln sd by 3 %.
     regression, chosen, truth = calm
     true = np.sqrt(np.mean((truth.on_bias * regression.rms) ** 2, axis=0))
     np.testing.assert_allclose(chosen.posterior.prior.column_sd[0, :4], true[:4], rtol=0.25)
@@ -405,7 +403,6 @@ def test_windows_that_the_model_misses_count_in_the_lack_of_fit_in_spite_of_thei
     fit = Fit(table, regression, chosen)
     points, _ = lack_of_fit(fit, claim_of(fit))
     widest = np.max([point.sd_m_s2 for point in points], axis=0)
-    # The bump of 100 ug is in half of the windows of a bin, so it has 71 ug RMS. The curve and the
-    # means of positions fit up to half of it.
+    # Half of a bin has the bump of 100 ug: 71 ug RMS, of which the fit removes up to a half.
     assert (widest > 35.0 * MICRO).all()
     assert (widest < 100.0 * MICRO).all()

@@ -324,8 +324,7 @@ class TestRow:
         assert row['chosen'] == '/imu/raw, the only Vector3Stamped of the bag, is taken for counts'
 
     def test_the_row_has_no_sd_of_a_slope_that_the_positions_do_not_determine(self, tmp_path):
-        # WHY: for one position, the sum of the slopes of bias and scale was stated as the slope of
-        # the bias, with an sd of 0.06 ug/K.
+        # WHY: the bias slope was the sum of the slopes of bias and scale, with an sd of 0.06 ug/K.
         write_unit(tmp_path / 'u', 1, 1)
         row = processed(tmp_path).row
         assert [row[f'bias_slope_sd_{axis}_ug_k'] for axis in 'xyz'] == [None] * 3

@@ -87,8 +87,7 @@ def test_a_population_has_mean_and_scatter_of_its_units_and_keeps_equal_curves_e
     own = np.array(own) / K[:, 0] ** 2
     expected = np.var(slopes, axis=0, ddof=1).mean() * 4.0 / 3.0 * 6.0 / 4.0 + own.mean()
     assert sd == pytest.approx(np.sqrt(expected), rel=1e-3)
-    # WHY: curves that both regimes share were not fully correlated in a prior from siblings: the
-    # error of a fit was 3.1 ug with this prior, 0.7 ug without.
+    # WHY: equal curves of both regimes were not fully correlated: the error was 3.1, not 0.7 ug.
     for block in (*layout.bias, *layout.scale):
         curves = range(block.static + 1, block.dynamic), range(block.dynamic + 1, block.response)
         for static, dynamic in zip(*curves, strict=True):
@@ -100,8 +99,7 @@ def test_a_population_has_mean_and_scatter_of_its_units_and_keeps_equal_curves_e
 
 
 def test_the_scatter_of_an_axis_is_averaged_over_the_axes_of_three_units(rng):
-    # WHY: three siblings had nearly equal biases of one axis by chance: with their prior a fit had
-    # a force error of 363 ug, without a prior 77 ug.
+    # WHY: three siblings had nearly equal biases of an axis by chance: forces erred by 363 ug.
     layout = parameter_layout(rich_calibration())
     deviations = rng.standard_normal((3, layout.n_parameters))
     level = layout.bias[1].static
@@ -226,8 +224,7 @@ def test_one_to_three_faces_of_an_unchanged_unit_keep_the_calibration(n_faces):
 
 @pytest.mark.parametrize('kind', ['bias', pytest.param('scale', marks=pytest.mark.slow)])
 def test_three_faces_halve_the_error_of_a_change_of_bias_or_scale(kind):
-    # WHY: an update by three faces took a bias change of 100 ug for mounting offsets. In this test
-    # the bias or the scale changes so that each face reads 1 count (300 ug) more or less.
+    # The bias or the scale changes so that each face reads 1 count (300 ug) more or less.
     K = np.array([axis.scale_factor for axis in fitted(9).calibration.axes])
     change = np.array([1.0, -1.0, 1.0]) / (K * STANDARD_GRAVITY)
 

@@ -134,8 +134,7 @@ def test_the_error_of_the_freezer_run_on_held_out_minutes(
     assert len(raw) >= 17 * len(sets) // n_sets
     # The constants are undetermined in one attitude, so compare the sd of |a|.
     assert np.std(raw) / MG == pytest.approx(drift, abs=0.2)
-    # Means over 60 s have 0.19 mg of noise. The temperatures of the first of 5 parts are outside
-    # the range of the other parts.
+    # Means over 60 s have 0.19 mg of noise; the first of 5 parts is outside the temperature range.
     assert np.sqrt(np.mean(np.square(left))) / MG == pytest.approx(mg, rel=0.35)
 
 

@@ -146,9 +146,9 @@ def test_three_soaks_of_5_h_have_at_most_two_false_alarms(sensor):
 
 
 def test_the_rate_of_false_alarms_is_below_that_of_the_setting():
-    # The setting allows 20 false alarms per hour, 1000 in 50 h of noise. Rice's formula, by which
-    # the threshold is set, counts crossings; these come in groups, so there are fewer separate
-    # alarms. The lower limit of 50 excludes a detector without alarms.
+    # The setting allows 1000 false alarms in 50 h of noise. Rice's formula for the threshold
+    # counts crossings, several of which make one alarm; the lower limit excludes a detector
+    # without alarms.
     settings = ThermometerSettings(0.01, lag_s=LAG_S)
     test = ChangeDetector(settings, 0.2 / 60.0, ripple=0.0, false_alarms=20.0 / 3600.0)
     rng = np.random.default_rng(6)
@@ -236,9 +236,8 @@ def test_the_dynamic_regime_ends_when_the_board_or_else_the_case_has_the_relaxed
 
 @pytest.mark.parametrize('sensor', ['1 mK', '1 mK, 62.5 mK steps', '10 mK, 62.5 mK steps'])
 def test_the_dynamic_regime_ends_by_the_case_or_the_board(sensor):
-    # The case lags the chamber by 3 min, the board lags the case by 15 min. After the ramp the
-    # rate of the case falls as exp(-t / 180 s), of the board as 900 / 720 exp(-t / 900 s). Case
-    # and board reach the relaxed rate, 0.1 of the ramp's, after 7 and 38 min; steps of 62.5 mK do
+    # The case lags the chamber by 3 min, the board lags the case by 15 min. After the ramp their
+    # rates fall to the relaxed rate, 0.1 of the ramp's, within 7 and 38 min. Steps of 62.5 mK do
     # not show the last 5 min of the case's change.
     noise, quantum = SENSORS[sensor]
     lag, behind = 180.0, 900.0

@@ -342,8 +342,7 @@ def test_conformity_is_stated_only_with_a_tolerance():
 
 
 def test_a_fit_in_one_pose_states_that_the_error_on_data_left_out_is_a_drift(cli, tmp_path):
-    # WHY: the certificate of a fit to one pose called the drift of left-out data the error |f| - g
-    # in left-out positions, and the calibration file did not contain this drift.
+    # WHY: after a fit to one pose the drift of left-out data was printed as the error |f| - g.
     bag, page, unit = write_bag(tmp_path / '01.mcap'), tmp_path / 'fit.html', tmp_path / 'fit.yaml'
     given = ('--gravity', '9.80665', '--groups', 'curve,set', '--report', page, '--json')
     facts = json.loads(cli('fit', bag, '-o', unit, *given).stdout)
