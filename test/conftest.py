@@ -25,7 +25,7 @@ from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# BLAS threads wait for each other on a busy machine, so numpy gets one when it is imported.
+# One BLAS thread per process, as several wait for each other; numpy reads this when imported.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 # Each worker of a test run uses its own DDS domain, limited to this machine. The id of the run and

@@ -156,7 +156,7 @@ def assert_columns(block, messages):
 
 
 def regular_messages(n=40, accel=ACCEL, every=8):
-    """Make messages of samples at a fixed rate, with a reading of each thermometer per `every`."""
+    """Make messages of samples at a fixed rate; both thermometers have one per `every` samples."""
     messages = []
     width = 3 if accel == ACCEL else 37
     for row in range(n):

@@ -127,7 +127,7 @@ def test_bends_have_slopes_and_go_on_along_their_tangent_beyond_the_range():
     states = np.zeros((StateLayout(MemorySpec()).width, 3))
     states[BOARD] = 20.0 + np.array([8.0, 12.0, 15.0])
     raw = table.raw(states)
-    # The tangent ends 5 K (1/4 of the range's width) outside the range; in it `beyond` is 0.
+    # The tangent ends 5 K (1/4 of the width) outside the range; inside the range `beyond` is 0.
     assert table.held(raw).tolist() == [[6.0, 10.0, 11.0], [2.0, 6.0, 7.0]]
     assert table.beyond(raw).tolist() == [[0.0, 4.0, 7.0]] * 2
 

@@ -138,7 +138,7 @@ def test_the_accelerometer_is_chosen_among_several_triads_of_a_table():
         ('t [s],ax [g],ay [g],az [g],T [°C]', 'ax [g]', ('s', 'g', 'degC')),
         ('t,imu0_ax,imu0_ay,imu0_az,T_board,T_case', 'imu0_ax', ('', '', 'degC')),
         ('elapsed_h,ax,ay,az,temp (°F)', 'ax', ('h', '', 'degF')),
-        # WHY: the `g` of `ax_g` was taken for a gyroscope's: "column 'ax_g' is given twice".
+        # WHY: the `g` of `ax_g` was taken for a gyroscope: "column 'ax_g' is given twice".
         ('time,ax_g,ay_g,az_g,temp', 'ax_g', ('', 'g', 'degC')),
         ('t,acc_x_g,acc_y_g,acc_z_g,gx_dps,gy_dps,gz_dps,temp', 'acc_x_g', ('', 'g', 'degC')),
         # These headings are from PlotJuggler for sensor_msgs/Imu, and from the EuRoC data sets.

@@ -176,7 +176,7 @@ def test_corrections_with_random_initial_lag_states_scatter_by_the_claimed_sd(rn
     moved = np.repeat(np.array(state)[:, np.newaxis], len(draws), axis=1)
     terms = tuple(replace(term, range=(-4000.0, 4000.0)) for term in unit.response)
     wide = replace(unit, response=terms)
-    # Columns with squares of lags are nonlinear, so initial lag states are drawn with 0.05 sd.
+    # Columns with squares of lags are nonlinear, so draw initial lag states with 0.05 of their sd.
     small = 0.05
     moved[places] += small * (draws * np.array(shares)).T
     values = Correction(wide).bias_scale(moved)

@@ -159,8 +159,7 @@ def test_rests_at_three_temperatures_give_the_bias_slope_despite_a_warm_up_of_th
     # |f| of a rest has a noise of 1 ug; the warm-up makes its temperature uncertain by 0.1 K.
     np.testing.assert_allclose(slopes, SOAK_SLOPE, atol=0.002 * MG)
     assert 'misfit' not in findings_of(result)
-    # Soaks leave the weights of lags undetermined: their joint sd is 0.5 to 1 times the bias
-    # slope.
+    # Soaks leave the weights of lags undetermined: joint sd of 0.5 to 1 times the bias slope.
     variance, layout = np.diag(calibration.posterior.covariance()), parameter_layout(calibration)
     of_lags = [variance[block.response : block.end].sum() for block in layout.bias]
     assert 0.5 < np.sqrt(np.mean(of_lags) / np.mean(slopes**2)) < 1.0

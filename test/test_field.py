@@ -35,7 +35,7 @@ def test_derivatives_of_a_rest_by_all_parameters_agree_with_finite_differences()
     layout = parameter_layout(unit)
     levels = {level for block in layout.scale for level in (block.static, block.dynamic)}
     levels |= {block.static for block in layout.bias}
-    # Test every second parameter; blocks have odd lengths, so bias or scale has each kind tested.
+    # Test every second parameter: as blocks have odd lengths, bias or scale covers each kind.
     for k in range(0, layout.n_parameters, 2):
         step = 1e-7
         moved = values.copy()
@@ -162,8 +162,7 @@ def test_the_sd_of_an_old_calibration_aged_to_the_last_rest_includes_the_random_
     residual = unit.static.x.residual_sd_m_s2
     assert x.claimed_sd == pytest.approx(np.hypot(10.0 * MICRO_G, residual), rel=0.01)
     assert z.claimed_sd == pytest.approx(np.hypot(np.sqrt(200.0) * MICRO_G, residual), rel=0.01)
-    # The ageing model attributes half to all of the random walk's variance to the biases of x and
-    # y.
+    # The ageing model gives half to all of the random walk's variance to the biases of x and y.
     for axis in (x, y):
         assert 0.5 < axis.present_sd / (329.0 * MICRO_G) < 1.5
     # At the last rest the force sd of z is |random walk of z|, within two sd of turn-ons.

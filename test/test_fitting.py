@@ -124,9 +124,9 @@ def test_a_fit_has_all_positions_sources_sections_and_groups_and_leaves_only_noi
     assert [row.section for row in provenance.residuals] == ['static', 'dynamic', 'all']
     assert {finding.level for finding in response.findings} <= {'advice', 'good'}
     judged = {(group.part, group.group) for group in calibration.evidence}
-    # The part that determines an axis of the unit OWN_LAGS lags the board.
+    # Each axis of the unit OWN_LAGS depends on the temperature of a part that lags the board.
     assert {('bias', 'part'), ('scale', 'part')} <= judged
-    # A term of weights 0 has only a covariance, and no entry in `evidence`.
+    # A response term whose weights are all 0 has only a covariance, and no entry in `evidence`.
     weighty = [term for term in calibration.response if any((*term.bias, *term.scale))]
     assert {term.group for term in weighty} <= {group for _, group in judged}
     row = response.residuals[-1]
@@ -156,7 +156,7 @@ def test_the_error_of_the_compensator_is_that_stated_by_the_fit(response):
 
 
 def test_slow_noise_for_an_unmodelled_drift_leaves_the_white_noise():
-    # WHY: the stated white noise was 0.3, not 5 ug/sqrt(Hz): the node's check found no rest.
+    # WHY: the stated white noise was 0.3, not 5 ug/sqrt(Hz): the node's check of |f| saw no rest.
     paper = fitted(OWN_LAGS, positions(2, 1), 1, model='golovach')
     stated = np.array(paper.calibration.noise_density_m_s2_sqrt_hz) / MICRO_G
     np.testing.assert_allclose(stated, 5.0, rtol=0.4)

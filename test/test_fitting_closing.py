@@ -63,7 +63,7 @@ def test_the_evidence_selects_the_condition_that_ends_the_dynamic_regime(end_con
         records.append(replace(record, counts=record.counts + step))
     result = fit(sources_of(records), FitOptions(gravity=STANDARD_GRAVITY, **options))
     assert result.calibration.detector.end_condition == end_condition
-    # The estimated detector settings switch the regime at slightly different times than the true.
+    # The estimated detector settings switch the regime at slightly different times.
     last = result.residuals[-1]
     assert last.fitted.rms < 0.35 * last.raw.rms
 

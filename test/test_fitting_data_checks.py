@@ -146,7 +146,7 @@ def test_six_faces_do_not_determine_the_misalignment(good):
 
 
 def test_geometry_is_the_largest_sd_of_nine_parameters_per_sd_of_the_norm(rng):
-    # Nine parameters are fitted by least squares to |f| with an sd of 1: their sd is expected.
+    # Expected is the sd of nine parameters fitted by least squares to |f| with an sd of 1.
     up = positions(12, 5)
     x, y, z = up.T
     jacobian = np.column_stack((x, y, z, x * x, y * y, z * z, x * y, x * z, y * z))

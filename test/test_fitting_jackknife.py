@@ -71,8 +71,7 @@ def test_three_attitudes_determine_their_norms_as_well_as_mountings_repeat(rng):
 
 
 def test_the_claimed_sd_covers_the_weight_of_a_column_that_the_model_lacks():
-    # WHY: after soaks a lag was claimed with the sd of its weight: errors of 4 claimed sd in
-    # ramps.
+    # WHY: after soaks a lag was claimed with the sd of its weight: 4 claimed sd of error in ramps.
     ratios = [ratios_without_a_column(3e-5, seed) for seed in range(6)]
     # The prior sd of the weight equals the sd by the data, so the fit prefers half of the weight:
     # weight / claimed sd is 2 if the weight is large. The RMS of 18 ratios is uncertain by 5 %.

@@ -114,8 +114,7 @@ def test_columns_of_the_fit_equal_those_of_the_tracker(bags):
 
 
 def test_lags_after_a_pause_depend_on_the_temperatures_in_it(bags):
-    # WHY: lags took the temperature as constant in a pause: drift errors were three times as
-    # large.
+    # WHY: lags took the temperature as constant in a pause, which tripled the drift error.
     whole, first_s, last_s = bags[0], 780.0, 1200.0
     temperatures = {}
     for name, readings in whole.temperatures.items():

@@ -62,7 +62,7 @@ class TestOutliers:
             rows[i] = {**rows[i], 'dynamic_ug': 40.0}
         serials = {outlier.serial for outlier in summarise(rows).outliers}
         assert serials == {f'S{i:03d}' for i in range(5)}
-        # A loose case thermometer does not follow the case, so the board seems to lead.
+        # A loose case thermometer does not follow the case, so the board seems to lead the case.
         rows = fleet_of(20, rng)
         rows[4] = {**rows[4], 'board_lag_s': -800.0}
         (outlier,) = summarise(rows).outliers

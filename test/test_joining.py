@@ -128,7 +128,7 @@ def test_a_move_between_parts_gives_two_rests_and_parts_without_a_rest_are_joine
 
 @pytest.mark.slow
 def test_a_split_recording_gives_the_calibration_of_the_whole_recording():
-    # WHY: each part had its own turn-on and lag states: the claimed sd was 6 times as large.
+    # WHY: each part had its own turn-on and lag states, so the claimed sd was 6 times too large.
     bag = thermo_comp.read(ROOT / 'bags/fit/01.mcap')
     parts = []
     for begin_s in np.arange(0.0, bag.time_s[-1], 1800.0):

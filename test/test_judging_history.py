@@ -157,8 +157,7 @@ def test_forecasts_agree_with_the_simulated_future_of_units():
         for rows in field_watch.forecasts(kind, 3, 20).values():
             shares += rows[:, 0].tolist()
             ratios.append(float(np.median(rows[:, 3] / rows[:, 1])))
-    # The interval must contain 80 % of the simulated days; a mean of 24 shares is uncertain by 6
-    # %.
+    # The interval must contain 80 % of the simulated days; a mean of 24 shares errs by 6 %.
     assert np.mean(shares) == pytest.approx(0.8, abs=0.12)
     # A forecast's median is uncertain by a factor of 1.5, the mean of eight medians by 1.3.
     assert 1.0 / 1.6 < np.exp(np.mean(np.log(ratios))) < 1.6

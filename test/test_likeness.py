@@ -81,7 +81,7 @@ def test_one_attitude_in_the_chamber_does_not_separate_bias_and_scale():
         (('bias', 'bias'), 0.996, 1, True),  # variance inflation factor: 125
         (('bias', 'bias'), 0.994, 9, False),  # variance inflation factor: 84
         (('bias', 'scale'), 0.996, 6, True),
-        # Five attitudes do not separate bias and scale, which the finding `positions` says.
+        # The finding `positions` states that five attitudes do not separate bias and scale.
         (('bias', 'scale'), 0.996, 5, False),
     ],
 )

@@ -32,7 +32,7 @@ def test_the_lag_of_a_ramp_agrees_with_the_closed_formula(step_s):
 def test_errors_of_a_lag_after_a_gap_a_jump_wrong_or_stuck_readings_agree_with_formulas():
     bank = LagBank((100.0, 1000.0))
     bank.step(0, 0.0)
-    # A gap longer than tau / 10 adds variance to a lag: 50 s do for tau = 100 s, not for 1000 s.
+    # A gap above tau / 10 adds variance to a lag: 50 s if tau is 100 s, but not if it is 1000 s.
     bank.step(50 * SECOND_NS, 2.0)
     lost = 2.0 * (1.0 - math.exp(-0.5))
     assert bank.extra == pytest.approx([lost**2, 0.0])

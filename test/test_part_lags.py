@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fits find the lags of parts that determine the bias, with errors as claimed."""
+"""Fits find the lags of parts that determine the bias; errors agree with the claimed sd."""
 
 import json
 from dataclasses import replace
@@ -234,7 +234,7 @@ def test_a_bump_of_the_bias_over_temperature_is_fitted_by_knees():
 def test_two_lags_in_series_are_fitted_as_two_stages():
     # Sensor heads lag the board, pendulums lag the heads; T_board - T_pendulum changes the bias.
     unit = second_simulator.unit_of('products', 2)
-    # Two equal time constants are fitted as two with a ratio of 0.89.
+    # Two equal time constants are fitted as two time constants with a ratio of 0.89.
     unit.pendulum_s[0] = unit.head_s[0]
     _, program, *_, held = second_simulator.PLANS['mild']
     up = second_simulator.directions(9, 5)
@@ -346,7 +346,7 @@ def test_lags_of_a_unit_with_a_hidden_node_or_in_soaks_only_are_those_of_the_ban
         calibration = strangers.fitted(replace(study, bags=study.bags[:n]), **options)
         lags = {term.tau_s for term in calibration.response if term.kind == 'board'}
         assert lags <= {*FINE_TAUS}
-    # Soaks do not show how much case and board differ in ramps, so no limit may be set.
+    # Soaks do not show how much case and board differ in ramps, so a fit must state no range.
     assert calibration.rest_gradient_range_k is None
 
 

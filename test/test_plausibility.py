@@ -101,7 +101,7 @@ def test_a_frozen_sensor_is_detected_by_changes_of_the_second_sensor(sensor, fro
     other = tracker.checks['case'] if frozen == 'board' else tracker.checks['board']
     assert other.fault == Fault.NONE
     seen = getattr(tracker, frozen)
-    # Until its detection a frozen board reading errs by 4 quanta + 2 K, the case by 10 K more.
+    # Until detected a frozen board reading errs by up to 4 quanta + 2 K, the case by 10 K more.
     lead = 10.0 if frozen == 'case' else 0.0
     off = (board if frozen == 'board' else case) - seen.temperature
     assert abs(off) < 4.0 * quantum + 2.0 + lead

@@ -275,7 +275,7 @@ def test_the_only_topic_of_a_type_is_used_and_of_two_both_are_named(tmp_path):
             '/imu/ticks, the only Vector3Stamped of the bag, is taken for counts; '
             '/imu/die, the only Temperature of the bag, is taken for board'
         )
-    # The type selects a board topic only if none is named, and one topic, not the case's, has it.
+    # By its type a board topic is chosen only if none is named, and if only one may be meant.
     with pytest.raises(RecordingError, match='my/die: no such topic'):
         open_recording(path, Topics(board='my/die'), require=('board',))
     for topics in (('imu/die', 'baro/air'), ('temperature/case',), ('x/temperature/case',)):

@@ -147,8 +147,7 @@ def test_three_soaks_of_5_h_have_at_most_two_false_alarms(sensor):
 
 def test_the_rate_of_false_alarms_is_below_that_of_the_setting():
     # The setting allows 1000 false alarms in 50 h of noise. Rice's formula for the threshold
-    # counts crossings, several of which make one alarm; the lower limit excludes a detector
-    # without alarms.
+    # counts crossings, several per alarm; the lower limit excludes a detector without alarms.
     settings = ThermometerSettings(0.01, lag_s=LAG_S)
     test = ChangeDetector(settings, 0.2 / 60.0, ripple=0.0, false_alarms=20.0 / 3600.0)
     rng = np.random.default_rng(6)

@@ -62,7 +62,7 @@ def test_measured_errors_in_soaks_are_those_of_the_scale_factors():
 
 
 def test_position_errors_and_the_map_of_the_sphere_agree_with_hand_numbers():
-    # In 60 s 1 mg gives a position error of 9.80665e-3 * 1800 m; 1 ug: 1e-6 Earth diameters.
+    # In 60 s 1 mg causes an error of 9.80665e-3 * 1800 m; 1 ug at most 1e-6 Earth diameters.
     assert position_error(1e3 * MICRO_G, 60.0) == pytest.approx(17.652, rel=1e-4)
     assert schuler_peak(MICRO_G) == pytest.approx(12.742, rel=1e-4)
     assert figures.equal_area((0.0, 0.0, 1.0), 1) == (0.0, 0.0)

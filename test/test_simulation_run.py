@@ -249,7 +249,7 @@ def test_the_true_thermal_model_leaves_only_noise(kind):
         norms.append(np.linalg.norm(force, axis=1) - STANDARD_GRAVITY / MICRO_G)
     vector = np.sqrt(np.mean(np.concatenate(errors)))
     if kind == 'slow-noise':
-        # A random walk of 7.3 h has 9 * 7.3 / 2 ug^2; three runs give its RMS to a factor of 2.
+        # In 7.3 h the random walk has a mean square of 9 * 7.3 / 2 ug^2, known to a factor of 4.
         assert 4.0 < vector < 20.0
     else:
         # 1311 means determine the RMS to 2 % (|f|) and 1.2 % (vector); the limits are 5 sd.

@@ -111,7 +111,7 @@ def test_a_support_tilts_with_temperature_squared_and_a_cold_start_is_at_air_tem
     warm = record(given, cases.FROST, LEVEL, rng_of('cold'))
     for bag, heat in ((cold, 0.0), (warm, 2.0)):
         board, case = bag.temperatures['board'][1][0], bag.temperatures['case'][1][0]
-        # The tolerance allows for the chamber's ripple, 0.03 K, and for self-heating of 0.3 s.
+        # The tolerance: the chamber's ripple, 0.03 K, and self-heating in the first 0.3 s.
         assert board - case == pytest.approx(heat, abs=0.1)
 
 
@@ -202,7 +202,7 @@ def of_attitudes(given, board):
 
 
 def curved_unit():
-    """Make a unit with a bias cubic, and a scale linear, in temperature."""
+    """Make a unit whose bias is a cubic and whose scale is a linear function of temperature."""
     rng = rng_of('curved')
     return unit(
         bias=1500.0 * rng.standard_normal(3), gain=0.01 * rng.standard_normal(3),

@@ -172,7 +172,7 @@ def test_a_line_of_many_states_takes_one_noise_excess_for_all():
 
 
 def test_outside_the_range_the_claimed_sd_is_that_of_curve_and_parts():
-    # Outside the range no lag cancels the slope of the curve, so the claimed sd grows with it.
+    # Outside the range no lag cancels the slope of the curve, so the slope adds to the claimed sd.
     parts = regime_set(axis_set((0.0, 0.5), residual_sd_m_s2=1e-6))
     lag = term('board', (-0.5, 0.0, 0.0), tau_s=600.0)
     unit = calibration(static=parts, dynamic=parts, response=(lag,))
@@ -183,7 +183,7 @@ def test_outside_the_range_the_claimed_sd_is_that_of_curve_and_parts():
     # At 35 degC the bias slope is 0.8 counts/K; at 10 m/s^2 the scale slope cancels it.
     bent = axis_set((0.0, 0.5, 0.01), (1.0, -0.8 / 3000.0), residual_sd_m_s2=1e-6)
     unit = calibration(static=regime_set(bent), dynamic=regime_set(bent))
-    # The bias slope changes by 0.02 counts/K^2, over 30 K with an sd of 0.02 * 30 / sqrt(12).
+    # The bias slope changes by 0.02 counts/K^2: over 30 K its sd is 0.02 * 30 / sqrt(12) counts/K.
     bends = 0.6 / math.sqrt(12.0)
     far = math.sqrt(1.0 + (6.0 / 15.0) ** 2)
     assert sd_at(unit, 41.0, force=10.0) == pytest.approx(bends * 6.0 / 300.0 * far, rel=0.05)
