@@ -310,7 +310,7 @@ class TestFreezer:
     def path(self, real_data):
         path = real_data / 'freezer-mpu6050' / 'temp-calibration.csv'
         if not path.is_file():
-            pytest.skip(f'no {path}')
+            pytest.skip(f'{path} does not exist')
         return path
 
     def test_every_row_is_in_the_bag_and_the_faults_are_reported(self, path, tmp_path):

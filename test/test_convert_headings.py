@@ -98,7 +98,7 @@ def test_a_table_is_read_by_its_headings(tmp_path, rng, kind, headings, unit, on
 
 @pytest.mark.parametrize('kind', ['dates', 'text', 'numbers'])
 def test_a_parquet_table_is_read_by_its_headings(tmp_path, rng, kind):
-    pa = pytest.importorskip('pyarrow', reason='pyarrow is the extra `parquet`')
+    pa = pytest.importorskip('pyarrow', reason='pyarrow of the extra `parquet` is not installed')
     import pyarrow.parquet as pq
 
     stamp_ns = START_NS + STEP_NS * np.arange(N)

@@ -120,7 +120,7 @@ def test_a_missing_file_is_refused(tmp_path):
 
 
 def parquet(folder, **columns):
-    pa = pytest.importorskip('pyarrow', reason='pyarrow is the extra `parquet`')
+    pa = pytest.importorskip('pyarrow', reason='pyarrow of the extra `parquet` is not installed')
     import pyarrow.parquet as pq
 
     pq.write_table(pa.table(columns), folder / 'log.parquet')

@@ -50,7 +50,7 @@ COMMANDS = commands()
 @pytest.mark.parametrize(('page', 'command', 'output'), COMMANDS, ids=[c for _, c, _ in COMMANDS])
 def test_a_command_on_a_page_gives_the_output_shown(page, command, output, desk):
     if '--install-completion' in command:
-        pytest.skip('writes into the home folder of the user')
+        pytest.skip('the command writes into the home folder of the user')
     finished = desk.run(command)
     if '--json' in command:
         assert parsed(finished.stdout)
@@ -61,7 +61,7 @@ def test_a_command_on_a_page_gives_the_output_shown(page, command, output, desk)
 def test_bash_accepts_the_completion_script():
     bash = shutil.which('bash')
     if bash is None:
-        pytest.skip('no bash')
+        pytest.skip('bash is not installed')
     # thermo_comp asks which shell started it; without the `:` bash would replace itself by Python.
     words = f'eval "$({sys.executable} -m thermo_comp --show-completion; :)"; complete'
     finished = ran(bash, '-c', words)

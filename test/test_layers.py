@@ -139,7 +139,7 @@ def test_imports_between_packages_and_between_files_form_no_circle(by):
         targets = {own_unit(name) if by == 'package' else own_file(name) for name in names}
         uses.setdefault(here, set()).update(target for target in targets if target != here)
     left = circle(uses)
-    assert not left, f'import each other: {left}'
+    assert not left, f'these import each other: {left}'
 
 
 def loaded_after(statement, *watched):

@@ -40,7 +40,7 @@ def test_version_and_dependencies_are_equal_wherever_they_are_stated():
     install = re.search(r'^INSTALL = (\[.*?^\])', (ROOT / 'setup.py').read_text(), re.M | re.S)[1]
     install = ast.literal_eval(install)
     assert isinstance(install, list)
-    assert all('>=' in requirement for requirement in install), 'no floor'
+    assert all('>=' in requirement for requirement in install), 'no lowest version'
 
 
 def test_every_source_file_states_the_apache_licence_and_has_at_most_500_lines():

@@ -163,7 +163,7 @@ def test_memory_does_not_grow_with_the_bag(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize('imu', [False, True])
 def test_an_output_table_has_the_values_of_the_output_bag(tmp_path, imu):
-    pq = pytest.importorskip('pyarrow.parquet', reason='pyarrow is the extra `parquet`')
+    pq = pytest.importorskip('pyarrow.parquet', reason='pyarrow is not installed')
     bag = thermal_test(tmp_path / 'bag', rate_hz=2.0, is_imu=imu)
     unit = {'unit': Unit('T-1', 'm/s^2', 100.0, 0.1)} if imu else {}
     calibration = dataclasses.replace(rich_calibration(), **unit)
