@@ -10,8 +10,8 @@ selects one study of a case: ``--cases 'turn-on:9 at 30 ug'``.
 
 Units and recordings come from `strangers_units.py` and `strangers_cases.py`, which share no code
 with the package; the package is used only through `thermo_comp.fit` and `Calibration.correct`.
-Errors are those on held-out recordings, unless the row states otherwise. An error is the RMS of
-means over 60 s in ug: of the norm, ``|f| - g``, and of the vector against the true force. A ratio
+Errors are evaluated on held-out recordings, unless the row states otherwise. An error is the RMS
+of means over 60 s in ug: of the norm, ``|f| - g``, and of the vector less the true force. A ratio
 is the RMS of error / claimed sd. The table has the RMS of each figure over the units. MISS marks a
 limit of `strangers_limits.py` that a row violates; the exit code is then 1. The baselines fitted
 by the package take most of the time; ``--baselines strangers.json`` reads the scores of the
