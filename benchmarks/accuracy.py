@@ -204,7 +204,7 @@ def floor(tests: Sequence[SimulatedRun]) -> Errors:
 
 
 def judged(result: Errors, goal: Goal | None, least: Errors) -> str:
-    """Return RMS of |f| - g and of the error vector [ug] as a table cell, (!) above a limit."""
+    """Format the RMS of |f| - g and of the error vector [ug] as a table cell; (!): too large."""
     cell = f'{result.norm:.2f} / {result.vector:.2f}'
     if goal is None:
         return cell

@@ -7,7 +7,7 @@ All bags hold counts at 400 Hz and two temperatures at 10 Hz; rosbags and mcap g
 (`--peer-samples`). `rosbags` reads and deserializes each message; `mcap` only reads each message.
 A rate is the number of counts messages read per second of wall time, in the fastest of the
 repeats. Ratios between the rates of two readers vary less from machine to machine than the rates.
-In the table, 'blocks' and 'whole' are thermo_comp: a bag read by blocks, or whole into memory.
+For 'blocks' and 'whole' in the table thermo_comp reads a bag by blocks, or whole into memory.
 
     python benchmarks/bag_read.py --samples 1000000
 """

@@ -28,7 +28,7 @@ def damaged(
 
 
 def flip(file: Path, place: float = 0.5) -> None:
-    """Flip a bit of a byte; `place`: position of the byte / length of the file."""
+    """Flip a bit of the byte at (length of the file) * `place`."""
     data = bytearray(file.read_bytes())
     data[int(len(data) * place)] ^= 4
     file.write_bytes(data)

@@ -15,7 +15,7 @@ import os
 import sys
 from pathlib import Path
 
-# Before the first import of ROS: restrict discovery to this machine.
+# Restrict discovery to this machine before ROS is imported for the first time.
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 
 from live_node import through_the_node

@@ -27,7 +27,7 @@ from thermo_comp.field.series import RestSeries, series_of
 from thermo_comp.field.update import update
 from thermo_comp.field.watch import LIMIT, watch
 
-#: Verdicts are counted in classes of (true RMS of |f| - g) / (limit of the verdict): edges.
+#: Edges of the classes of (true RMS of |f| - g) / (limit of the verdict); verdicts are counted.
 CLASSES = (0.0, 0.6, 0.8, 0.9, 1.0, 1.1, 1.2, 1.5, 9.0)
 LABORATORY, TOLERANCE, N_FUTURES = calibration(), 200.0 * UG, 200
 

@@ -30,7 +30,7 @@ from thermo_comp.ros.waitloop import WaitLoop, separate_node, wait_until
 from thermo_comp.topics import FLAGS, IMU_OUT, OUTPUTS, SAMPLES, thermometer
 from thermo_comp.unit.calibration_file import load_calibration
 
-#: Largest number of published samples that the node has not yet taken; the middleware stores 5000.
+#: Largest number of published samples that the node has not taken yet; the middleware stores 5000.
 IN_FLIGHT = 2000
 #: Time limit for discovery, and for the arrival of the last messages [s]: Fast DDS sends a lost
 #: message again after 3 s, and on a busy machine must do so several times.

@@ -30,8 +30,8 @@ An idle core sleeps and needs time to wake up, and the host may use an idle virt
 machines. On Linux, as root, all cores are kept awake for all relays, by a request for a wake-up
 time of 0 us in /dev/cpu_dma_latency, as in cyclictest; with `--sleep` the cores may sleep. The
 host may stop a virtual machine with all its processes. "stolen" at the end of each row is the
-percentage of time for which the machine was stopped; if it is above some percent, the latencies
-are not those of node and relay.
+percentage of time for which the machine was stopped. Above some percent the latencies are mainly
+due to the host.
 """
 
 from __future__ import annotations

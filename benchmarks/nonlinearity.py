@@ -188,7 +188,7 @@ def figures(seed: int, k2: float, k3: float) -> dict[str, Floats]:
     of_terms = sd[layout.nonlinear : layout.misalignment].reshape(3, 2, -1)
     result = {'kinds': np.array([term.kind for term in nonlinearity.terms])}
     if not k2:
-        # Repeat the fit with K2 and K3 fixed at 0; return changes of bias, scale / claimed sd.
+        # Repeat the fit with K2 and K3 fixed at 0; return (change / claimed sd) of bias and scale.
         without = fitted(runs, k2_sd=1e-12, k3_sd=1e-13)
         values = [
             np.array([[a.bias / a.scale_factor, np.log(a.scale_factor)] for a in used.axes])

@@ -50,7 +50,7 @@ def second_order(t: Floats, lag: float, other: float) -> Floats:
 def temperatures(
     scene: Scene, t: Floats, duration: float, rng: np.random.Generator, ripple: float = RIPPLE_C
 ) -> tuple[Floats, Floats]:
-    """Return case and board temperatures [degC]: a ramp from time 0 to `duration`; 0: a soak."""
+    """Return case and board temperatures [degC]: a ramp that lasts `duration`; if 0, a soak."""
     rate = scene.ramp_k_min / 60.0 * rng.choice((-1.0, 1.0))
     start = 20.0 + rng.uniform(-0.5, 0.5) * max(scene.quantum, 0.1)
     board_lag = BOARD_LAG_S if abs(BOARD_LAG_S - scene.lag_s) > 1.0 else 1.01 * scene.lag_s

@@ -86,7 +86,6 @@ def compensate(path: Path) -> tuple[int, float]:
     n = 0
     with open_recording(path) as reader:
         for block in reader.blocks():
-            # Measure the CPU time of correcting a block, without the time of reading the block.
             begin = time.thread_time()
             n += len(process_block(compensator, block).index)
             spent += time.thread_time() - begin

@@ -10,8 +10,8 @@ selects one study of a case: ``--cases 'turn-on:9 at 30 ug'``.
 
 Units and recordings come from `strangers_units.py` and `strangers_cases.py`, which share no code
 with the package; the package is used only through `thermo_comp.fit` and `Calibration.correct`.
-Errors are those on held-out recordings, unless the row states otherwise. An error is the RMS of
-means over 60 s in ug: of the norm, ``|f| - g``, and of the vector against the true force. A ratio
+Errors are evaluated on held-out recordings, unless the row states otherwise. An error is the RMS
+of means over 60 s in ug: of the norm, ``|f| - g``, and of the vector less the true force. A ratio
 is the RMS of error / claimed sd. The table has the RMS of each figure over the units. MISS marks a
 limit of `strangers_limits.py` that a row violates; the exit code is then 1. The baselines fitted
 by the package take most of the time; ``--baselines strangers.json`` reads the scores of the
@@ -140,8 +140,8 @@ def score(outs: Sequence[Corrected], bags: Sequence[Minutes], *, is_drift: bool)
     forces = [out.force for out in outs]
     plain = error_of(forces, bags, is_drift=is_drift)
     if is_drift:
-        # A mounting's bias offset cancels in the drift: subtract the smallest claimed variance,
-        # that at the reference temperature, from all claimed variances of a bag.
+        # A mounting's bias offset cancels in the drift. Therefore subtract the smallest claimed
+        # variance, which is at the reference temperature, from all claimed variances of a bag.
         variances = [np.diagonal(out.claim, axis1=1, axis2=2) for out in outs]
         sd = np.sqrt(np.concatenate(
             [v - v.min(axis=0) + out.white for v, out in zip(variances, outs, strict=True)]

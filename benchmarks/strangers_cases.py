@@ -190,7 +190,6 @@ def mems(number: int) -> Iterator[Study]:
         for sd in (100, 300, 1000):
             rng = rng_of('mems', n, sd, number)
             unit = consumer_grade(rng)
-            # At 10 Hz the noise of a sample is about a count, so rounding averages out.
             fit, held = (
                 positions(
                     unit,

@@ -97,7 +97,7 @@ def blocks_of(bag: Bag, name: str) -> dict[int, Bag]:
 
 
 def cats(path: Path) -> Iterator[Study]:
-    """Hold out the real unit's rests in odd blocks, then those in even blocks, then one by one."""
+    """Hold out the real unit's rests: all in odd blocks, all in even blocks, then each alone."""
     whole = real_unit(path)
     rests = [part(whole, rows, f'rest{k}') for k, rows in enumerate(rests_of(whole))]
     still: tuple[list[Bag], list[Bag]] = ([], [])

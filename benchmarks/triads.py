@@ -151,13 +151,13 @@ _EXTRA: dict[str, Callable[[Specimen], list[Effect]]] = {
         )
     ],
     'hysteresis': _slips,
-    # Exponents of |T_case - T_board|: load (1) and losses (2) of a heat pump, convection (1.25).
+    # Flow ~ |T_case - T_board|^n: load (n = 1) and losses (2) of a heat pump, convection (1.25).
     'even': lambda draw: [
         FlowEffect('case', 'board', 1.0, bias=draw.signed(3.0, 12.0), scale=draw.normal(10.0)),
         FlowEffect('case', 'board', 2.0, bias=draw.signed(0.2, 1.0)),
         FlowEffect('case', 'board', 1.25, bias=draw.normal(2.0), bias_curvature=draw.normal(0.05)),
     ],
-    # A leakage of 1 to 5 ug at the reference temperature, which doubles every 7 to 10 K.
+    # The leakage is 1 to 5 ug at the reference temperature, and doubles every 7 to 10 K.
     'convection': lambda draw: [
         LeakageEffect('board', draw.between(10.0, 14.5), bias=draw.signed(1.0, 5.0))
     ],

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns small calibrations and blocks of samples for tests of many modules."""
+"""Owns functions that make small calibrations, samples and readings, for tests of many modules."""
 
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
@@ -26,10 +26,17 @@ from thermo_comp.unit.rate_bias import Gyroscope, RateCurve, RateSet, RateTerm
 
 GRAVITY = 9.80665
 SECOND_NS = 1_000_000_000
+#: The beginning of 2026, at which bags of tests begin [ns].
+START_NS = 1_767_225_600 * SECOND_NS
+FACES = np.vstack((np.eye(3), -np.eye(3)))
 #: Indices of the six distinct elements among the nine of a 3 x 3 covariance.
 UNIQUE = [0, 1, 2, 4, 5, 8]
-#: Settings without checks for stuck samples and for a wrong |f|.
+#: Settings of a compensator that does not check for stuck samples, nor |f| against gravity.
 UNCHECKED = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def axis_set(bias=(0.0,), scale=(1.0,), **keys):
@@ -62,7 +69,7 @@ def thermal_calibration():
 
 
 def term(kind, bias=(0.0, 0.0, 0.0), scale=(0.0, 0.0, 0.0), **keys):
-    """Make a response term; defaults: the group of the same name as `kind`, range +-50 K."""
+    """Make a response term; by default its group is named as its kind, and its range is +-50 K."""
     values = {'group': kind, 'range': (-50.0, 50.0), **keys}
     return ResponseTerm(kind=kind, bias=tuple(bias), scale=tuple(scale), **values)
 
@@ -143,7 +150,7 @@ def rich_gyroscope():
 
 
 def stream(compensator, events):
-    """Process single events, with angular rates 1e-3 * sample; return rows and sample numbers."""
+    """Process events one by one, with rates of 1e-3 * sample; return rows and sample numbers."""
     rows, index = [], []
     position = 0
     for kind, stamp, value in events:
@@ -182,7 +189,7 @@ def batch(compensator, events):
 
 
 def assert_equal_bits(unit, config, events, chunk):
-    """Check that single events, a block, and blocks of `chunk` events give equal bits."""
+    """Check that blocks of `chunk` events, or one block, give the bits of single events."""
     streamed, whole, cut = (Compensator(unit, config) for _ in range(3))
     rows, index = stream(streamed, events)
     block = batch(whole, events)
@@ -204,7 +211,7 @@ def assert_equal_bits(unit, config, events, chunk):
 
 
 def warm(compensator, celsius=20.0, case=None, *, until_s=1, start_s=0, flicker=0.0):
-    """Push a board and a case reading each second; +-`flicker` [K] shows that neither is stuck."""
+    """Push a board and a case reading each second; `flicker` [K] shows that neither is stuck."""
     for second in range(start_s, until_s):
         noise = flicker * (-1) ** second
         compensator.push('board', second * SECOND_NS, celsius + noise)
@@ -237,7 +244,7 @@ def source_of(*arrays, name='bag', **keys):
 
 
 def arrays_of(run, every=1):
-    """Return all samples and each `every`-th reading of a simulated run, as arrays for a block."""
+    """Return the samples of a simulated run and each `every`-th reading, as arrays for a block."""
     readings = (run.board_stamp_ns, run.board, run.case_stamp_ns, run.case)
     return (run.accel_stamp_ns, run.counts.astype(float), *(part[::every] for part in readings))
 

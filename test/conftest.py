@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns common parts of the tests: a DDS domain per process, seeds, fixtures to run commands."""
+"""Owns settings and fixtures of all tests: DDS domain, hypothesis, functions that run commands."""
 
 import fcntl
 import gc
@@ -25,8 +25,7 @@ from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# One BLAS thread per process: on a busy machine several BLAS threads wait for each other. numpy
-# reads this variable when it is imported.
+# One BLAS thread per process, as several wait for each other; numpy reads this when imported.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 # Each worker of a test run uses its own DDS domain, limited to this machine. The id of the run and
@@ -37,15 +36,15 @@ os.environ['ROS_DOMAIN_ID'] = str(1 + (zlib.crc32(_RUN.encode()) % 20) * 4 + _WO
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ.pop('ROS_STATIC_PEERS', None)
 
-# A process that a shell starts in the background ignores SIGINT: set the default handler.
+# A process that a shell starts in the background ignores SIGINT, so set the default handler.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-# Examples of hypothesis have no time limit, because their duration depends on the machine.
+# Hypothesis sets no time limit for a test, because the test's duration depends on the machine.
 settings.register_profile('usual', max_examples=50, deadline=None)
 settings.load_profile('usual')
-# Number of examples per test in `make nightly`, except for tests that set a number.
+# `make nightly` runs this number of examples of each test, unless the test sets a number.
 settings.register_profile('nightly', max_examples=10_000, deadline=None)
 
 
@@ -187,7 +186,7 @@ def cli(program):
         with _as_a_process(cwd), _caught('stdout', 1) as output, _caught('stderr', 2) as errors:
             keep_standard_output()
             returned = run_command(arguments)
-            sys.stdout.close()  # flushes its buffer
+            sys.stdout.close()  # closing the stream flushes its buffer
             finished = subprocess.CompletedProcess(arguments, returned, output(), errors())
         return _checked(finished, code)
 
@@ -212,7 +211,6 @@ def small_disk(tmp_path, request):
 
 @pytest.fixture
 def peer():
-    """Return a ROS node with publishers, subscribers and clients for the node under test."""
     pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
     from ros_helpers import Peer
 
@@ -223,7 +221,6 @@ def peer():
 
 @pytest.fixture
 def unit(tmp_path):
-    """Write a calibration without temperature functions; return its path."""
     from builders import calibration
 
     from thermo_comp.unit.calibration_file import save_calibration
@@ -234,7 +231,7 @@ def unit(tmp_path):
 
 @pytest.fixture
 def no_figures(monkeypatch):
-    """Write pages without figures, which saves time; test_report.py tests the figures."""
+    """Write report pages without figures, which saves time; test_report.py tests the figures."""
     monkeypatch.setattr('thermo_comp.report.page.figures_of', lambda _: [])
 
 
@@ -250,7 +247,7 @@ def once(tmp_path_factory):
         with (shared / f'.{name}.lock').open('w') as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             if not folder.exists():
-                # Remove the files of an earlier call of `make` that failed.
+                # An earlier call of `make` that failed may have left files: remove them.
                 shutil.rmtree(partial, ignore_errors=True)
                 partial.mkdir()
                 make(partial)
@@ -268,7 +265,7 @@ def desk(tmp_path_factory, cli, once):
 
 
 class _Pickler(pickle.Pickler):
-    """Pickles a fit without the functions that read its bags: no test needs them after the fit."""
+    """Pickles a fit without its functions that read bags: no test needs them after the fit."""
 
     def persistent_id(self, value):
         is_local = isinstance(value, FunctionType) and '<' in value.__qualname__

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns a folder with the files that examples in help texts and pages use."""
+"""Owns folders with the files that the examples of help texts and pages use."""
 
 import itertools
 import os
@@ -28,7 +28,7 @@ _EXPORTS = {'autopilot.params': 'px4', 'xsens_acc.calib': 'imu_tk',
 
 
 def write_fit_of_the_readme(path, cli):
-    """Write the calibration of the sample bags by the command on docs/cli.md."""
+    """Write the calibration of the sample bags by the `fit` command on docs/cli.md."""
     words, _ = shown()['fit']
     bags = ROOT / 'bags' / 'fit'
     assert words[1] == 'bags/fit/*.mcap'
@@ -67,7 +67,7 @@ class Desk:
         elif name == 'unit.yaml':
             shutil.copy(self._make('unit42.yaml'), path)
         elif name == 'unit01.yaml':
-            # With the default model three fits take 10 s, with `golovach` less.
+            # Three fits with the default model take 10 s; the model `golovach` is faster.
             bags = sorted(self._make('bags/unit42').iterdir())
             given = ('--gravity', '9.8154', '--model', 'golovach', '--serial', path.stem)
             self._cli('fit', *bags, *given, '-o', path, '-q')
@@ -135,12 +135,12 @@ class Desk:
             write_new(path, np.random.default_rng(5))
 
     def run(self, command, cli=None):
-        """Run an example in a new folder, or an example of `fleet` in the folder of fleets."""
+        """Run an example in a new folder; examples of `fleet` share a folder."""
         words = shlex.split(command, comments=True)
         assert words.pop(0) == 'thermo_comp'
         outputs = {after for word, after in itertools.pairwise(words) if word == '-o'}
         self._n += 1
-        # All examples of `fleet` share a folder, so a second `fleet fit` finds existing results.
+        # The examples of `fleet` share a folder, so a second `fleet fit` finds existing results.
         here = self._folder / ('fleet' if words[0] == 'fleet' else f'run{self._n}')
         (here / 'bags').mkdir(parents=True, exist_ok=True)
         for word in words:
@@ -158,7 +158,7 @@ class Desk:
             arguments += sorted(str(path.relative_to(here)) for path in paths) or [word]
         if arguments[0] == 'play':
             pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
-            # In these tests there is no subscriber, so wait only 0.5 s for subscribers.
+            # No subscriber exists in these tests, so `play` waits only 0.5 s for subscribers.
             arguments[1:1] = ['--wait', '0.5']
         if arguments[:2] == ['record', '--positions']:
             return self._interrupted(arguments, here)

@@ -23,15 +23,15 @@ from sensor_msgs.msg import Imu, Temperature
 
 from thermo_comp.ros.waitloop import WaitLoop
 
-#: Time limit for any event [s]: after this time the test fails.
+#: Time limit for any event [s]; after this time the test fails.
 TIMEOUT_S = 60.0
-#: Longest span [s] and largest number of messages sent without a pause: the shared memory of Fast
-#: DDS has room for 512 messages; further messages arrive seconds later, out of order.
+#: A lot is sent without a pause: its longest span [s] and largest number of messages. The shared
+#: memory of Fast DDS holds 512 messages; further messages arrive seconds later, out of order.
 LOT_S, LOT_SIZE = 10.0, 400
 QOS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
 FRAME = b'sensor\0'
 _REST = np.array([20.0])
-#: Samples of the unit of `fault_rig` at rest at the reference temperature [counts].
+#: A sample of the unit of `fault_rig` at rest at the reference temperature [counts].
 _STANDING = counts_of(force_at(np.array([STANDS_S])), _REST, _REST, 0.0 * _REST)[0]
 _HEAD = '<4siII7s5x'
 _COUNTS, _READING = struct.Struct(_HEAD + '3d'), struct.Struct(_HEAD + '2d')
@@ -56,7 +56,7 @@ class Heard:
     stamp_ns: np.ndarray
     force: np.ndarray
     covariance: np.ndarray
-    #: The (level, message) of each diagnostics report, and all key values of the last report.
+    #: Level and message of each diagnostics report, and all key values of the last report.
     reports: list[tuple[int, str]] = field(default_factory=list)
     values: dict[str, str] = field(default_factory=dict)
 
@@ -106,7 +106,7 @@ class Bench:
             while not publisher.get_subscription_count():
                 pause.wait(0.01)
                 assert self.process.is_alive, self.process.said
-        # Discovery of the new publishers by the node's subscriptions takes 0.5 s.
+        # The node's subscriptions discover the new publishers within 0.5 s.
         pause.wait(0.5)
 
     def close(self):
@@ -140,7 +140,7 @@ class Bench:
     def set_parameters(self, **values):
         future = self.ask(**values)
         pause = threading.Event()
-        # Poll, because a callback would wait for the executor, which waits for the answer.
+        # Poll the future: a callback would wait for the executor, which waits for the answer.
         while not future.done():
             pause.wait(0.001)
             assert self.process.is_alive, self.process.said
@@ -160,7 +160,7 @@ class Bench:
         return n
 
     def meet(self):
-        """Send samples with stamps after all bags until the node publishes; read its counters."""
+        """Send samples later than all bags until the node publishes; read the node's counters."""
         pause = threading.Event()
         standing = _STANDING.copy()
         for k in range(1000):
@@ -171,7 +171,7 @@ class Bench:
             pause.wait(0.02)
             if self._frames:
                 break
-        # Messages before discovery are lost, so take the number of samples from the node.
+        # Samples sent before discovery are lost, so the node states how many it has counted.
         last_ns = stamp_ns + 1_000_000_000
         standing[2] += 1.0
         self.send([('counts', last_ns, tuple(standing))])
@@ -203,7 +203,7 @@ class Bench:
             if self.send(lot):
                 self.settle()
             else:
-                # Before each report the node takes all messages from its queues.
+                # The node takes all messages from its queues before each report.
                 n_reports = self._n_reports
                 self.wait_for(lambda n=n_reports: self._n_reports > n + 2, 'three reports')
         return self.take()

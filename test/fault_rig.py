@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the bag of the fault tests (its only errors: noise) and functions that insert faults."""
+"""Owns the bag of the fault tests, whose only error is noise, and functions that insert faults."""
 
 import math
 from collections.abc import Callable
@@ -9,18 +9,17 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from builders import GRAVITY, SECOND_NS, axis_set, calibration, regime_set, term
+from builders import GRAVITY, START_NS, axis_set, calibration, regime_set, term
 
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.online.status import CompensatorConfig
 from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
 from thermo_comp.unit.calibration import Axes, AxisReference, Unit
 
-START_NS = 1_767_225_600 * SECOND_NS
 RATE_HZ = 12.5
 READINGS_HZ = 2.5
 DURATION_S = 320.0
-#: Time at which the turn of the unit ends and its rest begins [s].
+#: Time at which the unit stops turning, and its rest begins [s].
 STANDS_S = 40.0
 RAMP_S = (60.0, 120.0)
 RAMP_K_S = 0.1
@@ -34,9 +33,9 @@ NOISE_SD = 1e-4
 BIAS = (18000.0, -15000.0, 16500.0)  # counts, which are 5 to 6 mg
 BIAS_SLOPE, BIAS_CURVE = 300.0, 4.0  # counts/K, counts/K^2: 100 ug/K, 1.4 ug/K^2
 SCALE_SLOPE = 7e-5
-BY_GRADIENT, BY_MEMORY = 150.0, 60.0  # counts per K of case less board, and of board lag
+BY_GRADIENT, BY_MEMORY = 150.0, 60.0  # counts per K of (case - board), and of board lag
 
-#: Residual sd of the static curves [m/s^2], as large as the error until a ramp is detected.
+#: Sd of the lack of fit of static curves [m/s^2]: their error until a ramp is detected.
 STATIC_RESIDUAL = 1.5e-4
 DYNAMIC_RESIDUAL = 3e-5
 #: A published force is wrong if its error exceeds this number of published standard deviations.
@@ -45,7 +44,7 @@ SIGMAS = 5.0
 CONFIG = CompensatorConfig(transition_time_s=5.0, temperature_timeout_s=20.0, case_timeout_s=10.0,
                            gravity_tolerance_m_s2=0.02)  # fmt: skip
 
-# A message: topic, stamp [ns] and value. Lists of messages are in order of arrival.
+# A message has topic, stamp [ns] and value. Lists of messages are in order of arrival.
 Event = tuple[str, int, Any]
 Inject = Callable[[list[Event]], list[Event]]
 
@@ -82,7 +81,7 @@ def unit(**changes):
 
 
 def force_at(seconds):
-    """Return the true specific force [m/s^2], shape (n, 3), of a slow turn and a rest after it."""
+    """Return the true specific force [m/s^2], shape (n, 3): a slow turn, then a rest."""
     angle = 0.02 * np.minimum(seconds, STANDS_S)
     return GRAVITY * np.array([np.sin(angle) * 0.6, np.sin(angle) * 0.8, np.cos(angle)]).T
 
@@ -103,13 +102,13 @@ class Truth:
 
 
 def ratios_to_sd(force, covariance, seconds):
-    """Return the errors of forces [m/s^2] at true times [s] divided by the claimed sd, (n, 3)."""
+    """Divide the errors of forces [m/s^2] at true times [s] by their claimed sd, shape (n, 3)."""
     sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     return np.abs(force - force_at(seconds)) / sd
 
 
 def truth(ramp_s=RAMP_S, duration_s=DURATION_S):
-    """Return temperatures of case (lags air) and board (lags case), and board - lagged board."""
+    """Return temperatures: the case lags the air, the board the case; `memory` as in `Truth`."""
     step = 0.01
     time = np.arange(0.0, duration_s + 1.0, step)
     air = 15.0 + RAMP_K_S * (np.clip(time, *ramp_s) - ramp_s[0])
@@ -161,7 +160,6 @@ def bag(rate_hz=RATE_HZ, ramp_s=RAMP_S, duration_s=DURATION_S, start_s=0.0):
 
 
 def corrected(events, compensator=None):
-    """Apply a `Compensator` to events; return stamps and rows (force, covariance)."""
     compensator = compensator or Compensator(unit(), CONFIG)
     stamps, rows = [], []
     for topic, stamp_ns, message in events:
@@ -224,7 +222,7 @@ def late(topic, delay_s, begin_s, end_s):
 
 
 def shuffled(topic, begin_s, end_s):
-    """Exchange neighbouring messages of a topic from `begin_s` to `end_s`, in pairs."""
+    """Exchange each two successive messages of a topic from `begin_s` to `end_s`."""
 
     def inject(events):
         result = list(events)

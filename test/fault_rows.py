@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the faults of docs/faults.md: for each fault the required output and required diagnostics.
-In the bag of `fault_rig` the unit turns until 40 s, and the ramp is from 60 to 120 s.
+Owns the faults of docs/faults.md, each with the required output and the required diagnostics. In
+the bag of `fault_rig` the unit turns until 40 s, and the ramp is from 60 to 120 s.
 """
 
 import math
@@ -22,13 +22,13 @@ class Row:
     inject: rig.Inject
     #: Required diagnostics: pairs of a level and a part of the message.
     says: tuple[tuple[int, str], ...]
-    #: Smallest number of published samples.
+    #: Smallest allowed number of published samples.
     n_least: int
     #: Spans [s] in which nothing may be published.
     silent: tuple[tuple[float, float], ...] = ()
-    #: Span [s] from the fault to its detection, in which the output may be wrong.
+    #: Span [s] from the fault to its detection, in which the published force may be wrong.
     blind: tuple[float, float] = (0.0, 0.0)
-    #: Time [s] from which the output is within 1 ug of the output without the fault; inf: never.
+    #: Time [s] from which the output is within 1 ug of the output without the fault; inf if never.
     recovered: float = 0.0
     #: Time [s] from which stamps are ahead of the true times, and by how many seconds.
     shift: tuple[float, float] = (math.inf, 0.0)
@@ -47,7 +47,7 @@ def lose(share):
 
 
 def faster(begin_s, end_s, factor):
-    """Replace each sample by `factor` samples with 1/`factor` of its counts each."""
+    """Replace each sample by `factor` samples, each with 1/`factor` of its counts."""
     step_ns = round(1e9 / rig.RATE_HZ / factor)
 
     def split(event):

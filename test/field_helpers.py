@@ -15,13 +15,13 @@ from thermo_comp.unit.posterior import posterior_of
 from thermo_comp.unit.prediction import ramp_states
 
 DAY_NS = 86_400 * 10**9
-#: The day 2030-01-01, which is after the date of every calibration in tests, in days since 1970.
+#: The day 2030-01-01 in days since 1970; it is later than the date of any calibration in tests.
 FIRST_DAY = 21_915
 ZERO = np.zeros(3)
 
 
 def rests(calibration, attitudes, error, days=20, seed=1, turn_on=20.0 * MICRO_G, rate=0.0):
-    """Log 3 turn-ons a day of 4 windows; `error(day)`: bias error [m/s^2]; `rate`: ramp [K/s]."""
+    """Draw rests: 3 turn-ons a day of 4 windows; `error(day)`: bias error; `rate`: ramp [K/s]."""
     rng = np.random.default_rng(seed)
     correction = Correction(calibration)
     M, logged = np.array(calibration.misalignment), []

@@ -18,16 +18,16 @@ from thermo_comp.typing import Floats
 
 GRAVITY = 9.81
 NOMINAL = np.array([1000.0, 1010.0, 990.0])  # counts per m/s^2
-#: Groups of the columns: curve (t, t^2), board (two lags), idle (two columns without effect).
+#: Group of each column: curve (t, t^2), board (two lags), idle (two columns without effect).
 GROUPS = ('curve', 'curve', 'board', 'board', 'idle', 'idle')
 TAUS = np.array([400.0, 2500.0])  # time constants of the two board lags [s]
-START = np.array([[0.25, 0.1], [0.1, 1.0]])  # covariance of both initial lag states [K^2]
+START = np.array([[0.25, 0.1], [0.1, 1.0]])  # covariance of the two initial lag states [K^2]
 MICRO = 1e-6 * GRAVITY  # 1 ug [m/s^2]
 
 
 @dataclass(frozen=True)
 class Truth:
-    """True parameters of a unit; a bias is in counts / nominal scale factor [m/s^2]."""
+    """True parameters of a unit; biases are in counts / nominal scale factor [m/s^2]."""
 
     kappa: Floats = field(default_factory=lambda: np.array([1.0003, 0.9996, 1.0005]))
     bias: Floats = field(default_factory=lambda: np.array([5e-3, -8e-3, 2e-3]))
@@ -40,10 +40,10 @@ class Truth:
     misalignment: Floats = field(default_factory=lambda: np.array([1e-3, -2e-3, 5e-4]))
     start_sd: float = 0.0
     sigma: Floats = field(default_factory=lambda: np.full(3, 2.0 * MICRO))
-    #: Correlated noise of the bias, in addition to white noise with an sd of `sigma`.
+    #: Correlated noise of the bias, which adds to the white noise of sd `sigma`.
     noise: Noise = field(default_factory=Noise)
     offset_sd: float = 0.0
-    #: Sd of the support tilt [rad] caused by a temperature column with an RMS of 1.
+    #: Sd [rad] of the support tilt by a temperature column whose RMS is 1.
     tilt_sd: float = 0.0
 
     @property
@@ -61,7 +61,7 @@ class Truth:
 
 
 def table_of(truth, n_positions, rng, *, n_windows=40, step_s=120.0, up=None):
-    """Draw a table of windows, with a bag per position; return table and true directions."""
+    """Draw a table of windows, with a bag per position; return the table and true directions."""
     up = positions(n_positions, 3) if up is None else up
     time = step_s * (np.arange(n_windows) + 0.5)
     # The temperature in the bag of position p is a sine with 0.7 + 0.05 p periods.
@@ -136,7 +136,7 @@ def rows_of(windows, rows):
 
 
 def without_starts(windows):
-    """Remove initial lag states, so that the model has no products of unknowns."""
+    """Remove initial lag states, so that the model contains no products of unknowns."""
     return replace(
         windows, lag=np.full_like(windows.lag, -1), start=np.zeros_like(windows.start),
         start_covariance=np.zeros((0, 0)),
@@ -159,7 +159,7 @@ def prior_of(truth, names=('curve', 'board'), **changes):
 
 
 def candidates_of(windows, forced=()):
-    """Allow all columns, keep the groups `forced`; typical sd of slopes: 5 ug/K, 5 ppm/K."""
+    """Allow all columns and keep the groups `forced`; typical sd of slopes: 5 ug/K, 5 ppm/K."""
     none = np.zeros((2, len(windows.groups)), dtype=bool)
     typical, largest = (
         np.outer(slope, windows.kelvins) * windows.parts
@@ -176,7 +176,7 @@ def begin(windows, up):
 
 
 def mode_of(regression, state, prior):
-    """Find the mode to full precision by Newton steps from the result of a fit."""
+    """Find the mode to full precision by Newton steps, from the state `state`."""
     point = regression.at(regression.solve(state, prior, n_steps=12).state, prior)
     for _ in range(6):
         step, _ = point.solution
@@ -185,5 +185,5 @@ def mode_of(regression, state, prior):
 
 
 def unit_of(state, layout):
-    """Return the parameters of the unit, without those of positions and bags, as a vector."""
+    """Return the parameters of the unit as a vector, without those of positions and bags."""
     return as_vector(state, layout)[: layout.n_unit]

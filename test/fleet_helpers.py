@@ -10,9 +10,9 @@ from thermo_comp.simulation.presets import unit_preset as preset
 from thermo_comp.simulation.run import simulate
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
-#: Program of about half an hour with ramps of 5 K/min; the board temperature covers 36 K.
+#: Program of 33 min with ramps of 5 K/min; the board temperature covers 36 K.
 PROGRAM = parse_cyclogram('20 2min, 45@5 8min, 5@5 10min')
-#: Tests that do not depend on the model use Golovach's model, whose fit is the fastest.
+#: Fit options of tests that do not depend on the model: the model `golovach` is the fastest.
 OPTIONS = FleetOptions(FitOptions(gravity=STANDARD_GRAVITY, model='golovach'), certificates=False)
 
 

@@ -9,14 +9,14 @@ import sys
 import tempfile
 from pathlib import Path
 
-_STOPPING_S = 10.0  # time for the node to end [s]
+_STOPPING_S = 10.0  # time for which `stop` waits for the node to end [s]
 
-#: Node without shared memory: that of a killed process is not removed and may crash other nodes.
+#: Makes a node use UDP: the shared memory of a killed process remains and may crash other nodes.
 OVER_UDP = {'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4'}
 
 
 def without_middleware(text):
-    """Drop lines of Fast DDS, which warn that another process has locked its shared memory."""
+    """Drop the lines by which Fast DDS warns that another process has locked its shared memory."""
     return ''.join(
         line for line in text.splitlines(keepends=True) if 'RTPS_TRANSPORT_SHM' not in line
     )

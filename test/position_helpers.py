@@ -28,6 +28,13 @@ class Imu:
     linear_acceleration_covariance = angular_velocity_covariance
 
 
+def source(accel, gyro=None, name='log'):
+    """Make a source of samples at 100 Hz, without temperatures."""
+    stamp_ns = START_NS + np.arange(len(accel)) * 10_000_000
+    block = ArrayBlock(stamp_ns, accel, imu=None if gyro is None else Imu(gyro))
+    return FitSource(name, lambda: [block])
+
+
 @dataclass
 class Rest:
     """A sensor at rest with specific force `level`; its board cools from `warm` by `fall`."""
@@ -37,8 +44,8 @@ class Rest:
     rate_hz: float = 25.0
     level: tuple[float, float, float] = (0.0, 0.0, GRAVITY)  # specific force [m/s^2]
     sd: float = 3.0 * MG  # noise of a sample [m/s^2]
-    warm: float = 35.0  # [degC]
-    fall: float = 20.0  # [K]
+    warm: float = 35.0  # board temperature at the start [degC]
+    fall: float = 20.0  # total cooling of the board [K]
     pace_s: float = 200.0  # time constant of the cooling [s]
     quantum: float = 0.0  # step of the board's readings [K]
 

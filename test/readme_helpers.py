@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the outputs shown in README and docs/cli.md; run as a program it writes them anew."""
+"""Owns the outputs shown on README and docs/cli.md; run as a program it writes them anew."""
 
 import os
 import re
@@ -19,7 +19,7 @@ _NUMBER = re.compile(r'-?\d+(?:\.\d+)?(?:e[+-]?\d+)?')
 
 
 def shown():
-    """Return the examples in docs/cli.md: sub-command -> (words of the command, its output)."""
+    """Return the examples of docs/cli.md by sub-command: words of the command, and its output."""
     collected = {}
     for kind, text in FENCE.findall(CLI_PAGE.read_text(encoding='utf-8')):
         if kind == 'console':
@@ -37,7 +37,7 @@ def shown_of_demo():
 
 
 def is_alike(got, expected):
-    """Whether outputs have equal words, and numbers that differ by at most 5, or by a third."""
+    """Whether outputs have equal words, and numbers that differ by at most 5 or by a third."""
     if _NUMBER.sub('#', got).split() != _NUMBER.sub('#', expected).split():
         return False
     numbers = zip(_NUMBER.findall(got), _NUMBER.findall(expected), strict=True)
@@ -45,7 +45,7 @@ def is_alike(got, expected):
 
 
 def refresh():
-    """Write the real output of the console examples into docs/cli.md."""
+    """Replace the outputs of the console examples on docs/cli.md by real outputs."""
     environment = {**os.environ, 'PYTHONPATH': str(ROOT), 'COLUMNS': '80'}
     with tempfile.TemporaryDirectory() as folder:
         for name in ('bags', 'benchmarks'):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns writers of bags by `mcap` and `rosbags`, and the columns expected of a reader."""
+"""Owns functions that write bags by `mcap` and `rosbags`, and the columns expected of a reader."""
 
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -23,7 +23,7 @@ STRING, BOOL = 'std_msgs/msg/String', 'std_msgs/msg/Bool'
 ACCEL, IMU_IN, BOARD, CASE, OTHER = (
     '/accel/counts', '/imu/uncompensated', '/temperature/board', '/temperature/case', '/chatter',
 )  # fmt: skip
-#: Message type of each topic, also of topics with the names of a driver.
+#: Message type of each topic; topics such as /mpu/data have the names of a driver.
 TYPES = {
     ACCEL: VECTOR, IMU_IN: IMU, BOARD: TEMPERATURE, CASE: TEMPERATURE, OTHER: STRING,
     '/mpu/data': IMU, '/mpu/die': TEMPERATURE, '/baro/air': TEMPERATURE,
@@ -117,7 +117,7 @@ def write_rosbag1(path, messages):
 
 
 def imu_columns(rng, n):
-    """Draw the columns of n Imu messages other than the linear acceleration."""
+    """Draw all columns of n Imu messages, except for the linear acceleration."""
     return ImuColumns(*(rng.standard_normal((n, width)) for width in (4, 9, 3, 9, 9)))
 
 
@@ -149,14 +149,14 @@ def assert_columns(block, messages):
             assert found.tolist() == expected[f'{role}_{name}'], (role, name)
         assert after.tolist() == expected[f'{role}_after']
         assert values.dtype == np.float64
-        # Compare bits, because a reader must keep the bits of a NaN, which does not equal itself.
+        # Compare bits: a reader must keep the bits of a NaN, and a NaN does not equal itself.
         shape = (-1, 3) if role == 'accel' else (-1,)
         wanted = np.array(expected[f'{role}_values'], np.float64).reshape(shape)
         assert np.ascontiguousarray(values).tobytes() == wanted.tobytes(), role
 
 
 def regular_messages(n=40, accel=ACCEL, every=8):
-    """Make messages of counts at a fixed rate, and both temperatures after each `every` counts."""
+    """Make messages of samples at a fixed rate; both thermometers have one per `every` samples."""
     messages = []
     width = 3 if accel == ACCEL else 37
     for row in range(n):

@@ -19,7 +19,7 @@ from thermo_comp.simulation.run import simulate
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 PROGRAM = '15 12min, 30@1.5 14min, 15@1.5 8min'
-#: Sample rate [Hz]: at 1 Hz rounding to counts would give a noise of 18 ug/sqrt(Hz), not 6.
+#: Sample rate [Hz]; at 1 Hz rounding to counts would add a noise of 18 ug/sqrt(Hz), not 6.
 RATE_HZ = 2.0
 N_POSITIONS = 9
 LEFT_OUT_RMS = [1e-6 * STANDARD_GRAVITY * (1 + k) for k in range(N_POSITIONS - 1)]
@@ -49,7 +49,7 @@ def fitted():
 
 @cache
 def evidence():
-    """Gather the data of a report, with invented left-out residuals, NaN in the last position."""
+    """Gather the data of a report; its left-out residuals are invented, the last one is NaN."""
     *others, last = fitted().positions
     pairs = zip(others, LEFT_OUT_RMS, strict=True)
     left_out = [replace(other, left_out_rms=rms) for other, rms in pairs]
@@ -59,7 +59,6 @@ def evidence():
 
 @cache
 def certificate():
-    """Render the page of the fit once, because drawing takes seconds."""
     return render_report(evidence())
 
 

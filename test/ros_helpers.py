@@ -6,6 +6,7 @@ import threading
 from contextlib import contextmanager, suppress
 
 import rclpy
+from builders import SECOND_NS, START_NS
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Vector3Stamped
 from live_node import node_in_thread  # noqa: F401 - for the tests
@@ -16,10 +17,9 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu, Temperature
 
-SECOND_NS = 1_000_000_000
-#: Stamp of the first sample of a test [ns], and interval between samples [ns].
-START_NS, CYCLE_NS = 1_767_225_600 * SECOND_NS, 10_000_000
-#: Time limit for any event on DDS [s]: after this time the test fails.
+#: Interval between the samples of a test [ns].
+CYCLE_NS = 10_000_000
+#: Time limit for any event on DDS [s]; after this time the test fails.
 TIMEOUT = 30.0
 DEEP = QoSProfile(depth=5000, reliability=ReliabilityPolicy.RELIABLE)
 
@@ -35,12 +35,12 @@ def stamp_of(message):
 
 
 def standing(k):
-    """Return a sample at rest [counts], 300 per m/s^2, that differs from its neighbours."""
+    """Return sample number k at rest, 300 counts per m/s^2; neighbouring samples differ."""
     return 30.0 + k % 3, -20.0 + k % 2, 2941.0 + k % 5
 
 
 class Peer:
-    """A ROS node in a thread; after each received message `wait_for` tests its condition."""
+    """A ROS node in a thread; `wait_for` tests its condition after each received message."""
 
     def __init__(self):
         self.context = Context()
@@ -97,7 +97,7 @@ class Peer:
         """Wait until publishers and subscribers of all topics have discovered each other."""
         topics = {subscription.topic_name for subscription in self.node.subscriptions}
         outputs = [output for output in node.node.publishers if output.topic_name in topics]
-        # Some tests have no thermometers, so leave out inputs without a publisher.
+        # Some tests publish no temperatures, so leave out inputs without a publisher.
         sent = {publisher.topic_name for publisher in self.node.publishers}
         inputs = [input_ for input_ in node.node.subscriptions if input_.topic_name in sent]
         self.poll(
@@ -110,7 +110,7 @@ class Peer:
         )
 
     def call(self, kind, name, request):
-        # Keep service clients, because discovery of a service takes longer than a call.
+        # Keep service clients, because the discovery of a service takes longer than a call.
         if name not in self._clients:
             self._clients[name] = self.node.create_client(kind, name)
         client = self._clients[name]
@@ -174,7 +174,6 @@ def node_arguments(unit, *overrides):
 
 @contextmanager
 def bare_node(*overrides):
-    """Make an rclpy node named thermo_comp with parameter overrides."""
     context = Context()
     words = [word for override in overrides for word in ('-p', override)]
     rclpy.init(args=['--ros-args', *words], context=context)
@@ -207,7 +206,7 @@ class Samples:
 
 
 def status_with(peer, heard, text, send=lambda: None):
-    """Call `send` until a diagnostics message contains the text; return its status."""
+    """Call `send` until a diagnostics message contains the text; return the message's status."""
     del heard[:]
     collected = []
 

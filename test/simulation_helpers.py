@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns functions for simulated runs that tests need, but not the package."""
+"""Owns functions that tests apply to simulated runs."""
 
 from dataclasses import replace
 
@@ -39,7 +39,7 @@ def rippled(program, seed=1, amplitude=0.1, period=300.0):
 
 
 def slow(bag):
-    """Average samples and times over 4 s: this is faster, and means over 60 s hardly change."""
+    """Average samples and their times over 4 s, for speed: means over 60 s hardly change."""
     n = round(4.0 / (bag.time_s[1] - bag.time_s[0]))
     whole = len(bag.time_s) // n * n
     time_s, samples = (
@@ -50,7 +50,7 @@ def slow(bag):
 
 
 def sources_of(bags):
-    """Return fit sources with board and case readings of bags of strangers_units.py."""
+    """Make the sources of a fit from bags of strangers_units.py, with board and case readings."""
     sources = []
     for number, bag in enumerate(bags):
         arrays = [bag.time_s, bag.samples]

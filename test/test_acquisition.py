@@ -187,7 +187,7 @@ def test_constants_that_the_positions_do_not_determine_keep_their_prior_sd():
         np.hypot(PRIOR_SD[0], PRIOR_SD[3]), rel=1e-3
     )
     sd = np.sqrt(np.diag(coverage.constants_covariance(FACES[:2], np.full(2, SD))))
-    # Bias and scale errors: half the difference and half the sum of errors of |f| on +x and -x.
+    # The bias error is half the difference, the scale error half the sum of errors on +x and -x.
     assert sd[[0, 3]] == pytest.approx(SD / np.sqrt(2.0), rel=1e-6)
     np.testing.assert_allclose(sd[[1, 2, 4, 5, 6, 7, 8]], PRIOR_SD[[1, 2, 4, 5, 6, 7, 8]])
 
@@ -214,7 +214,7 @@ def test_the_next_direction_reduces_the_mean_variance(n, rng):
     before = mean_variance(up, at)
     gain = before - mean_variance(np.vstack([up, proposed]), at)
     others = [before - mean_variance(np.vstack([up, unit]), at) for unit in units(rng, 300)]
-    # A face is proposed if it reduces the variance at least half as much as the best direction.
+    # The proposed direction is a face if a face gains at least half as much as the best direction.
     assert gain > 0.45 * max(others)
     assert np.max(up @ proposed, initial=-1.0) < np.cos(np.radians(20.0))
 
@@ -226,7 +226,6 @@ def test_a_direction_is_proposed_if_positions_are_near_all_directions(rng):
 
 
 def test_a_mean_reading_of_zero_has_no_direction_and_hides_none():
-    # WHY: after a mean reading of zero, which has no direction, no other direction was counted.
     means = np.vstack([np.zeros(3), FACES, FACES])
     assert coverage.n_directions(means) == coverage.n_directions(means[::-1]) == 6
 

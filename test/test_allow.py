@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A fit refuses wrong data by named refusals; a refusal that is allowed does not stop the fit."""
+"""A fit refuses wrong data for a named reason; if the user allows the reason, the fit goes on."""
 
 import re
 from contextlib import suppress
@@ -128,7 +128,6 @@ def in_whole_degrees(rest):
     ],
 )  # fmt: skip
 def test_bags_without_usable_numbers_are_refused_with_a_message(rng, spoil, text, options):
-    # WHY: the fit to bags without usable numbers ended with a traceback.
     with pytest.raises(FitError, match=text):
         fit(sources_of(rests_of(rng), spoil), options)
 
@@ -137,7 +136,7 @@ def test_bags_without_usable_numbers_are_refused_with_a_message(rng, spoil, text
     ('spoil', 'name', 'text'),
     [
         (late_by(120.0), 'unmeasured', '^2[0-9] % .* has no temperatures .* use the same clock'),
-        # WHY: for readings that are missing for 200 s the message suggested a second clock.
+        # WHY: for readings that were missing for 200 s the message suggested a second clock.
         (dropping_out, 'unmeasured', r'^2\d % .* has no temperatures .* stick, or drop out\? '
          r'bag\d: temperature/board has no new value for 20[0-2] s$'),
         # WHY: for readings in whole degrees the message suggested a second clock.
@@ -152,7 +151,7 @@ def test_likely_mistakes_are_refused_with_the_name_of_the_refusal(rng, spoil, na
 
 
 def test_one_bag_in_kelvins_or_with_a_constant_axis_is_refused_by_name(rng):
-    # WHY: a fit used one of ten bags in kelvins without a message, and was valid up to 313 degC.
+    # WHY: a fit with one of ten bags in kelvins gave no message, and was valid up to 313 degC.
     rests = rests_of(rng)
     in_kelvins(rests[4])
     with pytest.raises(FitError, match=r'^bag4: temperature/board reads 2\d+\S* degC .* kelvins'):
@@ -175,7 +174,7 @@ def test_one_bag_in_kelvins_or_with_a_constant_axis_is_refused_by_name(rng):
 
 
 def test_the_advice_for_rests_without_noise_names_the_parameter_of_the_node(rng):
-    # WHY: the node takes equal samples for a stuck converter, and dropped 60 % of all samples.
+    # WHY: the node takes equal samples for a stuck converter, so it dropped 60 % of the samples.
     rests = rests_of(rng, sd=0.3 * MG)
     for rest in rests[:2]:
         # The samples have no noise; with a drift of 40 mg they change by steps of 4 mg.

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The Python interface corrects arrays to the same bits as the compensator."""
+"""Corrections and fits of arrays in Python equal those of the commands."""
 
 import shutil
 from dataclasses import replace
@@ -65,7 +65,7 @@ def test_arrays_have_the_bits_of_a_replayed_bag(tmp_path, fitted):
 
 
 def test_readings_of_5000_times_or_of_a_further_thermometer_are_used(rng, arrays):
-    # WHY: `correct` queued all readings ahead of the samples; the full queue dropped some.
+    # WHY: `correct` queued all readings ahead of the samples; the full queue lost some readings.
     time_s = np.arange(5000) * 0.1
     readings = {name: 20.0 + rng.normal(0.0, 0.01, 5000) for name in ('board', 'case')}
     counts = rng.normal([5.0, -3.0, 2940.0], 2.0, (5000, 3)).round()
@@ -116,7 +116,7 @@ def test_unusable_samples_give_rows_of_nan_and_empty_arrays_give_empty_arrays(ar
     late = thermal_calibration().correct(arrays['time_s'], counts, board=arrays['board'])
     assert np.flatnonzero(np.isnan(late.specific_force[:, 0])).tolist() == [7, 9]
     assert (late.counters.n_not_finite, late.counters.n_saturated) == (1, 1)
-    # Without a case thermometer the dynamic regime begins no earlier than with one.
+    # Without case readings the dynamic regime begins at the same sample as with them, or later.
     assert late.dynamic.any()
     assert np.argmax(late.dynamic) >= np.argmax(out.dynamic)
     out = thermal_calibration().correct([], np.empty((0, 3)), board=[])
@@ -208,7 +208,6 @@ def test_arrays_that_cannot_be_fitted_and_doubled_bags_are_refused(tmp_path):
 
 
 def test_tc_read_keeps_the_known_force_of_a_bag_and_refuses_to_fit_a_rotation(tmp_path):
-    # WHY: `fit(read(bag))` took gravity as |f| in a bag whose metadata state another |f|.
     source = read_recording(ROOT / 'bags' / 'held_out.mcap').columns
     for number, facts in enumerate(
         (

@@ -11,7 +11,7 @@ import xml.etree.ElementTree as ET
 
 import numpy as np
 import pytest
-from builders import calibration
+from builders import START_NS, calibration
 from conftest import ROOT, ran
 
 from thermo_comp.errors import CalibrationError, RecordingError
@@ -19,8 +19,6 @@ from thermo_comp.recording.reader import inspect_recording
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.unit.calibration import Unit
 from thermo_comp.unit.calibration_file import load_calibration, save_calibration
-
-START_NS = 1_767_225_600_000_000_000
 
 
 def saved(path, serial='T-1'):
@@ -36,7 +34,6 @@ def test_a_clock_topic_that_goes_back_or_pauses_does_not_change_samples(peer, tm
         samples = Samples(peer, node)
         assert peer.set_parameters(use_sim_time=True)[0].successful
         clock = peer.publisher(Clock, '/clock')
-        # /clock rises by 1 h, falls back, is constant for five checks, jumps by a year, and ends.
         hour = 3600 * 10**9
         times = [START_NS, START_NS + hour, START_NS, *[START_NS] * 5, START_NS + 8760 * hour]
         for now_ns in times:
@@ -86,7 +83,6 @@ def test_twenty_clients_that_set_parameters_at_once_are_all_answered(peer, tmp_p
             assert len(results) == len(given)
             for (key, value), result in zip(given.items(), results, strict=True):
                 is_good = value not in (str(tmp_path / 'none'), 'x' * 300, -1.0, 'imu')
-                # The node may refuse a request because too many arrive at a time.
                 assert result.successful == is_good or 'too many' in result.reason, (key, value)
         config = node._relay.running.config
         for key in ('calibration_file', 'frame_id', 'transition_time', 'diagnostics_period'):
@@ -96,7 +92,6 @@ def test_twenty_clients_that_set_parameters_at_once_are_all_answered(peer, tmp_p
 
 
 def test_a_link_that_replaces_a_folder_gives_no_calibration_from_another_folder(tmp_path):
-    # A folder may be replaced by a link after the node has checked a path in it.
     pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
     from thermo_comp.ros.reader import read
 

@@ -36,7 +36,6 @@ def test_the_commands_in_the_readme_of_the_bags_make_the_sample_bags(command, tm
     for path in made:
         shipped = read_recording(ROOT / path.relative_to(tmp_path))
         anew = read_recording(path)
-        # Only the version in `simulated_by` may differ between shipped and new bags.
         new, old = (dict(bag.info.metadata) for bag in (anew, shipped))
         assert new.pop('simulated_by').split()[0] == old.pop('simulated_by').split()[0]
         assert new == old, path.name
@@ -83,7 +82,7 @@ def test_the_demonstration_prints_the_output_shown_on_the_pages(tmp_path, monkey
         rows = re.findall(rf'^{section} +([a-z ]+?) +\d+ +([\d.]+) ', printed, re.MULTILINE)
         assert len(rows) == 4, printed
         raw, node, two_sets, one_set = (float(rms) for _, rms in rows)
-        # The node's error must be below that of one or two curves without lags; noise is < 10 ug.
+        # Fits of one or two curves without lags must have twice the error of the node or more.
         assert raw > 150.0
         assert node < 10.0
         assert node < 0.5 * min(one_set, two_sets)

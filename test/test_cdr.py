@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node's conversion of serialized messages gives the bytes that conversion by rclpy gives."""
+"""The node converts serialized messages to the bytes that a conversion by rclpy would give."""
 
 import struct
 
@@ -98,7 +98,6 @@ def test_the_byte_swap_keeps_the_bits_of_a_signalling_nan():
 
 
 def test_messages_with_frame_ids_of_different_lengths_are_converted():
-    # The place of the numbers in a message depends on the length of its frame_id.
     converter = SampleConverter(Vector3Stamped)
     names = ['a', 'imu_link', '', 'a', 'x' * 40, 'imu_link']
     written = convert(converter, *(cdr('<', (1, k), f, [k, 0, 0]) for k, f in enumerate(names)))

@@ -148,8 +148,6 @@ def test_info_lists_nonlinear_terms(unit, cli, tmp_path):
 
 
 class TestTopics:
-    """Topics of inputs: from the command line, from a file, or chosen by their type."""
-
     @pytest.fixture
     def named(self, tmp_path):
         with BagWriter(tmp_path / 'bag') as writer:

@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 import pytest
-from builders import axis_set, calibration, equal_axes, regime_set, rich_calibration
+from builders import START_NS, axis_set, calibration, equal_axes, regime_set, rich_calibration
 from conftest import ROOT, parsed
 
 from thermo_comp.recording.topics import Topics
@@ -14,7 +14,6 @@ from thermo_comp.recording.writer import BagWriter
 from thermo_comp.unit.calibration_file import save_calibration
 
 TOPICS = Topics()
-START_NS = 1_767_225_600_000_000_000
 
 
 def bag(path, *, counts=True, board=True, case=True, serial='', n=600, up=(0.6, 0.0, 0.8)):
@@ -36,7 +35,6 @@ def unit(tmp_path):
 
 
 def refused(cli, code, message, *arguments):
-    """Run a command that must fail with exactly one line that contains `message`."""
     finished = cli(*arguments, code=code)
     lines = finished.stderr.splitlines()
     assert len(lines) == 1, finished.stderr
@@ -149,7 +147,7 @@ def test_a_calibration_that_is_not_valid_gives_exit_code_1(cli, tmp_path):
     path = bag(tmp_path / 'bag', case=False, n=3000, up=(0.0, 0.0, 0.980665))
     finished = cli('evaluate', path, '-c', tmp_path / 'wrong.yaml', code=1)
     assert 'no better than raw: 48 mg RMS of |f| - g, ' in finished.stdout
-    # The second calibration is right: its levels of +10 mg cancel its biases of -10 mg.
+    # The second calibration is right: its bias curves of +10 mg cancel its biases of -10 mg.
     right = axis_set(delta=30.0)
     sets = regime_set(right, right, right)
     valid = calibration(axes=equal_axes(300.0, -30.0), static=sets, dynamic=sets)

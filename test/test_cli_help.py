@@ -16,7 +16,6 @@ pytestmark = pytest.mark.usefixtures('equal_fits_once', 'no_figures')
 
 
 def leaves(group, prefix=''):
-    """Return every command and sub-command by its full name, such as `group command`."""
     collected = {}
     for name, command in group.commands.items():
         inner = hasattr(command, 'commands')
@@ -30,9 +29,9 @@ EXAMPLES = [
     for name, command in COMMANDS.items()
     for line in re.findall(r'^ +(thermo_comp .*)$', command.help or '', re.MULTILINE)
 ]
-# The example that runs in a separate process; other examples run in the process of the tests.
+# This example runs in a separate process; the other examples run in the process of the tests.
 OF_ITS_OWN = 'thermo_comp evaluate held_out.mcap -c unit42.yaml --tolerance 100ug'
-# Examples that other files test; one example of each other command is tested with --json.
+# Other files test these examples; one example of each other command is tested with --json.
 TESTED = re.compile(r'thermo_comp (play|report|record --positions) |bags/unit42/\*')
 WITH_JSON = {line.split()[1]: line for line in EXAMPLES if not TESTED.search(line)}.values()
 QUICK = [line for line in EXAMPLES if line.split()[1] in ('info', 'convert', 'export', 'import')]

@@ -47,7 +47,7 @@ def test_columns_of_the_bank_differ_bend_within_the_span_or_are_even_about_rest(
     assert {(column.sensor, column.rest_k) for column in change} == {('case', -0.5)}
     table = ColumnTable(change, MemorySpec(('case', 'tip')), 20.0)
     states = np.zeros((StateLayout(MemorySpec(('case', 'tip'))).width, 3))
-    # Gradients: -0.5 K, the value in a soak, and 1.5 K above and below the value in a soak.
+    # The gradients differ from the value in a soak, -0.5 K, by 0, +1.5 and -1.5 K.
     states[GRADIENT] = -0.5, 1.0, -2.0
     values = table.raw(states)
     assert np.all(values[:, 0] == 0.0)
@@ -93,7 +93,7 @@ def test_the_value_of_each_kind_of_column_agrees_with_hand_numbers():
     ]
     spec = memory_of(columns, ('case', 'tip'))
     layout = StateLayout(spec)
-    # T_board, its variance, rate; weight; is regime unknown; 4 (gradient or lag, variance); play.
+    # T_board, its variance, rate; weight; unknown regime; 4 times gradient or lag, variance; play.
     state = [23.0, 0.0, 0.01, 0.25, 0.0, 1.2, 0.0, -0.7, 0.0, 0.5, 0.0, -0.3, 0.0, 0.1]
     state = np.array([state]).T
     assert layout.width == len(state)
@@ -115,20 +115,19 @@ def test_bends_have_slopes_and_go_on_along_their_tangent_beyond_the_range():
     state = np.zeros((StateLayout(spec).width, 1))
     lag = StateLayout(spec).places[Lag('board', 60.0)]
     state[BOARD], state[lag] = 24.0, 0.5
-    # Slopes of column 0 over t, of column 1 over its lag, then of both over the board temperature.
+    # Slopes of column 0 over t, of column 1 over its lag, and of both columns over T_board.
     assert np.ravel(table.slopes(state)).tolist() == [1.0, -1.0, 1.0, 1.0]
     state[BOARD] = 21.0
     assert not np.any(table.slopes(state))
     flow = ColumnTable([Column('gradient', 'gradient', **WIDE)], MemorySpec(), 20.0)
     assert flow.slopes(np.zeros((7, 1)))[1] is None
-    # WHY: `bend` columns became constant at different temperatures; the slope was wrong by 200
-    # ug/K.
+    # WHY: `bend` columns became constant at different temperatures: slopes erred by 200 ug/K.
     columns = [Column('bend', 'bend', knee_k=k, range=(-12.0 - k, 8.0 - k)) for k in (2.0, 6.0)]
     table = ColumnTable(columns, MemorySpec(), 20.0)
     states = np.zeros((StateLayout(MemorySpec()).width, 3))
     states[BOARD] = 20.0 + np.array([8.0, 12.0, 15.0])
     raw = table.raw(states)
-    # The tangent ends 5 K, 1/4 of the range's width, beyond the range; `beyond` is 0 in the range.
+    # The tangent ends 5 K (1/4 of the width) outside the range; inside the range `beyond` is 0.
     assert table.held(raw).tolist() == [[6.0, 10.0, 11.0], [2.0, 6.0, 7.0]]
     assert table.beyond(raw).tolist() == [[0.0, 4.0, 7.0]] * 2
 
@@ -149,7 +148,7 @@ def test_a_new_kind_of_column_needs_one_term_only(monkeypatch):
     rate, variance = state[place : place + 2]
     line = correction.line(state, state, np.zeros(N_ROWS), 0.0)
     assert line[8] == pytest.approx(3e6 * rate**2) == pytest.approx(300.0, rel=0.02)
-    # d(bias)/d(rate) is 2 * 3e6 * rate [counts s/K]; the scale factor is 300 counts per m/s^2.
+    # The slope of the bias over the rate is 2 * 3e6 * rate [counts s/K]; K: 300 counts per m/s^2.
     by_rate = (2.0 * 3e6 * rate / 300.0) ** 2 * variance
     assert line[VARIANCES[2]] - correction.noise[2] == pytest.approx(by_rate, rel=1e-6)
     with pytest.raises(ValueError, match=r'keep the largest effect of the column within'):

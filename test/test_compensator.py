@@ -32,7 +32,7 @@ from thermo_comp.online.compensator import Compensator, CompensatorConfig
 from thermo_comp.unit.calibration import Axes, AxisReference
 from thermo_comp.unit.correction import Correction
 
-#: Variance of a sample [m^2/s^4]: density^2 / cycle, plus rounding with a carried remainder.
+#: Variance of a sample [m^2/s^4]: density^2 / cycle, plus the variance of rounding with carry.
 NOISE = 1e-4**2 / 0.01 + (1.0 / 6.0) / 300.0**2
 
 
@@ -61,7 +61,6 @@ def test_corrected_samples_agree_with_the_formulas_of_two_faces_and_of_the_stati
     assert (x, y, z) == pytest.approx((a, 1e-3 * a + b, 2e-3 * a - 3e-3 * b + c), abs=1e-12)
 
 
-#: Calibration of all examples; no example changes it.
 RICH = rich_calibration()
 
 #: Values of a few samples: not finite, limits of 16 bits, zeros, the least positive number.
@@ -69,7 +68,7 @@ STRANGE = (math.nan, math.inf, -math.inf, 32767.0, -32768.0, 0.0, -0.0, 5e-324)
 
 
 def event_list(seed):
-    """Make random messages: late, repeated, with falling stamps, not finite, saturated."""
+    """Make random messages; some are late, repeated, not finite or saturated, or stamps fall."""
     rng = random.Random(seed)
     events = []
     stamp = rng.choice([0, rng.randrange(2**60)])
@@ -105,7 +104,7 @@ def at_seconds(*events):
     ]
 
 
-# Only if stamps fall by over 5 s, earlier readings count as readings of another clock.
+# Earlier readings count as readings of another clock only if stamps fall by more than 5 s.
 @given(event_lists, st.integers(3, 30), st.sampled_from([0.0, 5.0]))
 @example(at_seconds('A', 3, 'A', 0, 'B', 2, 'B', 86_400, 'C', 0, 'A', 0), 5, 0.0)
 @example(at_seconds('B', 26, 'B', 21, 'A', 23, 'B', 16.5), 1, 0.0)
@@ -132,7 +131,7 @@ def test_the_covariance_in_an_unknown_regime_contains_the_difference_of_the_sets
     early = compensator.process(SECOND_NS // 2, 0.0, 0.0, 1.0)
     warm(compensator, until_s=1500, start_s=1)
     late = compensator.process(1500 * SECOND_NS, 0.0, 0.0, 1.0)
-    # The dynamic bias exceeds the static bias by 3 counts (0.01 m/s^2) on x, and equals it on y.
+    # The dynamic bias is 3 counts (0.01 m/s^2) above the static bias on x, and equal on y.
     assert early[3] == pytest.approx(NOISE + 0.01**2, rel=1e-6)
     assert early[6] == pytest.approx(NOISE, rel=1e-6)
     assert late[3] == pytest.approx(NOISE, rel=1e-6)
@@ -163,7 +162,7 @@ def test_a_sample_with_a_stamp_20_s_ahead_is_dropped_unless_the_next_stamp_agree
         (np.insert(usual, 2, usual[2] + leap), [0, 1, 3, 4, 5]),
         # After a gap of 20 s the first sample is dropped, and the samples after it are used.
         (np.where(np.arange(5) < 2, usual, usual + leap), [0, 1, 3, 4]),
-        # Two stamps 20 s ahead are dropped if not adjacent, or if the second is before the first.
+        # Two stamps 20 s ahead are dropped if they are not adjacent, or if the second is lower.
         (np.insert(usual, [1, 3], usual[[1, 3]] + leap), [0, 2, 3, 5, 6]),
         (np.array([1, 2 + leap, 1 + leap, 3, 4]), [0, 3, 4]),
     ):
@@ -196,7 +195,7 @@ def test_a_reading_with_a_near_stamp_confirms_a_sample_20_s_ahead(is_read):
 
 @pytest.mark.parametrize('ahead_s', [0, 10**6])
 def test_a_full_queue_has_4096_readings_and_keeps_the_newest(ahead_s):
-    # WHY: case readings with a clock ahead filled the queue: new board readings were dropped.
+    # WHY: case readings with a clock ahead filled the queue, and new board readings were dropped.
     compensator = Compensator(thermal_calibration(), CompensatorConfig(gravity_tolerance_m_s2=0.0))
     for k in range(10_000):
         compensator.push('case', (k + ahead_s) * SECOND_NS, 20.0)
@@ -223,7 +222,7 @@ def test_all_readings_of_two_minutes_without_samples_are_applied(n_before, ahead
         for k in range(4, 20 * 120)
         for name in ('board', 'case')
     ]
-    # If `ahead_s` is 2, the last 2 s of readings have later stamps than the sample after them.
+    # For `ahead_s` = 2 the readings of the last 2 s have later stamps than the next sample.
     after_ns = (120 - ahead_s) * SECOND_NS
     last = [('accel', after_ns + k * SECOND_NS // 100, (1.0, 2.0 + k, 2930.0)) for k in range(5)]
     block, live = (Compensator(replace(rich_calibration(), gyroscope=None)) for _ in range(2))
@@ -248,7 +247,7 @@ def test_flush_updates_the_regime_without_samples():
 
 
 def test_another_transition_time_during_a_transition_causes_no_step_of_the_output():
-    # The curves of both regimes differ by 0.025 counts (8.5 ug) at any temperature.
+    # The curves of the two regimes differ by 0.025 counts (8.5 ug) at any temperature.
     unit = calibration(dynamic=regime_set(axis_set(delta=0.025)))
     compensator = Compensator(unit, replace(UNCHECKED, transition_time_s=100.0))
     warm(compensator, 20.0, until_s=1200)
@@ -265,7 +264,6 @@ def test_another_transition_time_during_a_transition_causes_no_step_of_the_outpu
 
 
 def test_a_new_transition_time_does_not_restart_the_checks_of_gravity_and_sample_rate(rng):
-    # WHY: a changed parameter restarted the check of |f|: a wrong |f| was published for 13 s.
     compensator = Compensator(calibration(), CompensatorConfig())
 
     def published(seconds, size):
@@ -297,7 +295,6 @@ def test_a_new_transition_time_does_not_restart_the_checks_of_gravity_and_sample
         samples = zip(stamps, *force.T, strict=True)
         return sum(compensator.process(*sample) is not None for sample in samples)
 
-    # Samples at four times the converter's rate are published for a short time, then refused.
     assert published(3) > 0
     assert published(4) == 0
     other = replace(compensator.config, transition_time_s=50.0)
@@ -347,7 +344,7 @@ def test_a_switch_of_sets_causes_no_step():
 
 @pytest.mark.parametrize(
     ('delta', 'given_s', 'expected_s'),
-    # At 1 ug/s a change by the difference of the regimes, 0.3 counts = 102 ug, takes 102 s.
+    # The regimes differ by 0.3 counts = 102 ug: at 1 ug/s a change by this difference takes 102 s.
     [(0.01, 30.0, 30.0), (0.3, 30.0, 1e-3 / 9.80665e-6), (0.3, 5.0, 50.0), (0.3, 0.0, 0.0)],
 )
 def test_a_transition_time_above_0_limits_the_change_to_1_ug_per_s(delta, given_s, expected_s):

@@ -1,12 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A fit reports what initial lag states, tilts, offsets and slow noise explain in its bags."""
+"""A fit reports the sizes of initial lag states, tilts, offsets and slow noise in its bags."""
 
 from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 import strangers_units as units
+from builders import rms
 from fitting_truth import GRAVITY, MICRO, NOMINAL, Truth, begin, candidates_of, prior_of, table_of
 from simulation_helpers import sources_of
 from strangers_cases import HALF
@@ -18,12 +19,8 @@ from thermo_comp.fitting.initial_triad import within_positions
 from thermo_comp.fitting.unknowns import Noise
 from thermo_comp.unit.gravity import MICRO_G
 
-#: A tilt sd without visible effect, but not 0, so that all truths draw the same random numbers.
+#: This sd of tilts has no visible effect, but is not 0: all truths draw equal random numbers.
 NOTHING = Truth(tilt_sd=1e-15)
-
-
-def rms(values):
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def table(truth):
@@ -43,8 +40,8 @@ def settled(truth):
     [
         ('initial_lag_states', {'start_sd': 0.5, 'on_bias': 5.0 * NOTHING.on_bias}, 0.05),
         ('support_tilt', {'tilt_sd': 5e-6}, 0.05),
-        # |f| determines 24 combinations of the 72 offsets, of which 9 act like changes of the
-        # constants: the sd of 15 numbers is uncertain by 1 / sqrt(2 * 15) = 18 %.
+        # |f| determines 24 combinations of the 72 offsets. 9 of them act like changes of the
+        # constants; from the other 15 the sd is known to 1 / sqrt(2 * 15) = 18 %.
         ('mounting_offsets', {'offset_sd': 30.0 * MICRO}, 0.36),
     ],
 )
@@ -55,7 +52,6 @@ def test_the_size_of_an_effect_is_the_rms_that_it_adds_to_the_readings(name, eff
     true = (table(truth)[0].mean - without.mean) / NOMINAL
     if name == 'support_tilt':
         true = within_positions(true, windows.position)
-    # The noise of a mean over 60 windows is 0.26 ug.
     hidden = truth.sigma[0] / np.sqrt(60.0)
     assert rms(true) > 5.0 * hidden
     assert getattr(found, name) == pytest.approx(rms(true), rel=tolerance)
@@ -101,7 +97,6 @@ def test_starts_and_tilts_larger_than_the_response_are_findings(name, value, exp
     if expected:
         assert 'explain 90 ug RMS' in found[0].message
         assert 'thermal response of the unit, 60 ug' in found[0].message
-    # Effects below the white noise of a window give no finding.
     assert not list(judge_contributions(values, 100.0 * MICRO_G))
 
 

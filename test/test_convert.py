@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Conversion of a table: each row is in the bag or counted, and values are unchanged."""
+"""The conversion of a table writes or counts each row, and does not change values."""
 
 import json
 
@@ -60,7 +60,7 @@ def test_a_bag_converted_from_a_table_has_the_values_of_the_table(tmp_path):
         np.column_stack([columns[k] for k in ['wx', 'wy', 'wz']]),
         rtol=1e-14,  # rounding of the conversions to rad/s and back to deg/s
     )
-    # sensor_msgs/Imu: -1: no orientation, 0: unknown covariance of the angular rate.
+    # In a sensor_msgs/Imu -1 means no orientation, 0 an unknown covariance of the angular rate.
     assert block.imu.orientation_covariance[:, 0].tolist() == [-1.0] * 400
     assert not block.imu.angular_velocity_covariance.any()
     case, board = block.temperatures['case'], block.temperatures['board']
@@ -117,7 +117,6 @@ def test_times_of_a_counter_of_32_bits_continue_after_its_overflow(tmp_path, uni
 
 
 def test_readings_stay_among_samples_after_a_restart_of_the_clock(tmp_path):
-    # WHY: after a restart of the clock, the bag had all readings first and then all samples.
     path, _ = table(tmp_path / 'log.csv')
     lines = path.read_text().splitlines()
     for k in range(201, 401):
@@ -151,7 +150,7 @@ def test_rows_with_faults_are_counted_and_readings_of_minus_127_degc_left_out(tm
     assert (report.findings['backwards'].count, report.findings['backwards'].lines) == (1, (43,))
     assert (report.findings['repeated'].count, report.findings['repeated'].lines) == (1, (52,))
     assert len(block) == report.messages['accel'] == 397
-    # The bag contains clipped samples and samples in wrong order: the node rejects them.
+    # The bag keeps clipped samples and samples in wrong order, because the node rejects them.
     assert block.accel[:, 0].max() == 2.0 * STANDARD_GRAVITY
     assert (np.diff(block.accel_stamp_ns) < 0).sum() == 1
     assert (np.diff(block.log_ns['accel']) >= 0).all()
@@ -311,7 +310,7 @@ class TestFreezer:
     def path(self, real_data):
         path = real_data / 'freezer-mpu6050' / 'temp-calibration.csv'
         if not path.is_file():
-            pytest.skip(f'no {path}')
+            pytest.skip(f'{path} does not exist')
         return path
 
     def test_every_row_is_in_the_bag_and_the_faults_are_reported(self, path, tmp_path):

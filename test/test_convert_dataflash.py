@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""ArduPilot logs, written here by the public description of DataFlash, are converted to bags."""
+"""ArduPilot logs, written here as the public description of DataFlash states, become bags."""
 
 import struct
 
@@ -147,7 +147,7 @@ def test_samples_corrected_by_ardupilot_are_left_out(tmp_path, rng, course, kept
     np.testing.assert_array_equal(read.accel, force[0][kept])
     assert f'INS_TCAL1_ENABLE was 1 for {share} % of the samples' in read.chosen
     assert len(read_autopilot(path, allow_compensated=True).stamp_ns) == N
-    # The fit needs the thermal history: temperatures are kept also where samples are left out.
+    # The fit needs the thermal history, so temperatures stay where samples are left out.
     assert len(read.temperatures['board'].celsius) > 1
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of other programs are read by headings; |f| at rest and rates show the units."""
+"""Tables of other programs are read by their headings; |f| at rest and rates show the units."""
 
 from datetime import datetime, timedelta, timezone
 from itertools import takewhile
@@ -98,8 +98,7 @@ def test_a_table_is_read_by_its_headings(tmp_path, rng, kind, headings, unit, on
 
 @pytest.mark.parametrize('kind', ['dates', 'text', 'numbers'])
 def test_a_parquet_table_is_read_by_its_headings(tmp_path, rng, kind):
-    # WHY: a Parquet table was read only with a column map, although it has headings.
-    pa = pytest.importorskip('pyarrow', reason='pyarrow is the extra `parquet`')
+    pa = pytest.importorskip('pyarrow', reason='pyarrow of the extra `parquet` is not installed')
     import pyarrow.parquet as pq
 
     stamp_ns = START_NS + STEP_NS * np.arange(N)
@@ -139,10 +138,10 @@ def test_the_accelerometer_is_chosen_among_several_triads_of_a_table():
         ('t [s],ax [g],ay [g],az [g],T [°C]', 'ax [g]', ('s', 'g', 'degC')),
         ('t,imu0_ax,imu0_ay,imu0_az,T_board,T_case', 'imu0_ax', ('', '', 'degC')),
         ('elapsed_h,ax,ay,az,temp (°F)', 'ax', ('h', '', 'degF')),
-        # The `g` at the end was read as a gyroscope's letter: "column 'ax_g' is given twice".
+        # WHY: the `g` of `ax_g` was taken for a gyroscope: "column 'ax_g' is given twice".
         ('time,ax_g,ay_g,az_g,temp', 'ax_g', ('', 'g', 'degC')),
         ('t,acc_x_g,acc_y_g,acc_z_g,gx_dps,gy_dps,gz_dps,temp', 'acc_x_g', ('', 'g', 'degC')),
-        # Headings that PlotJuggler writes for sensor_msgs/Imu, and those of the EuRoC data sets.
+        # These headings are from PlotJuggler for sensor_msgs/Imu, and from the EuRoC data sets.
         ('__time,/imu/angular_velocity/x,/imu/angular_velocity/y,/imu/angular_velocity/z,'
          '/imu/linear_acceleration/x,/imu/linear_acceleration/y,/imu/linear_acceleration/z,temp',
          '/imu/linear_acceleration/x', ('', '', 'degC')),
@@ -198,19 +197,19 @@ def test_the_unit_of_the_times_of_a_slow_log_is_recognised(tmp_path, unit, times
         # WHY: for dates that are not ISO 8601 the message was that no row has a number as stamp.
         *(('date', [cell] * 900, f"column 'date' is a date of ISO 8601.*'{cell}'")
           for cell in ('29/03/2026 01:30:00', '01:30:00.5')),
-        # WHY: the message `column 'temp' is given twice` suggested a wrong command line.
+        # WHY: the message `column 'temp' is given twice` blamed the command line, not the table.
         ('t,temp', [f'{k / 10},20' for k in range(900)], r"log\.csv: 2 columns are called 'temp'"),
     ],
 )  # fmt: skip
 def test_columns_with_unusable_times_or_temperatures_are_refused(tmp_path, heading, times, reason):
-    # WHY: times in minutes were read as seconds; for times that do not rise the message was wrong.
+    # WHY: times in minutes were read as seconds; times that do not rise gave a wrong message.
     path = slow_table(tmp_path / 'log.csv', heading, times)
     with pytest.raises(RecordingError, match=reason):
         read_log(path)
 
 
 def test_a_table_with_blank_temperature_cells_is_read(tmp_path):
-    # WHY: if the last cell of most rows was blank, the reader counted a heading too many.
+    # WHY: if the last cell of most rows was blank, the reader expected a further heading.
     path = slow_table(tmp_path / 'log.csv', 'time', [k / 100 for k in range(N)], last=31.99)
     head, *rows = path.read_text().splitlines()
     rows = [row if k % 100 == 0 else f'{row.rpartition(",")[0]},' for k, row in enumerate(rows)]
@@ -241,7 +240,7 @@ def test_a_temperature_in_millikelvins_and_a_force_without_gravity_are_refused(t
     path = slow_table(tmp_path / 'log.csv', 'time', times, 20_000.0, 21_000.0)
     with pytest.raises(RecordingError, match='expected -90 to 200: the unit in a column map may'):
         write_log(table_log(path, guess_columns(path)), tmp_path / 'bag')
-    # A phone's linear acceleration is the acceleration without gravity.
+    # The linear acceleration that a phone logs does not contain gravity.
     names = [f'Linear acceleration {axis} (m/s^2)' for axis in 'xyz']
     rows = [f'{at},0.01,0.02,{0.01 * (k % 3)}' for k, at in enumerate(times)]
     path.write_text('\n'.join([','.join(['time', *names]), *rows]) + '\n')
@@ -294,7 +293,7 @@ def test_the_guessed_column_map_is_printed(tmp_path, rng, cli, headings, thermom
 
 @pytest.mark.parametrize(('last', 'unit'), [(3, None), (1200, None), (40, 'degC')])
 def test_a_column_board_of_whole_numbers_is_a_temperature_only_if_plausible(tmp_path, last, unit):
-    # The column `board` has 3 in all rows (number of a board), row numbers, or 3 to 40 degC.
+    # The column `board` counts rows, or is 3 (number of a board), or rises from 3 to 40 degC.
     rows = [f'{k / 10},0,6,8,{3 + k * (last - 3) // 1199}' for k in range(1200)]
     (tmp_path / 'log.csv').write_text('\n'.join(['time,ax,ay,az,board', *rows]))
     board = guess_columns(tmp_path / 'log.csv').board
@@ -354,7 +353,7 @@ def test_the_norm_at_rest_and_a_plausible_sample_rate_show_the_units(
 
 
 def test_the_speed_of_a_turn_by_hand_shows_the_unit_of_times(tmp_path, rng):
-    # WHY: 1 Hz was taken for 1 kHz. A turn by hand takes one interval of 1 s, or 800 of 1 ms.
+    # WHY: 1 Hz was taken for 1 kHz. A turn by hand takes one interval of 1 s, or 800 of 1 ms each.
     angle = np.repeat([0.0, np.pi, 0.0], [400, 800, 400])
     ramp = np.clip((np.arange(1600) - 400) / 800, 0.0, 1.0) * np.pi
     for turned, unit in ((angle, 's'), (ramp, 'ms')):
@@ -404,7 +403,7 @@ def test_tables_whose_columns_cannot_be_identified_are_refused(tmp_path, rng):
     for content, reason in (
         ('t,a,b,c\n' + '0,0,0,9.8\n' * 100, 'its headings name no accelerometer'),
         ('a,b,c\n1,2,3\n2,3,4\n', "name no accelerometer: 'a', 'b', 'c'; give a column map"),
-        # WHY: decimal commas were taken for separators, so the headings had too few names.
+        # WHY: decimal commas were taken for separators, so rows had more cells than headings.
         ('t;ax;ay;az\n' + '0,01;0,0;0,1;9,8\n' * 9, 'commas, it begins with 0,01: write decimal'),
         ('0 0 0 9.8 20\n' * 100, '5 columns without headings cannot be identified'),
     ):

@@ -69,7 +69,7 @@ def test_headings_are_optional_and_a_column_may_begin_late(tmp_path):
 
 @pytest.mark.parametrize('separator', [',', ';', '\t', ' '])
 def test_lines_before_the_table_of_a_logger_are_left_out(tmp_path, separator):
-    # The row of units becomes a row of NaN; the incomplete last row is counted and left out.
+    # The reader turns the row of units into NaN, and counts and omits the incomplete last row.
     head = ['Inertial logger', '# serial 7', '% matlab', '// c', f'Rate:{separator}100', '']
     rows = ['t|ax|ay|az', 's|g|g|g', *(f'{k}|0.1|0.2|{k}' for k in range(60)), '# end', '60|0.1']
     text = '\n'.join([*head, *(row.replace('|', separator) for row in rows)])
@@ -120,7 +120,7 @@ def test_a_missing_file_is_refused(tmp_path):
 
 
 def parquet(folder, **columns):
-    pa = pytest.importorskip('pyarrow', reason='pyarrow is the extra `parquet`')
+    pa = pytest.importorskip('pyarrow', reason='pyarrow of the extra `parquet` is not installed')
     import pyarrow.parquet as pq
 
     pq.write_table(pa.table(columns), folder / 'log.parquet')
@@ -196,7 +196,6 @@ PRESSURE = 'sensor_msgs/msg/FluidPressure'
 
 
 def write_bag(path, rng, ros=2, scale=G):
-    """Write a bag of a sensor at rest whose samples have norm `scale`."""
     force = scale * (np.array([0.0, 0.1, 1.0]) + 0.003 * rng.standard_normal((N, 3)))
     zeros, messages = [0.0] * 9, []
     for k in range(N):
@@ -244,7 +243,7 @@ def present(imu, temperature=(), pressure=()):
         ((), (), None, None),
         (('/t',), (), '/t', None),
         (('/imu/t', '/air'), (), '/imu/t', '/air'),
-        # A thermometer in a barometer's namespace is the case's, even as the only thermometer.
+        # A thermometer beside a barometer is taken for the case's, even if it is the only one.
         (('/baro/t',), ('/baro/p',), None, '/baro/t'),
         (('/imu/t', '/baro/t', ), ('/baro/p',), '/imu/t', '/baro/t'),
         (('/robot/imu/t', '/robot/baro/t'), ('/robot/baro/p',), '/robot/imu/t', '/robot/baro/t'),
@@ -321,7 +320,7 @@ def test_movement_is_found_in_any_unit(rng, scale):
     accel[2000:3000] += 20e-3 * scale * rng.standard_normal((1000, 3))
     stillness = find_stillness(np.arange(1, 5001) * 10_000_000, accel)
     assert np.array(stillness.moving_ns) * 1e-9 == pytest.approx(np.array([[20.01, 30.01]]))
-    # A mean over 2 s at 100 Hz of samples with a noise of 0.1 % has a noise of 0.1 % / sqrt(200).
+    # Samples at 100 Hz have a noise of 0.1 %, so a mean over 2 s has a noise of 0.1 % / sqrt(200).
     assert stillness.magnitude == pytest.approx(scale, rel=3e-4)
     assert stillness.noise == pytest.approx(1e-3 * scale, rel=0.1)
     assert stillness.still_s == pytest.approx(40.0, abs=0.5)

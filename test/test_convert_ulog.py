@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""PX4 logs, written here by the public format description of ULog, are converted to bags."""
+"""PX4 logs, written here as the public format description of ULog states, become bags."""
 
 import struct
 
@@ -94,7 +94,7 @@ def test_each_imu_of_a_log_can_become_a_bag(flight, tmp_path, imu):
     recording = read_recording(tmp_path / 'bag.mcap')
     bag = recording.columns
     assert report.messages['accel'] == N
-    # A stamp is the time at which this IMU took the sample, not the time of publication.
+    # A stamp is the time at which the IMU took the sample, not the time of publication.
     expected_ns = (5_000_000 + np.arange(N) * STEP_US + imu) * 1000
     np.testing.assert_array_equal(bag.accel_stamp_ns, expected_ns)
     np.testing.assert_array_equal(bag.accel, truth['force'][imu])
@@ -221,7 +221,7 @@ def test_samples_compensated_by_px4_are_left_out(tmp_path, rng, begin):
     force = write_combined(path, rng, {'TC_A_ENABLE': 1 - begin}, TC_A_ENABLE=begin)
     read = read_autopilot(path)
     assert 'TC_A_ENABLE was 1 for 50 % of the samples' in read.chosen
-    # A changed parameter has the stamp of the message before it: skip the sample at the change.
+    # A parameter change has the stamp of the message before it, so skip the sample at the change.
     n = min(len(read.accel), N // 2) - 1
     part = slice(-n, None) if begin else slice(n)
     np.testing.assert_array_equal(read.accel[part], force[part])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""With all columns, blocks get the bits of single samples, and the claimed sd is right."""
+"""Corrections of blocks and of single samples have equal bits, and their claimed sd is right."""
 
 import math
 from dataclasses import replace
@@ -79,7 +79,7 @@ def run_of(rng, seconds=240, rate=4, swing_k=12.0):
 def test_blocks_corrected_with_all_columns_have_the_bits_of_single_samples(seed, chunk):
     rng = np.random.default_rng(seed)
     unit = full_bank(rng, posterior=True)
-    # Temperatures exceed the range (5 to 35 degC) and its continuation (-2.5 to 42.5 degC).
+    # Temperatures leave the range (5 to 35 degC) and its continuation (-2.5 to 42.5 degC).
     events = run_of(rng, seconds=30, swing_k=150.0)
     assert max(value for kind, _, value in events if kind == 'board') > 45.0
     rows, _, _ = builders.assert_equal_bits(unit, builders.UNCHECKED, events, chunk)
@@ -157,7 +157,7 @@ def test_corrections_drawn_from_the_posterior_scatter_by_the_claimed_sd(rng):
             # The covariance of n draws is uncertain by at most 8 % of the product of both sd.
             sds = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
             assert (np.abs(claimed - expected) < 0.33 * sds).all()
-            # Claimed variances equal those of the draws in all directions, so correlations agree.
+            # Claimed and drawn variances agree in any direction, so correlations agree, too.
             root = np.linalg.inv(np.linalg.cholesky(expected))
             assert np.abs(root @ claimed @ root.T - np.eye(3)).max() < 0.5
 

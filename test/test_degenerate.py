@@ -47,5 +47,5 @@ def test_the_message_of_a_refusal_names_its_cause(name, text, tmp_path, cli):
     failed = cli('fit', path, '--gravity', '9.81', '-o', tmp_path / 'out.yaml', code=1)
     (line,) = [text for text in failed.stderr.splitlines() if ': error: ' in text]
     assert text in line
-    # The message names a topic that the command has selected by its message type.
+    # The command has selected the topic by its message type, so the message names the topic.
     assert 'bag.mcap (/imu/data)' in line or name in {'stamps all zero', 'axes not orthogonal'}

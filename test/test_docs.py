@@ -20,7 +20,7 @@ pytestmark = pytest.mark.usefixtures('equal_fits_once', 'no_figures')
 
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))]
 TUTORIAL = ROOT / 'docs' / 'tutorial.ipynb'
-# Commands that other files test: `play` takes minutes, and `record` waits for 18 positions.
+# Other files test these commands: `play` takes minutes, `record` waits for 18 positions.
 ELSEWHERE = (
     'thermo_comp play bags/held_out.mcap --rate 20',
     'thermo_comp record session --positions 18 --soak 45min -o bags/unit42',
@@ -50,7 +50,7 @@ COMMANDS = commands()
 @pytest.mark.parametrize(('page', 'command', 'output'), COMMANDS, ids=[c for _, c, _ in COMMANDS])
 def test_a_command_on_a_page_gives_the_output_shown(page, command, output, desk):
     if '--install-completion' in command:
-        pytest.skip('writes into the home folder of the user')
+        pytest.skip('the command writes into the home folder of the user')
     finished = desk.run(command)
     if '--json' in command:
         assert parsed(finished.stdout)
@@ -61,7 +61,7 @@ def test_a_command_on_a_page_gives_the_output_shown(page, command, output, desk)
 def test_bash_accepts_the_completion_script():
     bash = shutil.which('bash')
     if bash is None:
-        pytest.skip('no bash')
+        pytest.skip('bash is not installed')
     # thermo_comp asks which shell started it; without the `:` bash would replace itself by Python.
     words = f'eval "$({sys.executable} -m thermo_comp --show-completion; :)"; complete'
     finished = ran(bash, '-c', words)
@@ -122,7 +122,6 @@ def test_messages_quoted_on_the_pages_are_in_the_source():
     quoted = re.findall(r'^\| `([^`]+)` \|', text, re.MULTILINE)
     assert len(quoted) > 10
     sources = ''.join(path.read_text() for path in (ROOT / 'thermo_comp').rglob('*.py'))
-    # Join adjacent string literals, which form one message.
     plain = re.sub(r"'\s+f?'", '', sources)
     for sentence in quoted:
         # Numbers and '...' stand for values at run time: compare the longest text between values.

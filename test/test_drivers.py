@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Commands that get a driver's file of config/drivers read bags with this driver's topics."""
+"""A command with a driver's file of config/drivers reads bags with the topics of this driver."""
 
 import csv
 import re
 
 import numpy as np
 import pytest
-from builders import axis_set, calibration, equal_axes, regime_set
+from builders import START_NS, axis_set, calibration, equal_axes, regime_set
 from conftest import ROOT, parsed
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -18,7 +18,6 @@ from thermo_comp.unit.calibration import Unit
 from thermo_comp.unit.calibration_file import save_calibration
 
 FILES = sorted((ROOT / 'config' / 'drivers').glob('*.yaml'))
-START_NS = 1_767_225_600 * 10**9
 IMU, TEMPERATURE = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/Temperature'
 MAGNETIC, VECTOR = 'sensor_msgs/msg/MagneticField', 'geometry_msgs/msg/Vector3Stamped'
 FLOAT, PRESSURE = 'std_msgs/msg/Float64', 'sensor_msgs/msg/FluidPressure'
@@ -31,7 +30,7 @@ OWN = {
     'float32 mean_temp\n',
     'microstrain_inertial_msgs/msg/MipHeader': 'std_msgs/Header header\nuint8 event_source\n',
 }
-#: Topics of each driver with their types (docs/drivers.md), and other topics in a bag.
+#: For each driver: its topics with their types (docs/drivers.md), and other topics of its bag.
 LAYOUTS = {
     'microstrain': {'/imu/data': IMU, '/mip/sensor/temperature_statistics': MIP},
     'xsens': {'/imu/data': IMU, '/temperature': TEMPERATURE, '/filter/free_acceleration': VECTOR,
@@ -52,16 +51,16 @@ LAYOUTS = {
     'realsense': {'/camera/camera/accel/sample': IMU, '/camera/camera/gyro/sample': IMU},
     'mpu6050': {'/imu': IMU},
 }  # fmt: skip
-#: Drivers whose bags are fitted: one for each type of temperature message, one without readings.
+#: Drivers whose bags are fitted: one per type of temperature message, and one without readings.
 FITTED = {'mavros', 'px4', 'phidgets', 'ardupilot'}
-# Drivers whose bag takes the longest time: they run in `make slow`.
+# The bags of these drivers take the longest time, so their tests run in `make slow`.
 SLOW = {'px4', 'phidgets'}
 #: Seven rests of REST_S [s]: six faces, the first again; the board warms by WARMING [K/s].
 UPS = np.concatenate((np.eye(3), -np.eye(3), [[1.0, 0.0, 0.0]]))
 RATE, REST_S, WARMING = 5, 75, 0.05
 SECONDS = len(UPS) * REST_S
 GRAVITY, MICRO_G = 9.80665, 9.80665e-6
-#: Bias [m/s^2], its slope [m/s^2/K], noise of a sample [m/s^2] (6 ug in means over 60 s).
+#: Bias [m/s^2], its slope [m/s^2/K], and noise of a sample [m/s^2], 6 ug in means over 60 s.
 BIAS, SLOPE, NOISE = np.array([0.05, -0.03, 0.08]), np.array([1e-3, -2e-3, 3e-3]), 1e-3
 
 
@@ -138,7 +137,7 @@ def test_every_command_reads_a_bag_with_the_topics_of_the_driver(path, bag, tmp_
     printed = cli('info', bag, *topics).stdout
     assert f'{SECONDS * RATE} samples of imu, {RATE} Hz' in printed
     assert f'{len(UPS)} still intervals' in printed
-    # `info` uses only the thermometers of the topics file, no other numbers of the messages.
+    # `info` lists the thermometers that the topics file names, and no other numbers of messages.
     assert re.findall(r'^(board|case) +1\.000 +(\S+) +(\S+)', printed, re.MULTILINE) == [
         (name, f'{20.0 - lag:.2f}', f'{46.2 - lag:.2f}')
         for name, lag in (('board', 0.0), ('case', 2.0))
@@ -152,7 +151,7 @@ def test_every_command_reads_a_bag_with_the_topics_of_the_driver(path, bag, tmp_
     if path.stem in FITTED:
         finished = cli('fit', bag, *topics, '-o', fitted, '--gravity', str(GRAVITY))
         assert ('the bags have no thermometer' in finished.stdout) == (not has_board)
-        # Noise of means over 60 s: 6 ug. Drift of raw samples: 26 K times 1 to 3 mm/s^2/K.
+        # Means over 60 s have 6 ug of noise; raw samples drift by 26 K times 1 to 3 mm/s^2/K.
         judged = parsed(cli('evaluate', bag, '-c', fitted, *topics, '--json', code=None).stdout)
         left = judged['sections_m_s2']['all']['rms'] / MICRO_G
         assert left < 10.0 if has_board else 500.0 < left < 2500.0
@@ -192,7 +191,7 @@ def test_the_node_uses_the_topics_of_the_driver_s_file(path, tmp_path, peer):
         topics = {topic.partition(':')[0] for name, topic in names.items() if name != 'output'}
         board, _, field = names['board'].partition(':')
         if field:
-            # The driver's message package is not installed, so `LiveField` must refuse the topic.
+            # The driver's message package is not installed: `LiveField` must refuse the topic.
             assert topics - {board} <= heard_topics
             with pytest.raises(ThermoCompError, match=f'{board}: its type .* is not installed'):
                 LiveField(board, layout[board], field)

@@ -41,7 +41,6 @@ def cubic():
 
 @pytest.mark.parametrize('to', get_args(Tool))
 def test_a_serial_with_line_breaks_adds_no_line_to_an_export(cubic, to):
-    # WHY: a serial with a line break added a parameter to the parameter file of a vehicle.
     assert get_args(Tool) == tuple(TOOLS)
     clean = export_calibration(cubic, to).text
     unit = replace(cubic.unit)
@@ -112,7 +111,7 @@ def test_the_bias_of_a_gyroscope_is_exported_and_imported(cubic):
     px4 = export_calibration(unit, 'px4')
     value = numbers(px4.text, '\t')
     assert value['TC_G_ENABLE'] == 1.0
-    # PX4 subtracts X0 + X1 d + X2 d^2 + X3 d^3 from angular rates [rad/s]; d: temperature - TREF.
+    # PX4 subtracts X0 + X1 d + X2 d^2 + X3 d^3 [rad/s], with d = temperature - TREF.
     d = celsius[2] - value['TC_G0_TREF']
     for axis in range(3):
         bias = sum(value[f'TC_G0_X{power}_{axis}'] * d**power for power in range(4))
@@ -125,7 +124,7 @@ def test_the_bias_of_a_gyroscope_is_exported_and_imported(cubic):
     assert 'angular rate' not in ' '.join(px4.notes)
     ardupilot = export_calibration(unit, 'ardupilot', number=2).text
     assert 'INS_TCAL2_GYR1_X' in ardupilot
-    # ArduPilot stores the bias at CALTEMP as another parameter, so its cubic is 0 at CALTEMP.
+    # ArduPilot stores the bias at CALTEMP in another parameter, so its cubic is 0 at CALTEMP.
     found = again(f'{ardupilot}INS_GYR2_CALTEMP,{celsius[3]}\n')
     np.testing.assert_allclose(found, true - true[3], atol=1e-9)
     zeros = re.sub(r'(GYR\d_.),.*', r'\1,0', ardupilot)
@@ -159,8 +158,7 @@ def test_px4_offsets_are_in_m_s2_and_contain_scale_errors_in_a_stated_attitude(c
     assert any('the driver must divide counts by K' in note for note in ours.notes)
     for name, value in numbers(expected.text, '\t').items():
         assert numbers(ours.text, '\t')[name] == pytest.approx(value, rel=1e-8, abs=1e-12)
-    # WHY: PX4 subtracts the offset from readings that it takes as m/s^2. The offset for a stated
-    # attitude must contain the effect of the scale error.
+    # WHY: PX4 subtracts offsets in m/s^2; for a stated attitude they must contain the scale error.
     scaled = replace(cubic, axes=axes_of(0.995, (0.1, -0.2, 0.3)))
     plain = export_calibration(scaled, 'px4')
     for name, value in numbers(expected.text, '\t').items():
@@ -169,7 +167,6 @@ def test_px4_offsets_are_in_m_s2_and_contain_scale_errors_in_a_stated_attitude(c
     up = (0.6, 0.0, 0.8)
     level = numbers(export_calibration(scaled, 'px4', up=up).text, '\t')
     for axis in range(3):
-        # In the attitude `up` at the reference temperature, reading - offset must be gravity.
         d = 20.0 - level['TC_A0_TREF']
         reading = 0.995 * 9.81 * up[axis] + (0.1, -0.2, 0.3)[axis]
         offset = sum(level[f'TC_A0_X{power}_{axis}'] * d**power for power in range(4))
@@ -286,7 +283,7 @@ def test_formulas_of_imu_tk_imu_calib_and_kalibr_give_the_correction_of_the_cali
     assert np.all(np.tril(T, -1) == 0.0)
     assert np.count_nonzero(K - np.diag(np.diag(K))) == 0
     theirs = (RAW - numbers[18:]) @ (T @ K).T
-    # The export notes state roll, pitch, yaw rounded to 1e-6 rad: an error of 1e-6 * 90 m/s^2.
+    # The notes round roll, pitch and yaw to 1e-6 rad, which is an error of 1e-6 * 90 m/s^2.
     np.testing.assert_allclose(theirs, ours(tumbled, RAW) @ turn(file.notes).T, atol=1e-4)
     norms, expected = (np.linalg.norm(force, axis=1) for force in (theirs, ours(tumbled, RAW)))
     np.testing.assert_allclose(norms, expected, rtol=1e-12)
@@ -312,7 +309,7 @@ def test_constants_are_unchanged_by_export_and_import(tumbled, to):
 
 
 def test_imported_matrices_become_a_triangular_matrix_and_a_rotation():
-    # The text is a file that imu_tk wrote; `theirs` is the formula of imu_tk, written by hand.
+    # The text was written by imu_tk; `theirs` is imu_tk's formula, written by hand.
     text = (
         '          1 -0.00354989 -0.00890444\n          0           1 -0.0213032\n'
         '          0           0           1\n\n'

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A full disk or a kill leaves no partial file as the output of a command except `record`."""
+"""A full disk or a kill leaves no partial output file, except for the bag of `record`."""
 
 import os
 import re
@@ -19,11 +19,11 @@ from thermo_comp.recording.reader import read_recording
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.unit.calibration_file import save_calibration
 
-#: Bags in the working folder, whose fit takes 0.5 s.
+#: The fit of these two bags takes 0.5 s.
 FIT = ('bags/01.mcap', 'bags/02.mcap')
 HELD_OUT = ROOT / 'bags' / 'held_out.mcap'
 GRAVITY = ('--gravity', '9.80665', '--model', 'golovach')
-#: For each output the arguments of its command before the path of the output.
+#: Arguments of the command that writes each output, up to the path of the output.
 COMMANDS = {
     'unit.yaml': ('fit', *FIT, *GRAVITY, '-f', '-o'),
     'page.html': ('report', '-c', 'unit.yaml', '-f', '-o'),
@@ -84,7 +84,6 @@ def test_a_recording_on_a_full_disk_keeps_what_was_written(small_disk, cli):
 
 @pytest.mark.parametrize('name', COMMANDS)
 def test_output_into_a_read_only_folder_fails_in_one_line(folder, cli, name):
-    # Not even root can write in /proc.
     locked = folder / 'locked' if os.geteuid() else Path('/proc')
     locked.mkdir(mode=0o500, exist_ok=True)
     finished = cli(*COMMANDS[name], locked / name, code=1, cwd=folder)
@@ -92,7 +91,7 @@ def test_output_into_a_read_only_folder_fails_in_one_line(folder, cli, name):
     assert line.startswith(f'thermo_comp: error: {locked / name}: ')
 
 
-#: A script that runs a command and kills itself while it writes, or before the final rename.
+#: This script runs a command, and kills itself during a write or before the final rename.
 KILLED = """
 import os, signal, sys
 point, target = sys.argv[1:3]
@@ -116,7 +115,6 @@ sys.exit(main())
 
 
 def killed_replay(script, point, name, folder):
-    """Run a script that replays the bag HELD_OUT into `folder`/`name` and kills itself."""
     arguments = [str(word) for word in COMMANDS['bag.mcap']]
     command = [sys.executable, '-c', script, point, name, *arguments, name]
     environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
@@ -140,7 +138,6 @@ def test_a_killed_command_leaves_the_old_file(folder, point):
 
 @pytest.mark.parametrize('name', ['bag.mcap', 'rows.csv'])
 def test_a_command_ended_by_sigterm_leaves_no_file(folder, name):
-    # WHY: a command that was ended by SIGTERM left a hidden file as large as the bag.
     listed = set(folder.iterdir())
     ended = killed_replay(KILLED.replace('SIGKILL', 'SIGTERM'), 'writing', name, folder)
     assert (ended.returncode, ended.stderr) == (143, b'')

@@ -33,19 +33,18 @@ def test_every_published_error_is_below_five_claimed_sd(inject):
     sd = np.sqrt(table[:, [3, 6, 8]])
     off = (np.abs(table[:, :3] - rig.force_at(seconds)) / sd).max(axis=1)
     assert seconds[off > rig.SIGMAS].tolist() == []
-    # The published sd covers a fault only while the fault lasts: before the fault it is small.
+    # The published sd is large only while the fault lasts: before the fault it is small.
     assert sd[450:540].max() < 3e-4
 
 
 def settling_s():
-    """Return the time from the end of a ramp to the end of the dynamic regime [s]."""
     detector = rig.unit().detector
     ramp = 60.0 * rig.RAMP_K_S
     return rig.BOARD_LAG_S * math.log(ramp / detector.relaxed_rate_k_min) + detector.dwell_s
 
 
 def ended_s(row):
-    """Return the time [s] from which the messages of a fault row equal those without the fault."""
+    """Return the time [s] from which a row's messages equal those of the bag without the fault."""
     at, _ = row.shift
     if math.isfinite(at):
         return at

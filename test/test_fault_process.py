@@ -37,7 +37,6 @@ def node(path):
 
 
 def sigmas(heard):
-    """Return the largest ratio (error of a received force) / (claimed sd of this force)."""
     seconds = (heard.stamp_ns - START_NS) * 1e-9
     return ratios_to_sd(heard.force, heard.covariance, seconds).max()
 
@@ -68,7 +67,7 @@ def test_a_node_killed_in_a_ramp_restarts_with_larger_covariance(path):
         assert (first.values['regime'], first.values['memory settled']) == ('unknown', 'False')
         rest = node.play([e for e in events if seconds_of(e[1]) >= 91.0])
     n = len(first.force)
-    # Unknown lag states after a start make the covariance larger than without a restart.
+    # After a start lag states are unknown, so the covariance is larger than without a restart.
     at = round(90.0 * RATE_HZ)
     assert (first.covariance[:, 0, 0] > 4.0 * undisturbed[at : at + n, 3].max()).all()
     assert max(sigmas(first), sigmas(rest)) < SIGMAS
@@ -95,7 +94,7 @@ def unreadable(path):
     if os.geteuid():
         path.chmod(0)
     else:
-        # Root can open any file, but nobody can read the first byte of /proc/self/mem.
+        # Root can open any file, but not even root can read the first byte of /proc/self/mem.
         path.unlink()
         path.symlink_to('/proc/self/mem')
 
@@ -155,7 +154,7 @@ def test_bad_calibration_files_leave_the_running_calibration(path, tmp_path):
 def test_many_reloads_at_1_khz_lose_no_sample(tmp_path):
     path = tmp_path / 'fast.yaml'
     save_calibration(unit(unit=Unit('F-1', 'counts', 8388607.0, 1e-3)), path)
-    # Sending ends at the answer to the last reload, before all 60 s of samples have been sent.
+    # The test stops sending at the answer to the last reload, before the end of the 60 s.
     events = bag(rate_hz=1000.0, duration_s=60.0)
     n_reloads = 100
     with bench(path) as node:
@@ -185,7 +184,7 @@ def test_many_reloads_at_1_khz_lose_no_sample(tmp_path):
     assert len(answers) >= n_reloads
     assert all(answers)
     assert len(heard.force) == n_samples
-    # By noise one sample in a million exceeds 5 sd; there are many samples, so the limit is 6 sd.
+    # One sample in a million has an error above 5 sd by noise alone; for all samples 6 sd suffice.
     assert sigmas(heard) < SIGMAS + 1.0
 
 
@@ -208,7 +207,7 @@ def test_the_slope_of_the_soak_benchmark_has_the_claimed_standard_error(rng):
     # `slope` leaves out the first 10 % of the run, here 360 s.
     values[:300] += 50.0
     slope, sd = soak.slope(list(zip(time.tolist(), values.tolist(), strict=True)), 60.0)
-    # Sd of the slope: sd of a mean over 60 s / sqrt(sum of (t - mean t)^2 of the 54 means).
+    # Expected sd: sd of a mean over 60 s / sqrt(sum of (t - mean t)^2) over the 54 means.
     assert sd == pytest.approx(1.0 / 60**0.5 / (54 * 0.9**2 / 12) ** 0.5, rel=0.3)
     assert abs(slope - 7.0) < 4.0 * sd
     assert soak.slope([(0.0, 1.0), (1.0, 1.0)], 60.0) is None

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The outputs for all rows of the fault table agree with the truth, for some also over DDS."""
+"""The output agrees with the truth for each row of the fault table, for some also over DDS."""
 
 from copy import deepcopy
 from dataclasses import asdict, fields
@@ -21,14 +21,14 @@ from thermo_comp.ros.diagnostics import findings_of
 from thermo_comp.ros.reader import LoadedCalibration
 from thermo_comp.unit.calibration_file import save_calibration
 
-#: After recovery the output differs from the undisturbed output by at most 1 ug [m/s^2].
+#: After recovery the output differs by at most 1 ug [m/s^2] from the output without the fault.
 RECOVERED = 9.80665e-6
-#: Rows of the fault table that are also tested over DDS: they depend on the order of messages.
+#: These rows of the fault table depend on the order of messages, so they also run over DDS.
 OVER_DDS = (
     *('board late by 5 s', 'counts out of order'),
     *('time jumps back', 'temperatures of another clock'),
 )
-#: Slow tests: case faults that are also tested on the board thermometer; further time jumps.
+#: Slow tests: faults of the case that the board's tests cover, and further jumps of time.
 SLOW = {
     *('case twice', 'case in whole degrees', 'case is NaN', 'case is infinite'),
     *('case jumps by 40 K and stays', 'case out of order', 'case late by 5 s'),
@@ -40,7 +40,7 @@ CASES = [
 
 
 class Direct:
-    """A compensator that gets groups of messages without DDS, with the diagnostics of the node."""
+    """A compensator with the node's diagnostics, which gets lots of messages without DDS."""
 
     def __init__(self):
         self.compensator = Compensator(unit(), CONFIG)
@@ -71,7 +71,7 @@ class Direct:
 
 @cache
 def undisturbed():
-    """Return the groups of messages of the bag without a fault, each with the state before it."""
+    """Return the lots of the bag without a fault, each with the compensator before it."""
     run, result = Direct(), []
     for lot in (*lots(bag()), []):
         result.append((lot, deepcopy(run)))
@@ -81,7 +81,7 @@ def undisturbed():
 
 
 def direct(events):
-    """Return the output for events; reuse the undisturbed run up to the first difference."""
+    """Return the output for events; up to the first difference it is taken from `undisturbed`."""
     given, known = list(lots(events)), undisturbed()
     n = next((k for k, lot in enumerate(given) if lot != known[k][0]), len(given))
     run = deepcopy(known[n][1])
@@ -91,7 +91,7 @@ def direct(events):
 
 
 def wrong(row, heard):
-    """Return times of wrong samples outside `blind`, the span in which a fault is undetectable."""
+    """Return the times of wrong samples outside `blind`, in which a fault is undetectable."""
     seconds = true_seconds(row, heard.stamp_ns)
     is_wrong = (ratios_to_sd(heard.force, heard.covariance, seconds) > SIGMAS).any(axis=1)
     begin, end = row.blind
@@ -135,7 +135,6 @@ def test_fault_rows_over_dds_give_the_samples_without_dds(tmp_path):
     assert len(rows) == len(OVER_DDS)
     with bench(tmp_path / 'unit.yaml') as node:
         for row in rows:
-            # All faults of the rows in OVER_DDS are reported within 130 s.
             events = row.inject(list(bag(duration_s=130.0)))
             heard, expected = node.play(events), direct(events)
             for name in ('stamp_ns', 'force', 'covariance'):

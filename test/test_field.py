@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Calibrations updated by rests agree with true parameters, a Kalman filter, closed forms."""
+"""Updates by rests agree with true parameters, with a Kalman filter and with closed formulas."""
 
 from dataclasses import replace
 
@@ -35,7 +35,7 @@ def test_derivatives_of_a_rest_by_all_parameters_agree_with_finite_differences()
     layout = parameter_layout(unit)
     levels = {level for block in layout.scale for level in (block.static, block.dynamic)}
     levels |= {block.static for block in layout.bias}
-    # Test half of the parameters. Blocks have odd lengths: each kind is tested in bias or scale.
+    # Test every second parameter: as blocks have odd lengths, bias or scale covers each kind.
     for k in range(0, layout.n_parameters, 2):
         step = 1e-7
         moved = values.copy()
@@ -62,7 +62,7 @@ def test_an_update_with_the_true_variances_equals_a_kalman_filter():
     series = series_of(history.rests, unit)
     best = field_units.BestFilter(process)
     for k in range(len(series)):
-        # The mean of the rests of row k of `series` is one measurement of the Kalman filter.
+        # The mean of the rests in row k of `series` is one measurement of the Kalman filter.
         first = int(series.n_windows[:k].sum())
         windows = [r for _, r in history.rests[first : first + int(series.n_windows[k])]]
         mean = np.mean([window.mean for window in windows], axis=0) / field_units.K
@@ -92,7 +92,7 @@ def test_an_update_with_the_true_variances_equals_a_kalman_filter():
 
 
 def test_updates_of_ageing_units_have_small_errors_of_at_most_1_4_claimed_sd_rms():
-    # Units in level and in carried platforms age by random walks, turn-on offsets and one shock.
+    # Units on level and on carried platforms age by random walks, turn-on offsets and one shock.
     squares, ratios = [], []
     for kind, seed in (('level', 1), ('level', 2), ('level', 4), ('carried', 1)):
         history = field_units.live(kind, seed, 30, field_units.Process(shock_day=11.5))
@@ -116,7 +116,7 @@ def test_updates_of_ageing_units_have_small_errors_of_at_most_1_4_claimed_sd_rms
         if kind == 'level':
             assert abs(updated.ageing.turn_on / (20 * MICRO_G) - 1.0) < 0.5
     before, left = np.sqrt(np.mean(np.square(squares), axis=0)) / MICRO_G
-    # A Kalman filter with the true variances leaves 12 to 14 ug RMS (benchmarks/field.py).
+    # A Kalman filter with the true variances has errors of 12 to 14 ug RMS (benchmarks/field.py).
     assert before > 100.0
     assert left < 30.0
     assert np.sqrt(np.mean(np.square(ratios))) < 1.4
@@ -129,7 +129,7 @@ def test_an_update_does_not_change_the_constants_of_axes_that_no_rest_observes()
     assert [axis.is_determined for axis in updated.axis_changes] == [False, False, True]
     assert (new.axes.x, new.axes.y) == (unit.axes.x, unit.axes.y)
     assert new.axes.z != unit.axes.z
-    # In one attitude a shock of the bias and a change of gravity cause equal changes of |f| - g.
+    # In one attitude a shock of the bias and a change of gravity change |f| - g alike.
     assert [change.may_be_gravity for change in updated.changes] == [True]
     assert 'or gravity changed' in ' '.join(change_texts(updated))
     assert updated.axis_changes[2].reading == pytest.approx(300.0 * MICRO_G, abs=15.0 * MICRO_G)
@@ -158,20 +158,19 @@ def test_the_sd_of_an_old_calibration_aged_to_the_last_rest_includes_the_random_
     walk = np.cumsum(60.0 / np.sqrt(3.0) * MICRO_G * rng.standard_normal((90, 3)), axis=0)
     logged = rests(unit, upright, lambda day: walk[round(3 * day)], 30)
     x, y, z = update(series_of(logged, unit), unit).axis_changes
-    # The bias of x has an sd of 10 ug; at 1 g bias and scale of z have an sd of 10 ug each.
+    # The bias sd of x is 10 ug; at 1 g the bias and the scale of z each contribute 10 ug.
     residual = unit.static.x.residual_sd_m_s2
     assert x.claimed_sd == pytest.approx(np.hypot(10.0 * MICRO_G, residual), rel=0.01)
     assert z.claimed_sd == pytest.approx(np.hypot(np.sqrt(200.0) * MICRO_G, residual), rel=0.01)
-    # Rests in one attitude do not separate bias and scale: the ageing model attributes half to all
-    # of the variance of the random walk to the biases of x and y.
+    # The ageing model gives half to all of the random walk's variance to the biases of x and y.
     for axis in (x, y):
         assert 0.5 < axis.present_sd / (329.0 * MICRO_G) < 1.5
-    # At the last rest the force sd of z must equal |random walk of z| within two turn-on sd.
+    # At the last rest the force sd of z is |random walk of z|, within two sd of turn-ons.
     assert z.present_sd == pytest.approx(abs(walk[-1, 2]), abs=40.0 * MICRO_G)
 
 
 def stepped(history, size, day):
-    """Scale the means of rests as if from `day` on gravity were `size` [m/s^2] larger."""
+    """Change the means of rests as if gravity grew by `size` [m/s^2] on `day`."""
     return [
         (s, replace(r, mean=tuple(np.array(r.mean) * (1.0 + size / field_units.G * (d >= day)))))
         for (s, r), d in zip(history.rests, history.day, strict=True)
@@ -187,7 +186,7 @@ def test_a_change_of_gravity_is_not_taken_for_a_change_of_three_scales(day):
     result = update(series_of(stepped(history, size, day), unit), unit)
     ((change, found, sd),) = result.solution.gravity
     assert change.time - field_units.DAY_ZERO == pytest.approx(day + 0.4, abs=0.5)
-    # Random walks of the scales (10 ppm per root day) limit how well the gravity step is known.
+    # The gravity step is found only as well as the random walks of the scales permit.
     assert abs(found - size) < 4.0 * sd < 60.0 * MICRO_G
     for before, after in zip(aged.axis_changes, result.axis_changes, strict=True):
         assert after.scale == pytest.approx(before.scale, abs=30e-6)
@@ -215,7 +214,7 @@ def test_ageing_is_not_taken_for_a_change_of_gravity_or_of_the_unit(kind):
 
 @pytest.mark.parametrize('first', [0, 10])
 def test_samples_of_another_unit_are_refused(first):
-    # The scales of the second unit differ by 1 to 2 %, its biases by 0.3 to 1.4 mg.
+    # The second unit's scales differ by 1 to 2 %, and its biases by 0.3 to 1.4 mg.
     unit = field_units.calibration()
     history = field_units.live('carried', 3, 20, field_units.Process())
     mixed = [
@@ -268,7 +267,7 @@ def test_a_contradicting_turn_on_is_left_out_and_stamps_may_be_in_wrong_order(rn
 
 
 def test_a_wrong_clock_at_the_start_of_the_node_does_not_change_the_update(tmp_path, rng):
-    # Sample stamps are right; start times of no, of all or of only the last start are wrong.
+    # The stamps of samples are right; the time of no start, all starts or the last start is wrong.
     unit = precise()
     logged = rests(unit, upright, jump_of(300.0, 10.0))
     image = {start.start_ns: int(1.6e18 + 5e8 * rng.standard_normal()) for start, _ in logged}
@@ -362,7 +361,7 @@ def with_shares(logged, share):
 
 
 def test_derivatives_of_a_rest_by_initial_lag_states_agree_with_finite_differences():
-    # At a turn-on the states of lags are unknown; expected derivatives: finite differences of |f|.
+    # The derivatives of |f| by lag states, unknown after a turn-on, equal finite differences.
     unit, share, step = rich_calibration(), 0.6, 1e-4
     logged = with_shares(rests(unit, in_any_attitude, no_error, days=4, rate=0.5 / 60.0), share)
     series, layout = series_of(logged, unit), StateLayout(Correction(unit).memory)
@@ -392,8 +391,8 @@ def test_an_unknown_regime_after_a_turn_on_does_not_increase_the_noise_of_a_rest
 @pytest.mark.parametrize('lags', [pytest.param(0.0, marks=pytest.mark.slow), 1.0])
 def test_unknown_initial_lag_states_are_not_taken_for_scatter_of_rests(rng, lags):
     # A turn-on has three rests, in which 100, 70 and 40 % of the initial lag states remain. Random
-    # walks grow by 15 ug (bias) and 10 ug (scale, at 1 g) per root day; sd of turn-ons: 20 ug, of
-    # rests: 3 ug, of initial lag states: `lags` times the assumed sd (40 to 100 ug).
+    # walks grow by 15 ug (bias) and 10 ug (scale, at 1 g) per root day. The sd of turn-ons is 20
+    # ug, of rests 3 ug, of initial lag states `lags` times the assumed 40 to 100 ug.
     unit = rich_calibration()
     each = series_of(with_shares(rests(unit, in_any_attitude, no_error, days=60), 1.0), unit)
     n, names = len(each), [k for k, v in vars(each).items() if isinstance(v, np.ndarray)]
@@ -409,7 +408,7 @@ def test_unknown_initial_lag_states_are_not_taken_for_scatter_of_rests(rng, lags
     residual += np.sqrt(series.noise + (3.0 * MICRO_G) ** 2) * rng.standard_normal(3 * n)
     ageing, _, used = learn(replace(series, residual=residual), unit, float(series.time[0]))
     assert len(used) == 3 * n
-    # In six simulations the estimated sd scattered by 20 % (bias), 30 % (scale), 15 % (turn-on).
+    # The estimates of six simulations scattered by 20 % (bias), 30 % (scale) and 15 % (turn-on).
     assert ageing.bias == pytest.approx(15.0 * MICRO_G, rel=0.5)
     assert ageing.scale == pytest.approx(10.0 * MICRO_G, rel=0.7)
     assert ageing.turn_on == pytest.approx(20.0 * MICRO_G, rel=0.35)

@@ -164,7 +164,7 @@ def test_a_bag_with_a_message_type_of_the_driver_is_read(tmp_path, store, storag
     recording = read_recording(tmp_path / 'bag', Topics.named(names))
     assert 'readings of board, case have no stamp' in str(recording.info.chosen)
     board, case = (recording.columns.temperatures[name] for name in ('board', 'case'))
-    # A reading without a stamp gets the last sample's stamp; before any sample it is left out.
+    # A reading without a stamp gets the stamp of the last sample; before any sample it is omitted.
     assert board.celsius.tolist() == celsius[1:]
     assert board.stamp_ns.tolist() == [START_NS + (row - 1) * 10**7 for row in range(5, 50, 5)]
     assert case.celsius.tolist() == [celsiu - 1.0 for celsiu in celsius]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""No output of a command replaces an input or a file of another kind, or ignores the umask."""
+"""A command never replaces an input or a file of another kind, and respects the umask."""
 
 import os
 import stat
@@ -21,7 +21,6 @@ FILES = (files.CALIBRATION, files.PAGE, files.PARAMETERS, files.PARQUET, files.M
 
 @pytest.fixture
 def folder(tmp_path):
-    """Return a folder with bags of each kind, a calibration, and links to them."""
     save_calibration(calibration(), tmp_path / 'unit.yaml')
     bag(tmp_path / 'raw.mcap')
     bag(tmp_path / 'raw')
@@ -114,7 +113,7 @@ def test_of_eight_simultaneous_writers_one_writes_the_output(
     def refuse(*_):
         raise PermissionError
 
-    if not has_links:  # as on FAT
+    if not has_links:  # FAT has no links
         monkeypatch.setattr(os, 'link', refuse)
     start = threading.Barrier(8)
     won = []
@@ -157,7 +156,6 @@ def test_permissions_of_an_output_follow_the_umask(folder, cli, mask):
     for name in ('private.yaml', 'private.mcap', 'private/private_0.mcap'):
         assert stat.S_IMODE((folder / name).stat().st_mode) == 0o666 & ~mask, name
     assert stat.S_IMODE((folder / 'private').stat().st_mode) == 0o777 & ~mask
-    # A file that is replaced keeps its permissions.
     (folder / 'private.yaml').chmod(0o640)
     save_calibration(calibration(), folder / 'private.yaml')
     assert stat.S_IMODE((folder / 'private.yaml').stat().st_mode) == 0o640
@@ -167,7 +165,7 @@ def test_an_output_that_is_a_link_is_written_to_the_target_of_the_link(tmp_path)
     (tmp_path / 'store').mkdir()
     link = tmp_path / 'current.yaml'
     link.symlink_to('store/unit.yaml')
-    for overwrite in (False, True):  # in the first pass the link has no target
+    for overwrite in (False, True):  # the link has no target in the first pass
         save_calibration(calibration(), link, overwrite=overwrite)
         assert link.is_symlink()
         assert not (tmp_path / 'store' / 'unit.yaml').is_symlink()

@@ -25,7 +25,7 @@ from thermo_comp.fitting.refit_checks import in_pieces, of_whole_rests
 
 G = 9.80665
 MICRO_G = 1e-6 * G
-KNEE_C, SLOPE = 21.3, 20.0  # [degC], [ug/K]
+KNEE_C, SLOPE = 21.3, 20.0  # temperature of the knee [degC], slope above it [ug/K]
 BIAS = 1e-3 * G
 #: Noise of a sample [m/s^2], which gives 0.4 ug in means over 60 s at 0.5 Hz.
 NOISE = 2.0 * MICRO_G
@@ -36,7 +36,7 @@ UPS = np.array(
 
 
 def recording(up, rng, slope=None):
-    """Simulate two hours from 10 to 32 to 12 degC: times [s], samples [m/s^2], board [degC]."""
+    """Simulate 10 to 32 to 12 degC in two hours: times [s], samples [m/s^2], board [degC]."""
     time_s = np.arange(0.0, 7200.0, 2.0)
     board = np.interp(time_s, (0.0, 600.0, 3600.0, 7200.0), (10.0, 10.0, 32.0, 12.0))
     bias = (SLOPE if slope is None else slope) * MICRO_G * np.maximum(board - KNEE_C, 0.0)
@@ -51,7 +51,7 @@ def columns(recorded, name, thermometers=('board',)):
 
 
 def left_by(groups):
-    """Fit groups of columns; return unit and RMS error of 60 s means in a held-out bag [ug]."""
+    """Fit groups of columns; return the unit, and the RMS of 60 s means in a held-out bag [ug]."""
     rng = np.random.default_rng(8)
     bags = [columns(recording(up, rng), f'rest{k}') for k, up in enumerate(UPS)]
     unit = tc.fit(bags, gravity=G, input='m/s^2', groups=groups, mounting_sd=1e-7)
@@ -68,9 +68,9 @@ def test_a_knee_in_the_curve_of_the_bias_is_found_only_if_there_is_one(monkeypat
     knees = [term.knee_k for term in unit.response if term.group == 'bend']
     # The fit tries knees every 1 K, and uses the two that are next to the true knee.
     assert min(abs(20.0 + knee - KNEE_C) for knee in knees) < 1.0
-    # Two knees 1 K apart around the true knee cause an error of up to 5 ug, in 1 K of the 22 K.
+    # Two knees 1 K apart around the true knee cause an error of up to 5 ug over 1 K of the 22 K.
     assert left < 1.5
-    # The bends of a part end at its highest temperature in the bags, whatever their knees.
+    # The bends of a part end at its highest temperature in the bags, whatever their knees are.
     bends = [term for term in unit.response if term.group == 'bend']
     ends = {(term.tau_s, round(term.range[1] + term.knee_k, 6)) for term in bends}
     assert len(ends) == len({term.tau_s for term in bends})
@@ -93,7 +93,7 @@ def test_a_thermometer_on_two_topics_is_used_once():
 
 
 def columns_of(slopes, shift=0.0):
-    """Simulate a position for each given bias slope [ug/K]; add `shift` [ug] to all biases."""
+    """Simulate a position for each bias slope [ug/K]; all biases are larger by `shift` [ug]."""
     rng = np.random.default_rng(10)
     bags = []
     for k, (up, slope) in enumerate(zip(UPS, slopes, strict=False)):
@@ -147,7 +147,7 @@ def test_an_update_in_one_attitude_keeps_the_bias_that_this_attitude_does_not_sh
 
 
 def sd_of_a_correction(unit):
-    """Return the claimed sd of the axes at the end of a recording [ug]."""
+    """Return the claimed sd of each axis at the end of a recording [ug]."""
     time_s, force, board = recording(UPS[0], np.random.default_rng(11))
     last = unit.correct(time_s[3::4], force[3::4], board=(time_s[::5], board[::5])).covariance[-1]
     return np.sqrt(np.diag(last)) / MICRO_G
@@ -170,14 +170,14 @@ def test_a_bag_of_another_environment_is_excluded_and_increases_the_claimed_sd()
     for unit in (joint, later):
         (note,) = [note for note in unit.provenance.notes if note.startswith('environment: r4')]
         assert 'did not use these data' in note
-        # The variance added because of bag r4 covers the bias error in r4, up to 1.1 mg.
+        # The variance that bag r4 adds covers the bias error in r4, which is up to 1.1 mg.
         more = sd_of_a_correction(unit) ** 2 - sd_of_a_correction(alone) ** 2
         assert 0.5 < true_error / np.sqrt(more.mean()) < 1.5
     again = tc.fit(columns_of([SLOPE] * 5)[-1:], gravity=G, input='m/s^2', prior=alone)
     assert not [note for note in again.provenance.notes if note.startswith('environment')]
 
 
-# `from thermo_comp.fitting import fit` gives the function of this name, not the module.
+# The name `fit` in `thermo_comp.fitting` is the function, so look up its module.
 fit_module = sys.modules['thermo_comp.fitting.fit']
 
 
@@ -191,7 +191,7 @@ def test_the_pieces_of_a_rest_contain_every_window_of_the_rest(n_minutes, window
         np.testing.assert_array_equal(*map(np.concatenate, both))
     assert sum(p.n_whole for p in pieces.intervals) == sum(r.n_whole for r in bag.intervals)
     hours = [len(piece.time) * bag.window_s / 3600.0 for piece in pieces.intervals]
-    # If a rest is divided, its pieces are as close to an hour as possible: 40 to 90 min.
+    # A long rest is divided into pieces of about an hour, 40 to 90 min.
     assert len(hours) == len(bag.intervals) or (min(hours) > 0.66 and max(hours) < 1.51)
     assert pieces.intervals[0].start_ns == bag.intervals[0].start_ns
     assert pieces.intervals[-1].end_ns == bag.intervals[-1].end_ns
@@ -217,7 +217,7 @@ def test_the_reports_of_the_pieces_of_a_rest_are_combined(rng):
     assert (alone.source, alone.start_ns) == ('b', rest.start_ns)
     assert alone.duration_s == whole.duration_s
     assert alone.left_out_rms == pytest.approx(40.0)
-    # WHY: the fit of a real recording, whose first rest had one sample, ended in a division by 0.
+    # WHY: if the first rest of a recording had one sample, the fit ended in a division by 0.
     single = replace(rest, end_ns=rest.start_ns, time=rest.time[:1])
     report = PositionReport('rest', rest.start_ns, 0.0, (0.0, 0.0, 1.0), 3.0, 30.0)
     assert of_whole_rests([report], [replace(bag, intervals=(single,))]) == (report,)
@@ -249,5 +249,5 @@ def test_slowly_tilting_supports_are_fitted_with_an_attitude_per_hour():
     calibration = strangers.fitted(study)
     assert any('may tilt from hour to hour' in note for note in calibration.provenance.notes)
     tests = {'': [minutes(bag) for bag in study.tests['']]}
-    # A position drifts by 42 ug RMS due to its tilt, the mean of twelve positions by 12 ug.
+    # The tilt of a position changes its force by 42 ug RMS, the mean of twelve by 12 ug.
     assert strangers.scored(study, calibration, tests)[''].vector < 12.0

@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fits to simulated units give the true parameters, also for even functions of a gradient."""
+"""Fits to simulated units give the true parameters, also for functions even in a gradient."""
 
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
-from builders import ArrayBlock, arrays_of, source_of
+from builders import FACES, ArrayBlock, arrays_of, source_of
 from scipy.signal import lfilter
 from triads import triad
 
@@ -27,7 +27,6 @@ from thermo_comp.unit.metrics import norm_residual, residual_statistics
 
 RATE_HZ = 4.0
 PROGRAM = parse_cyclogram('20 20min, 45@1.5 30min, 5@1.5 30min, 20@1.5 20min')
-FACES = np.vstack((np.eye(3), -np.eye(3)))
 
 
 def records_of(unit, ups, seed, program=PROGRAM):
@@ -60,7 +59,7 @@ def claimed(calibration):
     return sd[bias], sd[scale], sd[layout.misalignment :]
 
 
-# With a reading every 8 s fits are faster; in a ramp of 1.5 K/min readings differ by 0.2 K.
+# A reading every 8 s makes fits faster; in a ramp of 1.5 K/min readings differ by 0.2 K.
 OWN_LAGS, PAPER, PLAIN = (
     triad(name, 1).with_thermometers(rate_hz=0.125) for name in ('own-lags', 'paper', 'plain')
 )
@@ -86,7 +85,7 @@ def pulls(found, unit):
 
 @pytest.mark.slow
 def test_errors_of_fitted_constants_are_below_4_claimed_sd(response):
-    # The errors of the nine constants are correlated, so one may reach 4 claimed sd.
+    # The errors of the nine constants are correlated, so an error may reach 4 claimed sd.
     pull = pulls(response, OWN_LAGS)
     assert np.abs(pull).max() < 4.0
     assert np.sqrt(np.mean(pull**2)) < 2.0
@@ -125,7 +124,7 @@ def test_a_fit_has_all_positions_sources_sections_and_groups_and_leaves_only_noi
     assert [row.section for row in provenance.residuals] == ['static', 'dynamic', 'all']
     assert {finding.level for finding in response.findings} <= {'advice', 'good'}
     judged = {(group.part, group.group) for group in calibration.evidence}
-    # In the unit OWN_LAGS each axis depends on the temperature of a part that lags the board.
+    # Each axis of the unit OWN_LAGS depends on the temperature of a part that lags the board.
     assert {('bias', 'part'), ('scale', 'part')} <= judged
     # A response term whose weights are all 0 has only a covariance, and no entry in `evidence`.
     weighty = [term for term in calibration.response if any((*term.bias, *term.scale))]
@@ -145,7 +144,7 @@ def test_the_error_of_the_compensator_is_that_stated_by_the_fit(response):
     per_window = round(60.0 * RATE_HZ)
     n = len(after.index) // per_window
     force = after.specific_force[: n * per_window].reshape(n, per_window, 3).mean(axis=1)
-    # In the first 45 min the unknown initial lag states cause the largest errors.
+    # The largest errors, in the first 45 min, are caused by unknown initial lag states.
     rms = residual_statistics(norm_residual(force[45:], STANDARD_GRAVITY)).rms
     assert rms < 2.0 * response.residuals[-1].left_out.rms
     density = np.array(response.calibration.noise_density_m_s2_sqrt_hz)
@@ -157,8 +156,7 @@ def test_the_error_of_the_compensator_is_that_stated_by_the_fit(response):
 
 
 def test_slow_noise_for_an_unmodelled_drift_leaves_the_white_noise():
-    # WHY: the file stated a white noise of 0.3 instead of 5 ug/sqrt(Hz), so that no window of the
-    # node's check of |f| counted as still.
+    # WHY: the stated white noise was 0.3, not 5 ug/sqrt(Hz): the node's check of |f| saw no rest.
     paper = fitted(OWN_LAGS, positions(2, 1), 1, model='golovach')
     stated = np.array(paper.calibration.noise_density_m_s2_sqrt_hz) / MICRO_G
     np.testing.assert_allclose(stated, 5.0, rtol=0.4)
@@ -168,12 +166,11 @@ def test_six_faces_leave_misalignment_at_its_prior():
     result = fitted(PLAIN, FACES, 2, groups=('curve', 'set'), mounting_sd=1e-6 * STANDARD_GRAVITY)
     _, _, M = constants(result.calibration)
     _, scale_sd, M_sd = claimed(result.calibration)
-    # Six faces do not determine M, which keeps its prior mean 0 and sd 1 mrad.
     np.testing.assert_allclose(M, 0.0, atol=1e-5)
     np.testing.assert_allclose(M_sd, 1e-3, rtol=0.02)
     finding = next(finding for finding in result.findings if finding.name == 'misalignment')
     assert (finding.level, finding.message.startswith('6 positions')) == ('advice', True)
-    # Six faces determine bias and scale; M of 1 mrad causes relative errors of M^2 / 2.
+    # Six faces determine bias and scale; an unknown M of 1 mrad causes relative errors of M^2 / 2.
     assert scale_sd.max() < 2e-5
     assert np.abs(pulls(result, PLAIN)).max() < 4.0
 
@@ -185,7 +182,7 @@ def test_the_claimed_sd_of_nine_positions_includes_turn_on_offsets(rng):
     switched_on = [replace(record, counts=record.counts + by) for record, by in pairs]
     options = FitOptions(gravity=STANDARD_GRAVITY, groups=('curve', 'set'))
     found = fit(sources_of(switched_on), options)
-    # The prior sd of turn-ons is some 50 ug. Nine normal errors exceed 1.55 RMS with p = 1 %.
+    # The prior sd of turn-ons is some 50 ug; nine normal errors exceed 1.55 RMS with p = 1 %.
     assert np.sqrt(np.mean(pulls(found, PLAIN) ** 2)) < 1.55
 
 
@@ -225,7 +222,7 @@ def faces_of(samples):
 
 @pytest.mark.parametrize('n_averaged', [0, 1, 4000])
 def test_counts_of_24_bits_that_a_driver_averages_are_fitted(n_averaged, rng):
-    # WHY: with one fractional sample a full scale of 16 bits was assumed for all samples.
+    # WHY: if one sample was not a whole number, the fit assumed a full scale of 16 bits.
     def counts(up):
         whole = np.rint(4e5 * (up + 1e-3 * rng.standard_normal((4000, 3))))
         whole[:n_averaged] += 0.25
@@ -261,7 +258,7 @@ def lagged(values, tau):
 
 
 def recorded(rng, up, name, targets):
-    """Simulate a bias that is even in (T_case - T_board) - (this difference in a soak)."""
+    """Simulate a bias that is even in T_case - T_board about its value in a soak."""
     corners = [(0.0, targets[0]), (900.0, targets[0])]
     for before, after in pairwise(targets):
         corners += [(corners[-1][0] + 60.0 * abs(after - before), after)]
@@ -280,7 +277,7 @@ def recorded(rng, up, name, targets):
     noise = 0.003 * rng.standard_normal((2, len(time)))
     board, case = np.round(np.stack((board, case)) + noise, 4)
     accel = force + bias * MICRO_G + NOISE * rng.standard_normal((len(time), 3))
-    # One reading in 10 s suffices for ramps of 1 K/min.
+    # A reading every 10 s suffices for ramps of 1 K/min.
     readings = (stamps[::5], board[::5], stamps[::5] + 1, case[::5])
     return source_of(stamps, accel, *readings, name=name)
 
@@ -290,7 +287,7 @@ def test_effects_even_about_the_rest_gradient_are_found(rng):
     programs = ((20.0, 35.0, 5.0, 20.0), (5.0, 25.0, 12.0), (35.0, 15.0, 30.0))
     bags = [recorded(rng, up, f'p{k}', programs[k % 3]) for k, up in enumerate(positions(4, 3))]
     reduced = [reduce_source(bag, full_scale=None) for bag in bags]
-    # Rates computed over 120 s cause most of the error of the gradient; noise adds only 0.1 mK.
+    # Most of the gradient's error is due to rates computed over 120 s; noise adds only 0.1 mK.
     assert abs(gradients_at_rest(reduced, ('case',))['case'] + OWN_HEAT_K) < 0.005
     groups = ('curve', 'gradient', 'board', 'gradient_even', 'gradient_even_about_rest')
     about_rest, about_0 = (
@@ -300,7 +297,7 @@ def test_effects_even_about_the_rest_gradient_are_found(rng):
     kept = {column.group for column in about_rest.calibration.response}
     assert 'gradient_even_about_rest' in kept
     assert 'gradient_even' not in kept
-    # The effect is even about T_case - T_board = -0.6 K; functions even about 0 K fit only part.
+    # The effect is even about -0.6 K of T_case - T_board; functions even about 0 K fit only part.
     floor = NOISE / np.sqrt(30.0)
     assert about_rest.residuals[-1].fitted.rms < 1.1 * floor
     assert about_0.residuals[-1].fitted.rms > 1.5 * floor
@@ -328,8 +325,7 @@ def test_a_named_group_without_columns_is_reported(rng):
 
 @pytest.mark.parametrize(('ratio', 'is_reported'), [(1.0, False), (1.0005, True)])
 def test_a_stated_norm_that_the_fit_ignores_is_reported(rng, ratio, is_reported):
-    # WHY: bags with a stated |f| of 9.8155 m/s^2 and gravity of 9.80665 m/s^2 gave scale factors
-    # with an error of 902 ppm, without a message.
+    # WHY: a stated |f| other than gravity gave scale factors with an error of 902 ppm, silently.
     known = KnownForce('stated', (Section(0.0, np.inf, ratio * STANDARD_GRAVITY, 0.0),))
     bags = [
         replace(recorded(rng, up, f'p{k}', (20.0, 30.0, 20.0)), force=known)

@@ -22,14 +22,14 @@ from thermo_comp.thermal.state import WEIGHT
 from thermo_comp.thermal.tracker import ThermalTracker
 from thermo_comp.unit.gravity import MICRO_G, STANDARD_GRAVITY
 
-#: Temperatures of a bag: soaks long enough for the board to settle.
+#: Chamber program of a bag; in its soaks the board settles.
 PROGRAM = parse_cyclogram('20 40min, 45@1.5 120min')
 #: Bias in the dynamic regime less bias in the static regime [m/s^2]; noise of a window: 2 ug.
 STEP = np.array([120.0, -80.0, 60.0]) * MICRO_G
 
 
 def weight(record, end_condition):
-    """Return each sample's weight of the dynamic curves, with the true detector settings."""
+    """Return the weight of the dynamic curves at each sample, with the true detector settings."""
     tracker = ThermalTracker(replace(DetectorSettings(), end_condition=end_condition))
     readings = sorted(
         (stamp, name, value)
@@ -40,7 +40,7 @@ def weight(record, end_condition):
         for stamp, value in zip(stamps.tolist(), values.tolist(), strict=True)
     )
     at, result = 0, []
-    # The weight of dynamic curves changes over 300 s, so every fourth sample (of 2 Hz) suffices.
+    # The weights change over 300 s, so every fourth sample (at 2 Hz) suffices.
     for stamp in record.accel_stamp_ns[::4].tolist():
         while at < len(readings) and readings[at][0] <= stamp:
             tracker.read(readings[at][1], readings[at][0], readings[at][2])
@@ -63,7 +63,7 @@ def test_the_evidence_selects_the_condition_that_ends_the_dynamic_regime(end_con
         records.append(replace(record, counts=record.counts + step))
     result = fit(sources_of(records), FitOptions(gravity=STANDARD_GRAVITY, **options))
     assert result.calibration.detector.end_condition == end_condition
-    # The detector settings are estimated, so regime switches differ slightly from the true ones.
+    # The estimated detector settings switch the regime at slightly different times.
     last = result.residuals[-1]
     assert last.fitted.rms < 0.35 * last.raw.rms
 
@@ -85,20 +85,20 @@ def test_products_and_determinant_equal_those_of_the_dense_matrix(rng, noise):
     series = rng.standard_normal((len(time), 5))
     whitener = Whitener(position, time)
     white = whitener.filter(series, weight, noise)
-    # The covariance of exponentially correlated noise in each position, and of white noise.
+    # Noise with exponential correlation in each position, plus white noise, has this covariance.
     distance = np.abs(time[:, None] - time)
     times_s = [noise.time_s * 10.0**k for k in range(noise.n_times)]
     slow = noise.ratio * sum(np.exp(-distance / time_s) for time_s in times_s)
     covariance = np.where(position[:, None] == position, slow, 0.0) + np.diag(1.0 / weight)
     expected = series.T @ np.linalg.solve(covariance, series)
-    # The tolerance allows for rounding at condition numbers of the covariance below 1e6.
+    # The tolerance allows for rounding, as condition numbers of the covariance are below 1e6.
     np.testing.assert_allclose(white.T @ white, expected, rtol=1e-9, atol=1e-10)
     determinant = np.linalg.slogdet(covariance)[1]
     assert whitener.log_determinant(weight, noise) == pytest.approx(determinant, abs=1e-9)
 
 
 def drawn(rng, n, steps, noise):
-    """Draw the noise of n positions on three axes: Gauss-Markov noise plus white noise."""
+    """Draw Gauss-Markov noise plus white noise of n positions on three axes."""
     time = np.cumsum(rng.uniform(20.0, 100.0, steps))
     weight = rng.uniform(0.3, 1.0, steps)
     slow = np.sqrt(noise.ratio) * rng.standard_normal((n, steps, 3))
@@ -116,10 +116,10 @@ def test_variance_ratio_and_correlation_time_are_estimated(rng, noise):
     fitted = whitener.estimate(5.0 * series, weight)
     assert 0.5 < fitted.ratio / noise.ratio < 2.0
     assert 0.5 < fitted.time_s / noise.time_s < 2.0
-    # Only correlation times up to a sixth of a position (at most 2000 s long) are tried.
+    # The search tries correlation times up to a sixth of a position, which lasts 2000 s at most.
     whitener, weight, series = drawn(rng, 12, 20, Noise(100.0, 1e5))
     assert 0.0 < whitener.estimate(series, weight).time_s <= 20.0 * 100.0 / 5.0
-    # In 1 % of all series of white noise a fit finds Gauss-Markov noise, but in none of these.
+    # Gauss-Markov noise is found in 1 % of all series of white noise, but in none of these.
     for _ in range(4):
         whitener, weight, series = drawn(rng, 5, 100, Noise())
         assert whitener.estimate(series, weight) == Noise()
@@ -131,7 +131,7 @@ MICRO = 9.80665e-6  # a micro-g [m/s^2]
 
 
 def score(drift, norms=(), by_thermometer=0.0, by_offsets=0.0):
-    """Return a score of equal left-out drifts `drift` and left-out |f| errors `norms` [ug]."""
+    """Return the score of drifts `drift` and errors of |f| `norms` on left-out data [ug]."""
     drifts = Folds(np.full(18, (drift * MICRO) ** 2), np.full(18, 20.0))
     of_norms = Folds((np.array(norms) * MICRO) ** 2, np.full(len(norms), 20.0))
     none = np.zeros((0, 3))
@@ -140,16 +140,14 @@ def score(drift, norms=(), by_thermometer=0.0, by_offsets=0.0):
 
 
 def test_neither_few_norms_nor_errors_of_a_coarse_thermometer_select_a_model():
-    # WHY: only four left-out |f| of a MEMS in six faces could be predicted with and without a
-    # curve; for these four the fit rejected the curve: the force error was 7 mg.
+    # WHY: only four left-out |f| of six faces were predicted, and these rejected a right curve.
     constants = score(20.0, [22.4, 457.7, 54.6, 26.1])
     curve = score(20.0, [16.8, 21.0, 22.5, 25.2])
     assert not is_better(constants, curve)
     assert is_undecided(constants, curve)
     assert not is_undecided(curve, constants)
     assert is_better(constants, score(20.0, [2.0, 40.0, 5.0, 2.0]))
-    # WHY: readings in steps of 1 K have equal errors in all bags of a temperature program: knees
-    # that fitted these errors doubled the drift error in other programs.
+    # WHY: knees fitted errors of readings in steps of 1 K, which are equal in all bags.
     by_thermometer = 49.0
     curve, parts, bends = (score(drift, (), by_thermometer) for drift in (120.0, 46.0, 20.0))
     assert is_better(curve, parts)
@@ -161,14 +159,13 @@ def test_neither_few_norms_nor_errors_of_a_coarse_thermometer_select_a_model():
 
 
 def test_left_out_norms_that_stated_offsets_explain_do_not_reject_a_model():
-    # WHY: with a stated mounting sd of 300 ug, random differences of left-out |f| rejected the
-    # lags of the parts, which lower the left-out drift from 9.4 ug to 1.0 ug.
+    # WHY: random differences of left-out |f| rejected lags that reduce the drift from 9.4 to 1 ug.
     norms = np.array([1016.0, 142.0, 1258.0, 244.0, 647.0, 467.0])
     for by_offsets, is_accepted in ((700.0, True), (300.0, False)):
         curve = score(9.4, norms, by_offsets=by_offsets)
         parts = score(1.0, norms * (1.6, 2.8, 1.2, 2.2, 1.3, 1.5), by_offsets=by_offsets)
         assert is_better(curve, parts) == is_accepted
-    # Equal drifts, and smaller |f| errors that offsets explain: no model is better.
+    # The drifts are equal and offsets explain the smaller |f| errors, so no model is better.
     assert not is_better(score(1.0, norms, by_offsets=700.0), score(1.0, 0.5 * norms))
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Refusals and advice of a fit on simulated tables, with the numbers in the messages."""
+"""Refusals and advice of a fit name the cause and the numbers of faults in simulated tables."""
 
 import re
 from contextlib import nullcontext
@@ -37,7 +37,7 @@ def findings_of(windows, up, *, has_case=True, prior=None):
 
 @pytest.fixture
 def good(rng):
-    """Make windows of 18 positions, each with a ramp up, a ramp down and a soak in 80 min."""
+    """Make windows of 18 positions, each with a ramp up, a ramp down and a soak, in 80 min."""
     data, up = table_of(Truth(), 18, rng)
     case = np.interp(data.time, [0.0, 1800.0, 3000.0, 3600.0], [5.0, 45.0, 5.0, 5.0])
     ends = [0.0, 1799.0, 1800.0, 3000.0, 3001.0]
@@ -62,14 +62,14 @@ def test_a_complete_thermal_test_gives_only_good_findings(good):
     ('name', 'changed', 'message'),
     [
         ('span', lambda w: {'temperature': 0.1 * w.temperature}, r'\(25 degC advised\): run the'),
-        # WHY: the readings given as those of the board were of a thermometer in the room.
+        # WHY: the thermometer given as the board's was in the room.
         ('span', lambda w: {'temperature': 0.01 * w.temperature}, 'is the thermometer on'),
         ('temperature', lambda w: {'temperature': 0.0 * w.temperature + 20.0},
          'no thermometer: the calibration holds at the temperature of the test'),
         ('ramps', lambda w: {'rate': 0.0 * w.rate}, 'no ramp'),
         ('directions', lambda w: {'rate': np.abs(w.rate)}, 'hardly any cooling was recorded'),
         ('soak', lambda w: {'weight': 0.0 * w.weight + 1.0}, 'only 0 % of the windows are static'),
-        # WHY: with soaks at one temperature the force error was 800 ug, the claimed sd 100 ug.
+        # WHY: after soaks at one temperature the force error was 800 ug, its claimed sd 100 ug.
         ('soak', lambda w: {'weight': 1.0 * (np.abs(w.temperature - 20.0) > 3.0)},
          r'% of the windows are static, over [56]\.\d K of the span of \d\d\.\d K'),
         ('swapped', lambda w: {'gradient': -w.gradient}, r'exchanged, or is the case thermometer'),
@@ -84,7 +84,6 @@ def test_missing_data_of_a_test_are_reported(good, name, changed, message):
 
 
 def test_exchanged_thermometers_in_one_bag_of_many_are_reported_with_its_name(good):
-    # WHY: with one exchanged bag of twelve, the fit took the mean of the two temperatures.
     windows, up = good
     data = replace(windows.data, bag=windows.data.position // 6)
     names = [f'{k // 6}.mcap' for k in range(18)]
@@ -96,7 +95,6 @@ def test_exchanged_thermometers_in_one_bag_of_many_are_reported_with_its_name(go
 
 
 def test_the_noise_of_soaks_is_not_taken_for_a_ramp_or_for_exchanged_sensors(good, rng):
-    # WHY: bags of soaks were refused: noise gave rates and gradients like exchanged thermometers.
     windows, up = good
     noise = rng.standard_normal(len(windows.rate))
     soaks = 5.0 + 15.0 * (windows.data.position % 3)
@@ -148,7 +146,7 @@ def test_six_faces_do_not_determine_the_misalignment(good):
 
 
 def test_geometry_is_the_largest_sd_of_nine_parameters_per_sd_of_the_norm(rng):
-    # Expected: sd of nine parameters fitted by least squares to values of |f| with an sd of 1.
+    # Expected is the sd of nine parameters fitted by least squares to |f| with an sd of 1.
     up = positions(12, 5)
     x, y, z = up.T
     jacobian = np.column_stack((x, y, z, x * x, y * y, z * z, x * y, x * z, y * z))
@@ -226,8 +224,7 @@ def test_options_out_of_range_are_refused(change, message):
 
 
 def test_the_gradient_of_a_soak_does_not_depend_on_the_ramps(good, rng):
-    # Self-heating makes the board 3 K warmer than the case. The board lags the case by 600 s in
-    # ramps, and by 1500 s at the beginning of a soak.
+    # The board is 3 K warmer than the case, and lags it by 600 s in ramps, 1500 s early in a soak.
     windows, _ = good
     t = windows.data.time
     rate = np.where(t < 3000.0, 1.0 / 60.0, 0.02 / 60.0 * np.exp(-(t - 3000.0) / 600.0))

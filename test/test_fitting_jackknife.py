@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The claimed sd covers effects that the model lacks, and agrees with a jackknife estimate."""
+"""The claimed sd includes effects that the model lacks, and agrees with jackknife estimates."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -43,7 +43,7 @@ def ratios_to_sd(seed, effect_sd):
 def test_the_claimed_sd_covers_effects_that_the_model_lacks(effect_sd):
     ratios = np.array([ratios_to_sd(seed, effect_sd) for seed in range(10)])
     of_fit, of_claim = np.sqrt(np.mean(ratios**2, axis=(0, 2, 3)))
-    # The RMS of 120 errors, which are correlated within an axis, has an error of about 15 %.
+    # The RMS of 120 errors, which are correlated within an axis, is uncertain by about 15 %.
     assert 0.7 < of_claim < 1.3
     if effect_sd:
         assert of_fit > 2.5
@@ -52,8 +52,7 @@ def test_the_claimed_sd_covers_effects_that_the_model_lacks(effect_sd):
 
 
 def test_three_attitudes_determine_their_norms_as_well_as_mountings_repeat(rng):
-    # WHY: three attitudes do not separate bias and scale; both differed by percents between fits
-    # with different mounting sds: the claimed sd of |f| was up to 10 times that of mounting means.
+    # WHY: for three attitudes the claimed sd of |f| was 10 times the sd of a mean over mountings.
     kappa, bias = np.array([1.03, 0.97, 1.02]), np.array([0.3, -0.2, 0.5])
     truth = fitting_truth.Truth(kappa, bias, offset_sd=2.0 * fitting_truth.MICRO)
     up = np.repeat(np.eye(3) + 0.02 * rng.standard_normal((3, 3)), 4, axis=0)
@@ -65,28 +64,27 @@ def test_three_attitudes_determine_their_norms_as_well_as_mountings_repeat(rng):
     claim = claim_of(Fit(windows, regression, SimpleNamespace(posterior=fitted, informative=())))
     along = regression.at(fitted.state, prior).norms_by_unit
     variance = np.einsum('ij,jk,ik->i', along, claim.covariance, along)
-    # Four mountings per attitude; the fitted sd of mounting offsets has an error of 25 %. The
-    # drifts, which share the axes' scale factors, correlate the three means.
+    # Each attitude has four mountings; the fitted sd of mounting offsets is uncertain by 25 %. The
+    # drifts depend on the scale factors of all axes, and so correlate the three means.
     assert (0.7 * claim.offset_sd / 2.0 < np.sqrt(variance)).all()
     assert (np.sqrt(variance) < 1.4 * claim.offset_sd / 2.0).all()
 
 
 def test_the_claimed_sd_covers_the_weight_of_a_column_that_the_model_lacks():
-    # WHY: after soaks a lag was claimed with the sd of its weight, which the data placed some sd
-    # from 0: errors of 4 claimed sd in ramps.
+    # WHY: after soaks a lag was claimed with the sd of its weight: 4 claimed sd of error in ramps.
     ratios = [ratios_without_a_column(3e-5, seed) for seed in range(6)]
-    # The prior sd of the weight is its sd by the data, so the bags prefer half of the weight: the
-    # ratio is 2 for a weight far above its sd. The RMS of 18 ratios has an error of some 5 %.
+    # The prior sd of the weight equals the sd by the data, so the fit prefers half of the weight:
+    # weight / claimed sd is 2 if the weight is large. The RMS of 18 ratios is uncertain by 5 %.
     assert 1.4 < np.sqrt(np.mean(np.square(ratios))) < 2.1
 
 
 def ratios_without_a_column(slope, seed):
-    """Return the weights of a column that the model lacks / their claimed sd; slope [m/s^2/K]."""
+    """Return weight / claimed sd of a column that the model lacks; `slope`: its size [m/s^2/K]."""
     truth, rng = fitting_truth.Truth(), np.random.default_rng(seed)
     is_curve = np.isin(fitting_truth.GROUPS, 'curve')
     truth = replace(truth, on_bias=truth.on_bias * is_curve, on_scale=truth.on_scale * is_curve)
     windows, up = fitting_truth.table_of(truth, 12, rng, n_windows=24)
-    # The data hardly separate the column from the curve: the sd of its weight is 3 sd of a window.
+    # Column and curve are nearly collinear: a weight of one sd is 3 sd of a window's noise.
     columns = windows.columns.copy()
     columns[:, 2] = columns[:, 0] + 0.3 * columns[:, 4]
     kelvins = windows.kelvins[0] * (np.arange(len(windows.kelvins)) == 2)
@@ -101,13 +99,13 @@ def ratios_without_a_column(slope, seed):
 
 
 def ratio(path):
-    """Fit one log; return the jackknife's sd over its positions divided by the claimed sd."""
+    """Fit one log; return the sd by a jackknife over its positions / the claimed sd."""
     accel = np.loadtxt(path, usecols=(0, 1, 2))
     stamps = np.arange(len(accel), dtype=np.int64) * 10_000_000
     options = FitOptions(gravity=STANDARD_GRAVITY, input='m/s^2')
     short = {'window_s': 1.0, 'cell_s': 0.2, 'min_rest_s': 1.0, 'fewest_windows': FEWEST_WINDOWS}
     whole = reduce_source(source_of(stamps, accel, name=path.stem), full_scale=None, **short)
-    # A jackknife cannot show the sd of turn-ons: each position is fitted as a separate recording.
+    # A jackknife cannot show the sd of turn-ons, so each position is given as a recording.
     result = fit_bags([replace(whole, intervals=[each]) for each in whole.intervals], options)
     posterior = result.fit.posterior
     calibration, data = result.calibration, result.fit.windows.data
@@ -135,5 +133,5 @@ def test_the_claimed_sd_agrees_with_a_jackknife(real_data):
     if not all(path.is_file() for path in logs):
         pytest.skip('the logs of the MPU-9150 units are not there')
     ratios = [ratio(path) for path in logs]
-    # A jackknife over about 20 positions determines sd with an error of about 15 %.
+    # A jackknife over about 20 positions determines an sd to 15 %.
     assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.4, ratios

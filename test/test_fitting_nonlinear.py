@@ -160,7 +160,7 @@ def test_a_force_given_by_the_user_overrides_the_force_in_the_bag(tmp_path):
         with BagWriter(tmp_path / f'{name}.mcap', metadata=metadata) as writer:
             writer.write_counts('accel/counts', stamps, rate)
             writer.write_counts('table/rate', stamps, rate)
-    # WHY: a bag name that begins with a digit, as those of `record`, was taken for a number.
+    # WHY: a bag name that begins with a digit, as `record` writes, was taken for a number.
     (tmp_path / 'table.txt').write_text('a.mcap 0 5 20\n02.mcap 0 5 25\n')
 
     def read(name, asked=ForceOptions()):  # noqa: B008
@@ -204,7 +204,7 @@ def test_a_constant_rotation_counts_as_a_rest_and_a_changing_rotation_does_not(r
     summed = accumulator.cells()
     still = still_intervals(without_rotation(summed), 3.0)
     edges = [(summed.time[a], summed.time[b - 1]) for a, b in still]
-    # The 10 s median follows a new angular rate 5 s late; 0.5 s beside a motion are left out.
+    # The median over 10 s follows a new rate 5 s late; 0.5 s next to a motion are left out.
     assert len(edges) == 3
     for (a, b), (begun, ended) in zip(edges, ((0, 80), (100, 180), (190, 240)), strict=True):
         assert begun <= a < begun + 8.0
@@ -246,7 +246,7 @@ def test_runs_of_a_centrifuge_determine_nonlinear_terms_that_a_later_fit_keeps()
     judged = judge_bags(result.bags, result.calibration)
     assert [round(size / G, 1) for size in judged.by_force] == [1.0, 3.2, 8.1]
     *_, most = judged.by_force.values()
-    # In means over 60 s noise and rounding are some ug, uncorrected nonlinear terms some 100 ug.
+    # In means over 60 s noise is some ug, and uncorrected nonlinear terms are some 100 ug.
     assert most.rms < 10.0 * MICRO < 100.0 * MICRO < most.raw_rms
     narrow = replace(result.calibration.nonlinearity, force_range_m_s2=(9.0, 5.0 * G))
     outside = judge_bags(result.bags, replace(result.calibration, nonlinearity=narrow))

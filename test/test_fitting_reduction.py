@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Samples are averaged over windows in rests; thermometer settings are estimated."""
+"""Samples in rests are averaged over windows; thermometer settings are estimated from readings."""
 
 from dataclasses import replace
 
@@ -48,12 +48,12 @@ def test_the_reduction_does_not_depend_on_blocks_or_on_the_origin_of_time(rng):
     whole = block(np.rint(still(rng, 61.0, (10.0, -3000.0, 50.0))))
     at_once = reduced([whole])
     for n_parts in (2, 7, 50):
-        *columns, _ = vars(whole).values()  # all but `imu`
+        *columns, _ = vars(whole).values()  # all fields but `imu`
         parts = zip(*(np.array_split(column, n_parts) for column in columns), strict=True)
         other = reduced([ArrayBlock(*part) for part in parts])
         for a, b in zip(at_once.intervals, other.intervals, strict=True):
             np.testing.assert_array_equal(a.count, b.count)
-            # The order of additions, and so the rounding, depends on the size of the blocks.
+            # The size of the blocks determines the order of additions, and so the rounding.
             np.testing.assert_allclose(a.mean, b.mean, rtol=1e-13, atol=1e-11)
             np.testing.assert_allclose(a.time, b.time, rtol=1e-12)
         np.testing.assert_array_equal(at_once.board.value, other.board.value)
@@ -69,7 +69,7 @@ def test_the_reduction_does_not_depend_on_blocks_or_on_the_origin_of_time(rng):
 
 @pytest.mark.parametrize('rest_s', [30, 45])
 def test_short_rests_of_slow_samples_are_found(rng, rest_s):
-    # WHY: at 1 Hz each mean over 30 s was of several attitudes, and so had a norm of 0.07 m/s^2.
+    # WHY: at 1 Hz a mean over 30 s contained several attitudes, and so had |f| of 0.07 m/s^2.
     ups = np.repeat(positions(18, 1), rest_s, axis=0)
     samples = 9.8 * (ups + 5e-6 * rng.standard_normal(ups.shape))
     tumble = ArrayBlock(stamps(len(samples), 1.0), samples)
@@ -77,16 +77,16 @@ def test_short_rests_of_slow_samples_are_found(rng, rest_s):
     assert len(bag.intervals) >= 18
     for interval in bag.intervals:
         size = np.linalg.norm(interval.mean, axis=1)
-        # A sample has a noise of 5 ug; a window has ten samples, or fewer at the end of a rest.
+        # A sample has 5 ug of noise; a window has ten samples, or fewer at the end of a rest.
         np.testing.assert_allclose(size, 9.8, rtol=2e-5)
-    # Samples at 1 Hz in random attitudes, without a rest, keep windows of 30 s.
+    # Samples at 1 Hz in random attitudes contain no rest, and keep windows of 30 s.
     alone = replace(tumble, accel=samples[rng.integers(rest_s, size=len(samples))])
     assert reduced([alone], full_scale=None).window_s == 30.0
 
 
 @pytest.mark.parametrize('cycle_s', [0.01, 0.02, 0.04, 0.05, 0.1, 0.3, 1.0])
 def test_the_estimated_interval_between_samples_is_right_to_0_1_percent(rng, cycle_s):
-    # WHY: at 10 Hz averages have 33 or 34 samples; the sample rate was computed as 9.9 Hz.
+    # WHY: means at 10 Hz have 33 or 34 samples, from which a sample rate of 9.9 Hz was computed.
     n = round(1800.0 / cycle_s)
     kept = rng.random(n) > 2.0 / n  # a few samples are lost
     samples = 9.8 + 0.01 * rng.standard_normal((n, 3))
@@ -130,11 +130,11 @@ def test_positions_in_one_bag_are_separated_but_not_by_vibrations_of_a_compresso
 
 
 def test_readings_of_a_lost_thermometer_and_glitches_are_counted_and_left_out(rng):
-    # WHY: with -127 degC in every 60th reading the error of the fit was 25 times as large.
+    # WHY: -127 degC in every 60th reading increased the error of a fit by a factor of 25.
     whole = block(still(rng, 2000.0, UP))
     whole.board[:] = 20.0 + 0.02 * rng.standard_normal(len(whole.board))
     whole.board[30::60] = -127.0
-    # WHY: each wrong sample ended a rest, and with 1 % wrong samples a fit took minutes, not 2 s.
+    # WHY: each wrong sample ended a rest: with 1 % wrong samples a fit took minutes, not 2 s.
     whole.accel[50::100, 1] += 1500.0
     whole.accel[100_000:100_010] += 1500.0 * np.array([[-1.0], [1.0]] * 5)
     bag = reduced([whole])
@@ -153,12 +153,12 @@ def test_readings_of_a_lost_thermometer_and_glitches_are_counted_and_left_out(rn
     at_ends = np.array([85.0, 20.0, 20.1, 20.2, 20.3, 20.4, -127.0])
     assert np.flatnonzero(is_spike(at_ends)).tolist() == [0, 6]
     assert not is_spike(np.array([np.inf, np.inf, np.inf, np.inf, 20.0, 20.0, np.inf])).all()
-    # Readings of a temperature that changes by up to 18 K from reading to reading are no spikes.
+    # A temperature that changes by up to 18 K from reading to reading has no spikes.
     assert not is_spike(np.array([-18.0, 0.0, 12.0, 18.0, 20.0, 21.0, 21.0])).any()
 
 
 def test_samples_in_bursts_are_a_rest_and_several_with_one_stamp_are_reported(rng):
-    # WHY: cells between two bursts were empty: a unit at rest was reported as worn or driven.
+    # WHY: cells between bursts were empty, so a unit at rest was reported as worn or driven.
     whole = block(still(rng, 600.0, UP))
     number = np.arange(len(whole.accel))
     for size in (20, 100, 200):
@@ -177,10 +177,10 @@ def test_samples_in_bursts_are_a_rest_and_several_with_one_stamp_are_reported(rn
 
 @pytest.mark.parametrize('n', [0, 1, 70])
 def test_a_few_stamps_that_do_not_rise_are_reported(n, rng):
-    # WHY: if less than 1 % of the stamps did not rise, `info` reported them, but `fit` did not.
+    # WHY: `info` reported any stamps that do not rise, but `fit` only 1 % of them or more.
     whole = block(still(rng, 300.0, UP))
     cycle_ns = int(np.median(np.diff(whole.accel_stamp_ns)))
-    # The clock is set back by n cycles, so n samples have stamps that have occurred before.
+    # The clock is set back by n cycles, so the stamps of n samples occur twice.
     whole.accel_stamp_ns[20_000:] -= n * cycle_ns
     bag = reduced([whole])
     assert bag.n_dropped == n
@@ -192,7 +192,7 @@ def test_a_few_stamps_that_do_not_rise_are_reported(n, rng):
 
 @pytest.mark.parametrize(
     ('rate_hz', 'cell_s', 'window_s'),
-    # At 100 Hz 20 means over 0.5 s make a window of 10 s; at 4 and 1 Hz a window is one mean.
+    # A window is 20 means over 0.5 s at 100 Hz (10 s), and one mean at 4 and at 1 Hz.
     [(100.0, 0.5, 10.0), (20.0, 10.0 / 6.0, 10.0), (4.0, 10.0, 10.0), (1.0, 30.0, 30.0)],
 )
 def test_windows_of_a_fit_have_the_stated_length(rate_hz, cell_s, window_s, rng):
@@ -227,7 +227,7 @@ def test_fast_readings_are_averaged_but_each_change_of_a_wide_quantum_is_kept(rn
         assert sensor.noise_sd_c == pytest.approx(0.05 / np.sqrt(20.0), rel=0.01)
         is_mean = np.diff(readings.stamp_ns, prepend=0) > 1_500_000_000
         error = readings.value - 20.0 - 1e-11 * (readings.stamp_ns - START_NS)
-        # An sd estimated from some 300 means has a relative sd of 1 / sqrt(2 * 300) = 4 %.
+        # An sd estimated from some 300 means is uncertain by 1 / sqrt(2 * 300) = 4 %.
         assert np.std(error[is_mean]) == pytest.approx(sensor.noise_sd_c, rel=0.16)
     assert 85.0 in means.board.value
     assert averaged(bag, detector, ('board', 'case'), 0.1) == (bag, detector)
@@ -262,7 +262,7 @@ def test_normal_gravity_agrees_with_published_values_and_impossible_places_are_r
 
 
 def soak_ramp_soak(quantum, noise, rng):
-    # A thermometer lags the air by 300 s: 3 h at 1 Hz, a soak, a ramp of 1 K/min, a soak.
+    # The thermometer lags the air by 300 s; 3 h at 1 Hz: a soak, a ramp of 1 K/min, a soak.
     time = np.arange(0.0, 10800.0)
     air = np.interp(time, [0.0, 3600.0, 5400.0], [5.0, 5.0, 35.0])
     celsius = np.empty_like(air)
@@ -279,7 +279,7 @@ def soak_ramp_soak(quantum, noise, rng):
 def test_thermometer_settings_are_estimated_from_readings(quantum, noise, rng):
     learned = learn_thermometer([soak_ramp_soak(quantum, noise, rng)], ThermometerSettings())
     assert learned.quantum_c == pytest.approx(quantum, rel=1e-6)
-    # Rounded readings show their noise only near a rounding edge, at the slow end of the ramp.
+    # Rounded readings show their noise only near rounding edges, at the slow end of the ramp.
     assert learned.noise_sd_c == pytest.approx(noise, rel=0.4 if quantum else 0.1)
     # Means over 60 s determine the lag of the thermometer, 300 s, to 100 s.
     assert learned.lag_s == pytest.approx(300.0, rel=0.35)
@@ -289,12 +289,12 @@ def test_thermometer_settings_are_estimated_from_readings(quantum, noise, rng):
 @pytest.mark.parametrize(('noise', 'found'), [(0.02, 0.02), (0.05, 0.05), (0.09, 0.09), (0, 0.01)])
 def test_readings_that_alternate_at_edges_of_1_k_steps_show_their_noise(noise, found, rng):
     learned = learn_thermometer([soak_ramp_soak(1.0, noise, rng)], ThermometerSettings())
-    # Only the two slowest crossings of edges show noise; without noise 0.01 quanta are assumed.
+    # Only the two slowest crossings of an edge show the noise; the least noise is 0.01 quanta.
     assert learned.noise_sd_c == pytest.approx(found, rel=0.3 if noise else 1e-6)
 
 
 def test_thermometer_settings_have_defaults_and_the_detector_s_follow_the_slowest_ramp(rng):
-    # WHY: with readings every 60 s and a lag of 50 s the estimated rate was 0 in all ramps.
+    # WHY: with readings every 60 s and a lag of 50 s, the estimated rate of any ramp was 0.
     time = np.arange(0.0, 14400.0, 60.0)
     celsius = np.interp(time, [0.0, 3600.0, 5400.0], [5.0, 5.0, 35.0])
     celsius += 0.01 * rng.standard_normal(len(time))
@@ -308,7 +308,7 @@ def test_thermometer_settings_have_defaults_and_the_detector_s_follow_the_slowes
     readings = Readings(stamps(n, 1.0), celsius + 0.005 * rng.standard_normal(n))
     bag = reduced([block(still(rng, 30.0, UP))])
     slow = learn_detector([replace(bag, temperatures={'board': readings, 'case': readings})])
-    # The setting `smallest_ramp_k_min` is 0.7 times the rate of the slowest ramp (0.15 K/min).
+    # The setting `smallest_ramp_k_min` is 0.7 times the rate of the slowest ramp, 0.15 K/min.
     assert slow.smallest_ramp_k_min == pytest.approx(0.105, rel=0.05)
     assert slow.relaxed_rate_k_min < slow.smallest_ramp_k_min / 1.5
 
@@ -342,7 +342,7 @@ def test_steps_of_a_converter_after_a_constant_soak_do_not_divide_a_rest_but_a_t
     ramp = np.maximum(rest.time - 1800.0, 0.0) / 1800.0
     rest.accel = np.rint(rest.accel / 0.04 + 6.0 * np.outer(ramp, (1.0, -1.3, 0.7))) * step
     assert len(reduce_source(rest.source(), full_scale=None).intervals) == 1
-    # WHY: between two rests with constant samples, a turn counted as one step of the converter.
+    # WHY: a turn between two rests of constant samples counted as a step of the converter.
     rest = Rest(rng, sd=0.0)
     rest.accel[rest.time > 300.0] = (GRAVITY, 0.0, 0.0)
     assert len(reduce_source(rest.source(), full_scale=None).intervals) == 2

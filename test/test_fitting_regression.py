@@ -30,7 +30,7 @@ from thermo_comp.fitting.left_out import score_of
 from thermo_comp.fitting.regression import Regression
 from thermo_comp.fitting.unknowns import Noise, State, inverse_misalignment, tangent_basis
 
-#: Sd of the attitudes about their common pose [rad].
+#: Sd by which attitudes differ from their common pose [rad].
 POSE_SD = 1e-4
 
 
@@ -71,7 +71,7 @@ class Dense:
         )  # fmt: skip
 
     def residual(self, x):
-        """Return residual / sd of all windows, then (parameter - prior mean) / prior sd."""
+        """Return residual / sd of each window, and (parameter - prior mean) / prior sd."""
         w, prior, state = self.windows, self.prior, self.state(x)
         rms = np.sqrt(np.mean(w.columns**2, axis=0))
         moved = w.columns.copy()
@@ -112,7 +112,7 @@ class Dense:
         return np.concatenate(parts)
 
     def jacobian(self, x):
-        """Return the Jacobian by central differences over 0.1 sd; relative error 1e-9."""
+        """Return the Jacobian by central differences over 0.1 sd, which have an error of 1e-9."""
         sd = np.sqrt(self.at.variance)
         columns = []
         for k in range(self.n):
@@ -130,14 +130,14 @@ class Dense:
 def solved(request):
     n_positions, pose_of = request.param
     rng = np.random.default_rng(5)
-    # Positions of one bag share an initial lag state, which is 0 for bags of several positions.
+    # The bag of one position has a random initial lag state, a bag of several positions has 0.
     truth = Truth(
         start_sd=0.5 if n_positions == 1 else 0.0, noise=Noise(4.0, 2000.0),
         offset_sd=2.0 * MICRO, tilt_sd=2e-7 if pose_of else 5e-6,
     )  # fmt: skip
     pose, up = (np.array(pose_of) if pose_of else None), None
     if pose_of:
-        # The attitudes differ by `POSE_SD` from one of three poses.
+        # Each attitude differs by `POSE_SD` from one of three poses.
         poses = np.array([[0.577, 0.577, 0.578], [-0.577, 0.578, 0.577], [0.578, -0.577, 0.577]])
         up = poses[pose] + POSE_SD * rng.standard_normal((len(pose), 3))
         up /= np.linalg.norm(up, axis=1, keepdims=True)
@@ -145,7 +145,7 @@ def solved(request):
     weight = rng.uniform(0.3, 1.0, len(windows.time))
     windows = replace(windows, weight=weight, bag=windows.position // n_positions, pose=pose)
     regression, state = begin(windows, up)
-    # In one or two poses bias, scale and M are undetermined: narrow priors limit their changes.
+    # One or two poses do not determine bias, scale and M: narrow priors limit their changes.
     narrow = {'scale_sd': 1e-5, 'misalignment_sd': 1e-5, 'bias_sd': np.full(3, 1e-4)}
     narrow['column_sd'] = column_sd(('curve', 'board'), 1e-2, 1e-5)
     narrow = narrow if pose_of else {}
@@ -173,17 +173,17 @@ def test_mode_covariance_and_evidence_agree_with_dense_linear_algebra(solved):
         correlation = mode.covariance / np.outer(sd[:n], sd[:n])
         np.testing.assert_allclose(correlation, covariance, atol=1e-4)
         assert np.diag(covariance) == pytest.approx(1.0, rel=1e-4)
-        # Laplace: -2 ln Z = misfit + ln det(noise) + ln det(prior) + ln det(Hessian).
+        # Laplace's formula: -2 ln Z = misfit + ln det(noise) + ln det(prior) + ln det(Hessian).
         precision = regression.precision(wide, mode.layout)
         known = np.log(precision[precision > 0.0]).sum()
         determinants = dense.determinant + np.linalg.slogdet(hessian)[1] - known
         beside.append(mode.log_evidence + 0.5 * (at @ at + determinants))
-    # The evidence differs from this formula by a constant independent of `start_variance_ratio`.
+    # The evidence less this formula is a constant that `start_variance_ratio` does not change.
     assert beside[1] == pytest.approx(beside[0], abs=1e-3)
 
 
 def test_errors_of_the_regression_divided_by_the_claimed_sd_have_an_rms_of_1():
-    # For 36 units of 33 correlated parameters the RMS of error / sd is uncertain by at most 13 %.
+    # The RMS of error / sd of 36 units with 33 correlated parameters is uncertain by 13 % at most.
     rng = np.random.default_rng(11)
     truth = Truth(noise=Noise(0.5, 1000.0), offset_sd=MICRO, start_sd=0.3)
     errors = []
@@ -198,7 +198,7 @@ def test_errors_of_the_regression_divided_by_the_claimed_sd_have_an_rms_of_1():
 
 
 def refit_of(whole, regression, prior, kept):
-    """Fit only the rows `kept`; return weights in units of the column RMS of the whole table."""
+    """Fit the rows `kept`; return weights in units of the column RMS of the whole table."""
     windows = regression.windows
     rest = Regression(rows_of(windows, np.flatnonzero(kept)), GRAVITY, NOMINAL)
     units = rest.rms / regression.rms
@@ -211,8 +211,7 @@ def refit_of(whole, regression, prior, kept):
     return replace(mode, weights=mode.weights / units)
 
 
-#: The left-out score linearises the model, which is exact with the groups LINEAR. With PRODUCTS it
-#: neglects (change of an initial lag state) * (change of this lag's weight).
+#: The left-out score linearises the model: it is exact for LINEAR, and approximate for PRODUCTS.
 LINEAR, PRODUCTS = ('curve',), ('curve', 'board')
 
 
@@ -261,7 +260,7 @@ def test_the_left_out_error_of_a_section_is_that_of_a_fit_to_all_others(rng, gro
         size = np.sqrt(np.mean(expected**2))
         assert score.sections.square[section] == pytest.approx(size**2, rel=2.0 * tolerance)
     assert score.sections.rms == pytest.approx(np.sqrt(score.sections.square.mean()))
-    # With a single position the score is the drift of |f| in left-out sections of this position.
+    # With a single position the score is the drift of |f| in the position's left-out sections.
     alone, state = begin(rows_of(windows, np.arange(24)), up[:1])
     alone_score = score_of(alone, alone.solve(state, prior))
     assert np.isnan(alone_score.positions.rms)
@@ -270,7 +269,7 @@ def test_the_left_out_error_of_a_section_is_that_of_a_fit_to_all_others(rng, gro
 
 
 def test_a_position_that_alone_determines_a_parameter_has_no_left_out_norm(rng):
-    # Five of the six faces do not separate bias and scale of the axis whose face is left out.
+    # Five faces do not separate bias and scale of the axis that is along gravity on the sixth.
     truth = Truth(misalignment=np.zeros(3))
     windows, up = table_of(truth, 6, rng, up=np.vstack((np.eye(3), -np.eye(3))))
     regression, state = begin(windows, up)
@@ -278,7 +277,7 @@ def test_a_position_that_alone_determines_a_parameter_has_no_left_out_norm(rng):
     score = score_of(regression, mode)
     assert np.isnan(score.force).all()
     assert np.isnan(score.norms.square).all()
-    # The drift of a left-out position does not depend on bias and scale, so it is predicted.
+    # Bias and scale do not change the drift of a left-out position, so the drift is predicted.
     assert np.isfinite(score.positions.square).all()
     np.testing.assert_allclose(mode.state.misalignment, 0.0, atol=1e-6)
     places = mode.layout.misalignment
@@ -348,7 +347,6 @@ def test_published_huygens_coefficients_come_back(rng):
         got = np.polynomial.Polynomial(scale)(shifted).coef * GRAVITY / counts_per_ampere
         printed = [f'{each:.5e}' for each in got[:3]]
         assert printed == ['1.30675e-03', '-1.35046e-07', '4.02821e-10']
-        # The published offset [g] is the fitted bias / (counts per g).
         powers = np.append(mode.bias[axis], mode.weights[0, axis] / regression.rms)
         bias = K0 * polynomial.polyval(t[:40], powers)
         ratio = bias / (polynomial.polyval(t[:40], scale) * GRAVITY)
@@ -359,7 +357,7 @@ def test_published_huygens_coefficients_come_back(rng):
 
 @pytest.mark.parametrize('noise', [Noise(), Noise(0.5, 1500.0)])
 def test_scores_of_inactive_columns_agree_with_a_fit_in_which_they_are_active(noise):
-    # Active columns would have weights S^-1 Q of covariance S^-1 (S: sparsity, Q: quality factor).
+    # If active, the columns would have weights S^-1 Q, covariance S^-1 (sparsity S, quality Q).
     truth, asked = Truth(noise=noise), np.isin(GROUPS, ('board', 'idle'))
     windows, up = table_of(truth, 12, np.random.default_rng(4), n_windows=30)
     regression, state = begin(without_starts(windows), up)
@@ -389,7 +387,7 @@ def test_scores_of_inactive_columns_agree_with_a_fit_in_which_they_are_active(no
 
 
 def test_inactive_and_active_columns_share_initial_lag_states(solved):
-    # WHY: the sparsity factor, without the prior of the sum of lag states, was 50 times too large.
+    # WHY: the sparsity lacked the prior of the sum of lag states, and was 50 times too large.
     regression, prior, mode = solved
     of_scale = np.isin(GROUPS, ('board',)) * [[0.0], [1.0]]
     without = replace(prior, column_sd=np.where(of_scale > 0.0, 0.0, prior.column_sd))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Selected model, prior sd, noises and claimed sd agree with the truth of simulated tables."""
+"""The selected model, prior sd, noises and claimed sd agree with the truth of simulated tables."""
 
 from dataclasses import replace
 from itertools import product
@@ -38,7 +38,7 @@ IDLE = np.array(GROUPS) == 'idle'
 
 
 def constants(truth):
-    """Return an initial prior with wrong noise parameters and a weight sd of 0 for all columns."""
+    """Return an initial prior with wrong noise parameters; the prior sd of all columns is 0."""
     return prior_of(
         truth, (), offset_sd=MICRO, offset_scale=30.0 * MICRO, sigma=np.full(3, 5.0 * MICRO),
         noise=Noise(), misalignment_sd=1e-3,
@@ -83,25 +83,25 @@ def test_only_columns_with_an_effect_are_chosen_and_each_trial_has_a_left_out_er
     judged = {(group.part, group.group) for group in evidence}
     assert judged == {*product(('bias', 'scale'), ('curve', 'board'))}
     assert not chosen.posterior.state.weights[..., IDLE].any()
-    # A tilt below the noise of a mean over 60 windows (2 ug / sqrt(60)) cannot be measured.
+    # A tilt below 2 ug / sqrt(60), the noise of a mean over 60 windows, cannot be measured.
     hidden = truth.sigma[0] / np.sqrt(60.0)
     tilt = GRAVITY * chosen.posterior.state.tilt
     assert np.abs(tilt).max() < hidden
     assert np.sqrt(np.mean(tilt**2)) < 0.5 * hidden
     rms = {trial.groups: trial.score.rms for trial in chosen.trials}
-    # The first trial fits only constants; its left-out error is the effect of temperature.
+    # The first trial fits only constants, so its left-out error contains the temperature drift.
     assert [*rms][:2] == [(), ('curve',)]
     assert rms[()] > 2.0 * rms['curve',] > 10.0 * rms['curve', 'board']
     (best,) = (trial for trial in chosen.trials if trial.is_chosen)
     assert best.score is chosen.score
-    # Errors of the fit make the left-out error larger than white noise, by 15 % at most.
+    # Errors of the fit increase the left-out error above the white noise, by 15 % at most.
     assert 1.0 < chosen.score.rms / truth.sigma[0] < 1.15
     assert all(is_better(trial.score, chosen.score) for trial in chosen.trials[:2])
 
 
 @pytest.mark.parametrize('where', ['one bag', 'one section', 'all'])
 def test_a_group_that_explains_one_bag_or_section_is_not_chosen(where):
-    # The evidence always favours group 'idle', left-out errors only with its effect in all rows.
+    # The evidence always favours 'idle', left-out errors only if the effect is in all rows.
     truth = Truth()
     windows, up = table_of(truth, 10, np.random.default_rng(5), n_windows=30)
     rows = {
@@ -116,8 +116,7 @@ def test_a_group_that_explains_one_bag_or_section_is_not_chosen(where):
 
 @pytest.mark.parametrize(('n_positions', 'step_s'), [(10, 120.0), (12, 60.0), (12, 240.0)])
 def test_a_lag_is_found_although_a_curve_without_the_lag_is_rejected(n_positions, step_s):
-    # WHY: a bias that depends on a lagged temperature needs the groups 'curve' and 'board'
-    # together; 'curve' without 'board' was rejected, and so the lag was not found.
+    # WHY: a bias that follows a lagged temperature needs two groups; the first alone was rejected.
     slope = 2e-5 * np.array([1.0, -2.0, 1.5])
     on_bias = np.outer(slope, [1.0, 0.0, 0.0, -1.0, 0.0, 0.0])
     truth = Truth(on_bias=on_bias, on_scale=np.zeros((3, 6)))
@@ -132,17 +131,17 @@ def test_estimated_noise_parameters_agree_with_the_truth_and_errors_with_the_cla
     regression, chosen, truth = noisy
     prior = chosen.posterior.prior
     assert {'curve', 'board'} <= chosen_groups(chosen)
-    # 1080 windows per axis determine the sd of white noise to 2 %, or less well beside slow noise.
+    # 1080 windows per axis determine the sd of white noise to 2 %, less well beside slow noise.
     np.testing.assert_allclose(prior.sigma, truth.sigma, rtol=0.15)
-    # Slow noise is known to a factor of 2, as a position lasts only six correlation times.
+    # A position lasts six correlation times, so slow noise is known only to a factor of 2.
     assert 0.5 < prior.noise.ratio / truth.noise.ratio < 2.0
     assert 0.5 < prior.noise.time_s / truth.noise.time_s < 2.0
     # 54 means less 45 unknowns (directions, scale, bias, M) determine the mounting sd to 24 %.
     assert 0.5 < prior.offset_sd / truth.offset_sd < 1.7
     errors = truth.errors(regression, chosen.posterior)
-    # Weights that the fit pruned have no sd and are not in `errors`.
+    # `errors` does not contain weights that the fit pruned, as they have no sd.
     every = np.concatenate([*errors.values()])
-    # The RMS of 30 values of error / sd is uncertain by 13 %; estimates of prior sd lower the RMS.
+    # The RMS of 30 ratios error / sd is uncertain by 13 %; fitted prior sds reduce the RMS.
     assert len(every) > 20
     assert 0.5 < np.sqrt(np.mean(every**2)) < 1.5
     assert np.abs(every).max() < 4.0
@@ -168,7 +167,7 @@ def test_flicker_noise_has_several_correlation_times():
 
 
 def test_rounding_removes_no_correlation_time_from_the_search():
-    # WHY: 10**log10(180) is rounded to less than 180, so the search left out a candidate, 180 s.
+    # WHY: 10**log10(180) is rounded to less than 180, so the search left out 180 s.
     whitener = Whitener(np.zeros(300, np.int64), 60.0 * np.arange(300))
     assert whitener.times_s[0] == 180.0
     for time_s in whitener.times_s:
@@ -177,8 +176,7 @@ def test_rounding_removes_no_correlation_time_from_the_search():
 
 
 def test_the_prior_sd_of_columns_is_that_of_true_weights_below_the_steepest_plausible_slope(calm):
-    # Prior variance of a column: sum of its squared weights / 3. The hyperprior moves ln sd by 3 %
-    # of its distance to the hyperprior's centre.
+    # The prior variance of a column is its mean squared weight; a hyperprior moves ln sd by 3 %.
     regression, chosen, truth = calm
     true = np.sqrt(np.mean((truth.on_bias * regression.rms) ** 2, axis=0))
     np.testing.assert_allclose(chosen.posterior.prior.column_sd[0, :4], true[:4], rtol=0.25)
@@ -191,7 +189,7 @@ def test_the_prior_sd_of_columns_is_that_of_true_weights_below_the_steepest_plau
     expected = np.sqrt(np.mean((columns @ truth.on_bias[:, 2:4].T) ** 2))
     # The group 'board' changes the bias by about 100 ug; the noise of a window is 2 ug.
     assert explains['bias', 'board'] == pytest.approx(expected, rel=0.05)
-    # The unit's bias slope is ten times the largest allowed prior sd of a bias slope.
+    # The bias slope is ten times the largest prior sd that a bias slope may have.
     truth = Truth(on_bias=10.0 * STEEPEST[0] * np.outer([1.0, -1.0, 1.0], np.arange(6) == 0))
     windows, up = table_of(truth, 12, np.random.default_rng(2), n_windows=20)
     regression, state = begin(windows, up)
@@ -220,7 +218,7 @@ def test_bends_have_one_prior_sd_of_the_change_of_slope():
 
 
 def test_the_bayes_factor_of_a_group_is_the_loss_of_evidence_if_the_group_is_removed():
-    # The Savage-Dickey ratio equals the loss of evidence if attitudes act linearly.
+    # If attitudes act linearly, the Savage-Dickey ratio is equal to the loss of evidence.
     truth = Truth()
     windows, up = table_of(truth, 12, np.random.default_rng(8))
     regression, state = begin(without_starts(windows), up)
@@ -265,12 +263,12 @@ def test_outliers_do_not_shift_the_fit_and_quantised_means_are_no_outliers(calm)
     dirty.mean[struck] += 1000.0 * rng.normal(0.0, 200.0 * MICRO, (len(struck), 3))
     _, other = selected_of(truth, dirty, calm[1].posterior.state.up)
     sd = np.sqrt(calm_fit.posterior.variance[calm_fit.posterior.layout.bias])
-    # 2 % of the windows have errors of 100 sd, but affect the fit only like errors of 3 sd.
+    # 2 % of the windows have errors of 100 sd, but change the fit only like errors of 3 sd.
     assert np.abs((other.posterior.state.bias - calm_fit.posterior.state.bias) / sd).max() < 1.0
     np.testing.assert_allclose(other.posterior.prior.sigma, truth.sigma, rtol=0.2)
     sds = (fitted.posterior.prior.column_sd[0] for fitted in (calm_fit, other))
     np.testing.assert_array_equal(*(sd > 0.0 for sd in sds))
-    # Carried remainders make most means equal: a mean that differs by one step is no outlier.
+    # As remainders are carried, most means are equal; a mean one step away is no outlier.
     windows, up = table_of(Truth(), 9, np.random.default_rng(2))
     regression, state = begin(windows, up)
     prior = prior_of(Truth(), (), offset_sd=1e-9)
@@ -312,7 +310,7 @@ def test_the_variance_of_initial_lag_states_is_estimated(start_sd, lower, upper)
 
 @pytest.mark.parametrize('offset', [0.0, 30.0])
 def test_the_evidence_selects_the_sd_of_an_informative_prior(calm, offset):
-    # The unit is 0 or 30 sd from the prior's mean: the fit selects the prior's sd or 100 times it.
+    # The unit is 0 or 30 sd from the prior's mean: the fit selects the stated sd or 100 times it.
     _, selected, truth = calm
     state = selected.posterior.state
     regression, _ = begin(calm[0].windows, state.up)
@@ -343,15 +341,14 @@ def test_thermal_tilts_of_supports_are_separated_from_the_drift_of_the_unit():
         return chosen, float(np.sqrt(np.mean((table.columns @ missed.T) ** 2)))
 
     chosen, left = drift_left(windows)
-    # 12 positions with 2 angles and 2 columns each determine the sd of tilts to 10 %.
+    # 12 positions, each with 2 angles and 2 columns, determine the sd of tilts to 10 %.
     assert 0.7 < chosen.posterior.prior.tilt_sd / truth.tilt_sd < 1.3
-    # A tilt of 5 urad changes a level axis' force by 5 ug; 720 windows determine drifts to 0.1 ug.
+    # A tilt of 5 urad is 5 ug on a level axis; 720 windows determine the drift to 0.1 ug.
     assert left < 0.5 * MICRO
     assert drift_left(stiff)[1] > 1.0 * MICRO
 
 
 def forced(truth, n, seed, n_windows):
-    """Fit a table with the groups 'curve' and 'board'."""
     windows, up = table_of(truth, n, np.random.default_rng(seed), n_windows=n_windows)
     regression, state = begin(without_starts(windows), up)
     candidates = candidates_of(windows, ('curve', 'board'))
@@ -368,7 +365,7 @@ def test_the_sd_of_gravity_adds_a_common_error_to_all_scale_factors():
     without, within = claimed(0.0), claimed(5e-4)
     added = within - without
     kappa = np.arange(3) * ((len(without) - 3) // 3)
-    # A relative error of gravity is a relative error of K in each axis, and of nothing else.
+    # A relative error of gravity changes K of all axes by an equal factor, and nothing else.
     both = np.ix_(kappa, kappa)
     np.testing.assert_allclose(added[both], (5e-4 / GRAVITY) ** 2, rtol=2e-3)
     correlation = added[both] / np.sqrt(np.outer(np.diag(added)[kappa], np.diag(added)[kappa]))
@@ -378,12 +375,12 @@ def test_the_sd_of_gravity_adds_a_common_error_to_all_scale_factors():
 
 
 def test_the_drift_of_scale_factors_determines_the_sd_of_turn_on_offsets():
-    # WHY: the estimated sd of turn-ons was 5, not 300 ug: the constants were off by 75 claimed sd.
+    # WHY: the estimated sd of turn-ons was 5, not 300 ug: constants had errors of 75 claimed sd.
     on_scale = np.outer([1.0, -0.7, 1.3], [1e-4, 0.0, 0.0, 0.0, 0.0, 0.0])
     truth = Truth(offset_sd=300.0 * MICRO, sigma=np.full(3, 0.5 * MICRO), on_scale=on_scale)
     _, regression, selection = forced(truth, 9, 2, 60)
     posterior = selection.posterior
-    # Of the 27 offsets 18 combinations are determined: the estimated sd has an error of 17 %.
+    # 18 combinations of the 27 offsets are determined, so the estimated sd is known to 17 %.
     assert posterior.prior.offset_sd == pytest.approx(300.0 * MICRO, rel=0.5)
     for errors in truth.errors(regression, posterior).values():
         # The RMS of three standard normal errors exceeds 2 with a probability of 0.7 %.
@@ -393,7 +390,7 @@ def test_the_drift_of_scale_factors_determines_the_sd_of_turn_on_offsets():
 def test_windows_that_the_model_misses_count_in_the_lack_of_fit_in_spite_of_their_weight():
     windows, up = table_of(Truth(), 12, np.random.default_rng(6), n_windows=60)
     temperature = windows.columns[:, 0]
-    # A bump that no column describes, in the middle tenth of the temperatures.
+    # The bias has a bump in the middle tenth of the temperatures, which no column describes.
     low, high = np.quantile(temperature, (0.45, 0.55))
     is_bump = (low <= temperature) & (temperature <= high)
     bump = 100.0 * MICRO * is_bump[:, None]
@@ -406,7 +403,6 @@ def test_windows_that_the_model_misses_count_in_the_lack_of_fit_in_spite_of_thei
     fit = Fit(table, regression, chosen)
     points, _ = lack_of_fit(fit, claim_of(fit))
     widest = np.max([point.sd_m_s2 for point in points], axis=0)
-    # The bump of 100 ug is in half of the windows of a bin: 71 ug RMS, of which the curve and the
-    # means of positions fit up to a half.
+    # Half of a bin has the bump of 100 ug: 71 ug RMS, of which the fit removes up to a half.
     assert (widest > 35.0 * MICRO).all()
     assert (widest < 100.0 * MICRO).all()

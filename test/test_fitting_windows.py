@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Columns of a fit's windows equal the compensator's; a calibration file equals the fit."""
+"""Windows of a fit have the compensator's columns; a calibration file corrects as the fit does."""
 
 from dataclasses import replace
 from importlib import import_module
@@ -52,7 +52,7 @@ def windows_of(bags):
 
 
 def test_a_rest_partly_in_the_range_of_the_model_is_used_there_only(bags):
-    # WHY: positions 3 K beyond the range of the prior doubled the error of an update.
+    # WHY: positions 3 K outside the range of the prior doubled the error of an update.
     everything = windows_of(bags)
     lower, upper = np.quantile(everything.temperature, (0.3, 0.7))
     for range_c, is_used in (((lower, upper), True), ((90.0, 95.0), False)):
@@ -61,12 +61,12 @@ def test_a_rest_partly_in_the_range_of_the_model_is_used_there_only(bags):
         board = windows.temperature
         assert (len(board) < len(everything.temperature)) == is_used
         assert (board.min() >= lower and board.max() <= upper) == is_used
-        # WHY: samples beyond the range were reported as samples without temperatures.
+        # WHY: samples outside the range were reported as samples without temperatures.
         assert not list(judge_missing(bags, windows))
 
 
 def test_the_sets_differ_only_with_soaks_at_several_temperatures(bags):
-    # WHY: static curves from 4 of 1035 windows erred by 341 ug, common curves of both by 21 ug.
+    # WHY: static curves fitted to 4 of 1035 windows erred by 341 ug, common curves by 21 ug.
     ramps = windows_of(bags)
     soaks = replace(ramps, weight=1.0 * (np.abs(ramps.rate) > 1e-3))
     of_sets = np.array(ramps.data.groups) == 'set'
@@ -109,13 +109,12 @@ def test_columns_of_the_fit_equal_those_of_the_tracker(bags):
     mean = np.array([phi[np.abs(seconds - t) <= 30.0].mean(axis=0) for t in time])
     scale = np.sqrt(np.mean(phi**2, axis=0)) + 1e-9
     late = time > 300.0
-    # The tracker's lags follow estimates, not readings: play operators reverse at other times.
+    # The tracker lags estimated temperatures, the fit lags readings: plays reverse at other times.
     np.testing.assert_allclose(rows[late, n_sets:] / scale, mean[late] / scale, atol=0.05)
 
 
 def test_lags_after_a_pause_depend_on_the_temperatures_in_it(bags):
-    # WHY: the lags were computed as if the temperature had stepped at the end of a pause, so the
-    # drifts of bags with pauses had three times the error.
+    # WHY: lags took the temperature as constant in a pause, which tripled the drift error.
     whole, first_s, last_s = bags[0], 780.0, 1200.0
     temperatures = {}
     for name, readings in whole.temperatures.items():
@@ -160,14 +159,14 @@ def test_columns_sections_and_initial_lag_states_agree_with_formulas(bags):
         assert (np.diff(section) >= 0).all()
         assert np.ptp(np.bincount(section, minlength=N_SECTIONS)) <= 2
     rms = np.sqrt(np.mean(data.columns**2, axis=0))
-    # `kelvins`: RMS of a column / its largest slope over t (1 for t, 2 max |t| for t^2).
+    # `kelvins` is the RMS of a column / its largest slope over t, which is 2 max |t| for t^2.
     lines = [0, *(k for k, column in enumerate(bank(), start=6) if column.group == 'board')]
     np.testing.assert_allclose(data.kelvins[lines], rms[lines], rtol=1e-6)
     assert data.kelvins[1] == pytest.approx(rms[1] / (2.0 * np.abs(t).max()), rel=0.02)
 
 
 def test_the_board_temperature_is_measured_while_the_case_thermometer_is_silent(bags):
-    # Without case readings from 900 s on, a bag still has board temperatures for the lags.
+    # The case readings of the bag end at 900 s; the lags need board temperatures after this time.
     bag = bags[0]
     is_early = (bag.case.stamp_ns - bag.start_ns) * 1e-9 < 900.0
     case = Readings(bag.case.stamp_ns[is_early], bag.case.value[is_early])
@@ -179,7 +178,7 @@ def test_the_board_temperature_is_measured_while_the_case_thermometer_is_silent(
 @pytest.mark.parametrize('name', ['board', 'case'])
 @pytest.mark.parametrize('is_stuck', [False, True])
 def test_windows_with_a_silent_or_stuck_thermometer_are_left_out(bags, name, is_stuck):
-    # The thermometer is silent, or repeats a value, from 900 s to 2200 s, in both ramps.
+    # From 900 s to 2200 s, in both ramps, the thermometer is silent or repeats one value.
     bag, start, stop = bags[0], 900.0, 2200.0
     readings = bag.temperatures[name]
     age = (readings.stamp_ns - bag.start_ns) * 1e-9

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A run over a fleet ends with all results despite bad bags, refusals and killed workers."""
+"""A fleet run ends and keeps all results despite bad bags, refusals and killed workers."""
 
 import csv
 import json
@@ -52,7 +52,7 @@ def contents(folder):
 
 @pytest.fixture(scope='module')
 def fleet(tmp_path_factory):
-    """Write three units: one without faults, one with a corrupt bag, one with swapped sensors."""
+    """Write three units: with good bags, with a corrupt bag, with exchanged thermometers."""
     folder = tmp_path_factory.mktemp('fleet') / 'bags'
     write_unit(folder / 'A' / 'good', 1)
     damage(write_unit(folder / 'A' / 'torn', 2, 7)[2])
@@ -101,7 +101,6 @@ def test_all_units_are_fitted_despite_a_killed_worker_and_only_once(client, flee
 
 @pytest.mark.slow
 def test_unreadable_bags_leave_earlier_results_in_place(scheduler, tmp_path):
-    # WHY: when bags could not be read, a second run deleted the results of the first run.
     bags = write_unit(tmp_path / 'bags' / 'unit', 1)
     options = replace(OPTIONS, certificates=True)
     first = fit_fleet(str(tmp_path / 'bags'), tmp_path / 'out', options, scheduler=scheduler)
@@ -152,7 +151,6 @@ def children_of(pid):
 
 @pytest.mark.slow
 def test_ctrl_c_while_workers_start_prints_no_traceback(tmp_path):
-    # WHY: after Ctrl-C each starting worker and Dask printed a traceback.
     write_unit(tmp_path / 'bags' / 'u', 1, 1)
     words = ['fleet', 'fit', 'bags', '-o', 'out', '--gravity', '9.81', '--workers', '1']
     process = subprocess.Popen(
@@ -274,7 +272,7 @@ def test_a_unit_is_fitted_again_with_other_options(scheduler, fleet, tmp_path):
 
 @pytest.mark.slow
 def test_the_prior_of_siblings_reduces_the_scale_error_of_a_unit_with_one_bag(scheduler, tmp_path):
-    # Unit 0 has a single position, which does not separate bias and scale; units 1 to 3 have nine.
+    # Unit 0 has one position, which does not separate bias and scale; units 1 to 3 have nine.
     siblings = [sibling(unit_preset('mems', 1), number) for number in range(4)]
     for number, unit in enumerate(siblings):
         folder, n_bags = tmp_path / 'bags' / f'u{number}', 9 if number else 1
@@ -290,7 +288,7 @@ def test_the_prior_of_siblings_reduces_the_scale_error_of_a_unit_with_one_bag(sc
     assert (helped.n_done, contents(tmp_path / 'out' / 'units')) == (1, before)
     assert [bool(row['prior']) for row in helped.rows] == [True, False, False, False]
     (before_row, *_), (row, *_) = alone.rows, helped.rows
-    # Compare the norm of the errors of three axes, as one error may be small by chance.
+    # One error may be small by chance, so compare the norms over three axes.
     scale = np.array(siblings[0].scale_factor)
 
     def cells(row, name):
@@ -310,7 +308,7 @@ def test_the_prior_of_siblings_reduces_the_scale_error_of_a_unit_with_one_bag(sc
         *(('valid', 1, False), ('valid', 0, True), ('valid, but it only claims 5 mg', 0, True)),
         *(('recalibrate', 1, False), ('recalibrate', 0, False), ('no better than raw', 0, False)),
         *(('thermometers exchanged or loose: not judged', whole, False) for whole in (1, 0)),
-        # A refused unit has `is_whole` None if its data are contradictory, 0 if data are missing.
+        # `is_whole` of a refused unit is None if data are contradictory, 0 if data are missing.
         *(('refused', None, False), ('refused', 0, True), ('failed', None, False)),
     ],
 )

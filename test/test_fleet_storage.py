@@ -113,7 +113,7 @@ class TestDiscovery:
         [
             (['u/1.mcap', 'u/2.mcap', 'u/notes.txt'], ['u/1.mcap', 'u/2.mcap']),
             (['u/p1/metadata.yaml', 'u/p1/p1_0.mcap', 'u/p1/p1_1.mcap'], ['u/p1']),
-            # Bags without metadata.yaml, as after a recorder was killed.
+            # These bags have no metadata.yaml, as after a recorder was killed.
             (['u/p1/p1_0.mcap', 'u/p2/p2_0.db3'], ['u/p1', 'u/p2']),
             (['u/u_a.mcap'], ['u/u_a.mcap']),
             (['top.bag', 'u/x.db3'], ['top.bag', 'u/x.db3']),
@@ -144,7 +144,7 @@ class TestDiscovery:
         write_unit(tmp_path, 3, 1, serial='', names=['e.mcap'])
         (tmp_path / 'f.mcap').write_bytes(b'no bag')
         units = find_units(Storage(str(tmp_path)))
-        # A bag without a serial belongs to a unit named like the folder; f.mcap is unreadable.
+        # A bag without a serial belongs to a unit named as the folder; f.mcap is unreadable.
         assert {unit.name: list(unit.bags) for unit in units} == {
             'mems-0001': ['a.mcap', 'd.mcap'], 'mems-0002': ['b.mcap', 'c.mcap'],
             tmp_path.name: ['e.mcap'], 'f.mcap': ['f.mcap'],
@@ -173,7 +173,6 @@ class TestDiscovery:
         assert [name for unit in units for name in unit.bags] == ['unit/1.mcap']
 
     def test_a_folder_that_cannot_be_read_is_named(self, tmp_path, monkeypatch):
-        # WHY: a unit whose folder was not readable was left out, and the exit code was 0.
         unread = '.hidden', 'lost+found'
         write_unit(tmp_path / 'u1', 1, 1)
         for name in ('u2', *unread):
@@ -279,7 +278,7 @@ class TestRow:
             return float(curve.value(1e-3) - curve.value(-1e-3)) / 2e-3 * 1e6
 
         assert row['scale_slope_x_ppm_k'] == pytest.approx(ppm_k(slope), rel=1e-6)
-        # The sd of a slope must equal the sd of 4000 slopes drawn from the posterior.
+        # The sd of the slope is that of 4000 slopes drawn from the posterior.
         block = parameter_layout(calibration).scale[0]
         rows = slice(block.static + 1, block.static + 1 + slope.n_free)
         covariance, rng = calibration.posterior.covariance()[rows, rows], np.random.default_rng(1)
@@ -325,15 +324,14 @@ class TestRow:
         assert row['chosen'] == '/imu/raw, the only Vector3Stamped of the bag, is taken for counts'
 
     def test_the_row_has_no_sd_of_a_slope_that_the_positions_do_not_determine(self, tmp_path):
-        # WHY: a fit of one position stated the sum of the slopes of bias and scale as the slope of
-        # the bias, with an sd of 0.06 ug/K.
+        # WHY: the bias slope was the sum of the slopes of bias and scale, with an sd of 0.06 ug/K.
         write_unit(tmp_path / 'u', 1, 1)
         row = processed(tmp_path).row
         assert [row[f'bias_slope_sd_{axis}_ug_k'] for axis in 'xyz'] == [None] * 3
         assert [row[f'scale_slope_sd_{axis}_ppm_k'] for axis in 'xyz'] == [None] * 3
 
     def test_the_lag_of_a_board_that_changes_before_the_case_is_negative(self, tmp_path):
-        # WHY: if the measured lag is negative, the calibration contains the default, 900 s.
+        # WHY: if the measured lag is negative, the calibration contains the default lag of 900 s.
         write_unit(tmp_path / 'u', 1, 4, is_exchanged=True)
         outcome = processed(tmp_path, fit=replace(OPTIONS.fit, allow=('swapped',)))
         assert outcome.row['board_lag_s'] < -100.0

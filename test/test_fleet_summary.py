@@ -71,7 +71,7 @@ class TestOutliers:
     @pytest.mark.parametrize('n', [10, pytest.param(40, marks=pytest.mark.slow)])
     def test_fewer_than_a_fifth_of_fleets_without_outliers_give_a_false_alarm(self, n, rng):
         n_alarms = sum(bool(summarise(fleet_of(n, rng)).outliers) for _ in range(60))
-        # At a rate of 5 %, 60 fleets give 3 false alarms on average, and 12 or more with p < 1e-4.
+        # At a rate of 5 % 60 fleets give 3 false alarms on average; 12 or more have p < 1e-4.
         assert n_alarms < 12
 
     def test_equal_units_and_a_fleet_of_six_give_no_outliers(self, rng):
@@ -91,7 +91,7 @@ def spread_of(name, rows):
 
 
 class TestUndetermined:
-    # WHY: a misalignment of -3950 +- 9100 urad, hardly determined, was an outlier of -32 fleet sd.
+    # WHY: a misalignment of -3950 +- 9100 urad was an outlier of -32 sd of the fleet.
     @staticmethod
     def with_few_positions(n, rng):
         rows = fleet_of(n + 12, rng)

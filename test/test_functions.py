@@ -30,7 +30,7 @@ temperatures = st.floats(-15.0, 15.0)
 
 
 def test_curves_agree_with_hand_numbers_and_splines_with_scipy():
-    # Eq. (10): the term with a4 is a4 t^4; Golovach's paper prints a4 t.
+    # The term with a4 in Eq. (10) is a4 t^4; Golovach's paper prints a4 t.
     assert functions.Polynomial((1.0, 2.0, 0.5, 0.25, 1.0)).value(3.0) == 1 + 6 + 4.5 + 6.75 + 81
     function = functions.Exponential(-2.0, (2.0,), (10.0,))
     assert function.value(0.0) == 0.0
@@ -39,7 +39,6 @@ def test_curves_agree_with_hand_numbers_and_splines_with_scipy():
     ours = functions.CubicSpline(KNOTS, values)
     reference = ReferenceSpline(KNOTS, values, bc_type='natural')
     t = np.linspace(-15.0, 15.0, 301)
-    # Both splines solve the same equations, so they differ by rounding.
     np.testing.assert_allclose(ours.value(t), reference(t), atol=1e-13)
     np.testing.assert_allclose(ours.slope(t), reference(t, 1), atol=1e-13)
     assert ours.value(-100.0) == ours.value(-15.0)
@@ -111,13 +110,13 @@ def test_the_predicted_sd_agrees_with_hand_numbers_or_is_that_of_the_residual():
         dynamic=regime_set(*[axis_set((0.0, 0.3))] * 3),
         response=(term('board', (0.3, 0.0, 0.0), tau_s=600.0),),
     )
-    # Parameters of x: level and slope of bias in each set (0-3), lag's weight (4), scales (5, 6).
+    # Parameters of x: bias level and slope per set (0-3), weight of the lag (4), scales (5, 6).
     variances = np.zeros(parameter_layout(unit).n_parameters)
     variances[:7] = 4e-4, 1e-6, 9e-4, 0.0, 1e-6, 1e-12, 4e-12
     unit = replace(unit, posterior=posterior_of(np.diag(variances)))
     states = ramp_states(unit, np.array([20.0, 30.0]), 0.0, np.inf)
     _, bias, _, scale = bias_scale_and_sd(unit, states)
-    # Bias variance at 30 degC: 4e-4 + 100 * 1e-6 counts^2, plus the residual's (30 um/s^2)^2.
+    # The bias variance at 30 degC is (4e-4 + 100 * 1e-6) counts^2, plus (30 um/s^2)^2.
     assert bias[:, 0] == pytest.approx(np.hypot(np.sqrt([4e-4, 5e-4]) / 300.0, 3e-5), rel=1e-6)
     assert bias[:, 1] == pytest.approx([3e-5, 3e-5])
     assert scale[:, 0] == pytest.approx([1e-6, 1e-6], rel=1e-6)
@@ -171,13 +170,13 @@ def test_ramp_states_equal_those_of_the_memory_of_the_fit(rate):
             # `gradient` rises within 1 s in `memory_on_grid`, but at once in `ramp_states`.
             assert state[place] == pytest.approx(lived[place - first], rel=2e-3), quantity
         elif isinstance(quantity, Play) and not quantity.tau_s:
-            # Play operators of lags are untested: a lag needs half an hour to change by `width_k`.
+            # A play of a lag is not tested: the lag needs half an hour to change by `width_k`.
             assert state[place] == pytest.approx(-quantity.width_k * np.sign(rate))
             assert state[place] == pytest.approx(lived[place - first])
 
 
 def test_statistics_of_residuals_agree_with_hand_numbers(rng):
-    # For 3 and -4 the mean is -0.5, the mean square 12.5. Values that are not finite do not count.
+    # 3 and -4 have the mean -0.5 and the mean square 12.5; infinite and NaN values do not count.
     for values in ((3.0, -4.0), (3.0, np.nan, -4.0), (np.inf, 3.0, -4.0)):
         statistics = residual_statistics(np.array(values))
         assert (statistics.n, statistics.mean, statistics.peak) == (2, -0.5, 4.0)

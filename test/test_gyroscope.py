@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders import calibration, rich_calibration, warm
+from builders import START_NS, calibration, rich_calibration, rms, warm
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -32,9 +32,8 @@ from thermo_comp.unit.prediction import bias_and_scale, bias_scale_and_sd, ramp_
 from thermo_comp.unit.rate_bias import MILLIDEGREE, RateCurve
 
 OPTIONS = FitOptions(gravity=STANDARD_GRAVITY, input='m/s^2')
-START_NS = 1_767_225_600_000_000_000
 RATE_HZ, MINUTE = 1.0, 60
-#: White noise of a mean over 60 s of the simulated gyroscope [rad/s].
+#: Sd of a mean over 60 s of the simulated gyroscope's white noise [rad/s].
 FLOOR = 5.0 * MILLIDEGREE / np.sqrt(60.0)
 
 
@@ -53,13 +52,9 @@ def source_of(record, K, rate=None, name='bag'):
     return FitSource(name, lambda: [block_of(record, K, rate)])
 
 
-def rms(values):
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
 @pytest.fixture(scope='module')
 def unit():
-    # The lags are minutes, so a reading every 4 s is sufficient; this saves 3/4 of a fit's time.
+    # Lags are minutes, so a reading every 4 s suffices, and saves 3/4 of the time of a fit.
     return unit_preset('mems', 2).with_thermometers(rate_hz=0.25)
 
 
@@ -102,7 +97,7 @@ def test_the_corrected_rate_of_a_mems_gyroscope_has_only_noise_also_in_data_left
     claimed = np.sqrt(out.angular_rate_variance.mean(axis=0) - message + EARTH_RATE**2 / 3.0)
     assert (np.abs(means.mean(axis=0)) < 3.0 * claimed).all()
     np.testing.assert_allclose(gyroscope.noise_density_rad_s_sqrt_hz, 5.0 * MILLIDEGREE, rtol=0.05)
-    # From nine positions the residual sd estimates the sd of turn-on offsets, 2 mdeg/s.
+    # The residual sd of nine positions estimates the sd of turn-on offsets, 2 mdeg/s.
     assert np.mean(gyroscope.residual_sd_rad_s) == pytest.approx(2.0 * MILLIDEGREE, rel=0.4)
     row = fitted.rates[-1]
     assert row.section == 'all'
@@ -166,7 +161,7 @@ def test_a_gyroscope_is_read_back_from_a_file_and_messages_name_wrong_keys():
     np.testing.assert_array_equal(scale, 1.0)
     _, sd_bias, _, sd_scale = bias_scale_and_sd(triad, states[1:2])
     np.testing.assert_array_equal(sd_scale, 0.0)
-    # At 20 degC the bias is its level; its variance: variance of the level + of a turn-on.
+    # The bias at 20 degC is its level, with the variances of the level and of a turn-on.
     np.testing.assert_allclose(bias[1], (0.02 + 1e-5, -0.03, 0.01 + 1e-5))
     expected = np.hypot((1e-5, 2e-5, 1e-5), np.sqrt(1.01e-10))
     np.testing.assert_allclose(sd_bias[0], expected, rtol=1e-5)
@@ -205,7 +200,7 @@ def test_the_rate_at_the_reference_temperature_is_corrected_by_its_bias():
     assert compensator.process(0, 300.0, 600.0, 2900.0) is not None
     x, y, z, *variances = compensator.correct_rate(0, 1.0, 1.0, 1.0)
     assert (x, y, z) == pytest.approx((0.98 - 1e-5, 1.03, 0.99 - 1e-5), abs=1e-12)
-    # In an unknown regime noise, residual and the regimes' bias difference add to the variance.
+    # In an unknown regime the variance contains noise, residual and the regimes' bias difference.
     least = np.square((1e-4, 2e-4, 1e-4)) / 0.01 + np.square((1e-5, 2e-5, 1e-5))
     assert (np.array(variances) >= least).all()
     assert variances == pytest.approx(least, rel=0.05)
@@ -243,7 +238,7 @@ def test_the_changes_of_the_rate_are_compared_with_their_claimed_sd(unit, fitted
     assert judged.exit_code == 0
     for name in ('static', 'dynamic', 'all'):
         section = rate.sections[name]
-        # The claimed sd exceeds the noise, because it includes unknown initial lag states.
+        # Unknown initial lag states add to the claimed sd, so it exceeds the noise.
         assert 0.7 < section.ratio < 1.2
         assert section.rms < 1.3 * FLOOR
         assert section.raw_rms > 50.0 * FLOOR

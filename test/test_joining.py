@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The parts of a split recording, and a part of a bag, give the results of one recording."""
+"""The parts of a split recording together give the results of the whole recording."""
 
 import re
 from dataclasses import replace
@@ -44,7 +44,6 @@ def recorded(rng, seconds):
 
 
 def cut(whole, edges_s, pause_s=0.0):
-    """Cut a block at times [s], with a pause between the parts."""
     edges = [START_NS, *(START_NS + round(1e9 * edge) for edge in edges_s), 2 * START_NS]
     parts = []
     for number, (begin, end) in enumerate(pairwise(edges)):
@@ -81,7 +80,7 @@ def test_parts_of_a_rest_have_the_windows_of_the_whole_rest(rng, edges_s):
     # At each cut less than one window of 10 s is lost.
     assert 0.0 <= rest.count.sum() - continued.count.sum() <= 10.0 * RATE_HZ * len(edges_s)
     assert np.all(np.diff(continued.time) > 0.0)
-    # Means of windows follow the drift within five sd of their noise.
+    # The means of windows differ from the drift by less than five sd of their noise.
     line = LEVEL + np.outer(continued.time, DRIFT)
     sd = NOISE / np.sqrt(continued.count)[:, None]
     assert np.abs((continued.mean - line) / sd).max() < 5.0
@@ -90,14 +89,14 @@ def test_parts_of_a_rest_have_the_windows_of_the_whole_rest(rng, edges_s):
 
 def test_recordings_that_are_not_parts_of_one_are_not_joined(rng):
     whole = recorded(rng, 400.0)
-    # Parts are joined after a pause of up to 60 s; in a longer pause the unit may have restarted.
+    # A pause of up to 60 s joins two parts; in a longer pause the unit may have restarted.
     for pause_s, n in ((1.0, 1), (50.0, 1), (61.0, 2)):
         assert len(joined(reduced(cut(whole, (200.0,), pause_s=pause_s)))) == n
     known = KnownForce('part', parse_sections('0 400 2.0'))
     assert len(joined(reduced(cut(whole, (200.0,)), force=known))) == 2
     short = recorded(rng, 2.0)
     assert len(joined(reduced([short, short]))) == 2
-    # Both recordings have the same stamps; each first part is joined with its own second part.
+    # The two recordings have equal stamps; each first part is joined with its own second part.
     parts = [*cut(whole, (200.0,)), *cut(replace(whole, accel=-whole.accel), (200.0,))[::-1]]
     first, second = joined(reduced(parts))
     assert len(first.intervals) == len(second.intervals) == 1
@@ -123,14 +122,13 @@ def test_a_move_between_parts_gives_two_rests_and_parts_without_a_rest_are_joine
     (bag,) = joined(reduced([before, moved]))
     first, second = bag.intervals
     assert first.time[-1] < 300.0 < second.time[0]
-    # WHY: the second rest began at 0 s, so windows of `evaluate` were off by up to half a window.
+    # WHY: the second rest began at 0 s, so windows of `evaluate` were up to half a window off.
     assert second.begin_s == pytest.approx(second.time[0] - 0.5 * bag.window_s, abs=0.01)
 
 
 @pytest.mark.slow
 def test_a_split_recording_gives_the_calibration_of_the_whole_recording():
-    # WHY: each part was fitted with a separate turn-on and separate lag states: the claimed sd was
-    # 6 times that of a fit to the whole recordings.
+    # WHY: each part had its own turn-on and lag states, so the claimed sd was 6 times too large.
     bag = thermo_comp.read(ROOT / 'bags/fit/01.mcap')
     parts = []
     for begin_s in np.arange(0.0, bag.time_s[-1], 1800.0):
@@ -148,7 +146,7 @@ def test_a_split_recording_gives_the_calibration_of_the_whole_recording():
         unit.correct(bag.time_s, bag.counts, **bag.temperatures).specific_force
         for unit in (whole, split)
     ))  # fmt: skip
-    # At the end of each part 30 s are lost; 1.2 ug is the noise of a mean over 60 s.
+    # Each part loses 30 s at its end; 1.2 ug is the noise of a mean over 60 s.
     assert np.nanstd(difference, axis=0).max() < 1.2 * MICRO_G
 
 
@@ -166,7 +164,7 @@ def test_evaluate_and_report_take_the_parts_as_one_recording(tmp_path, rng, cli)
     result = evaluate(paths, [('unit', calibration)])
     (bag,) = result.bags
     assert bag.source.name == 'part0.mcap .. part1.mcap'
-    # 900 s have 15 windows of 60 s, of which two may be lost at the cut.
+    # 900 s have 15 windows of 60 s; two windows may be lost at the cut.
     assert len(result.judgements['unit'].windows) >= 13
     thermo_comp.save(calibration, tmp_path / 'unit.yaml')
     errors = cli('evaluate', *paths, '-c', tmp_path / 'unit.yaml').stderr

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Windows, residuals and verdicts of a judgement agree with values computed by hand."""
+"""Windows, residuals and verdicts of a judgement agree with hand calculations."""
 
 import csv
 import dataclasses
@@ -8,7 +8,7 @@ import json
 
 import numpy as np
 import pytest
-from builders import GRAVITY, axis_set, calibration, equal_axes, regime_set
+from builders import GRAVITY, START_NS, axis_set, calibration, equal_axes, regime_set
 from conftest import ROOT
 
 from thermo_comp.cli.output import micro_g
@@ -30,7 +30,6 @@ from thermo_comp.unit.gravity import MICRO_G, parse_acceleration, ug_text
 from thermo_comp.unit.provenance import Provenance, ResidualSummary, Source
 
 TOPICS = Topics()
-START_NS = 1_767_225_600_000_000_000
 K = 300.0
 SLOPE = 2.0  # drift of the z axis [counts/K]
 
@@ -49,7 +48,7 @@ def resting(
     counts[:, 2] = K * GRAVITY + SLOPE * (celsius - 20.0) + error
     counts += noise * rng.standard_normal((n, 3))
     counts[:, ['xyz'.index(axis) for axis in dead]] = 0.0
-    # Alternate x by 1e-9 counts, because an axis that repeats one value counts as broken.
+    # x alternates by 1e-9 counts, because an axis that repeats one value counts as broken.
     counts[::2, 0] += 1e-9
     if shaken:
         rows = (seconds >= shaken[0]) & (seconds < shaken[1])
@@ -72,7 +71,6 @@ def corrected_by(slope, claim=0.0, **changes):
 
 
 def of_noise(sd):
-    """Make a calibration with white noise of `sd` per sample at 10 Hz [m/s^2]."""
     unit = dataclasses.replace(calibration().unit, cycle_time_s=0.1)
     return calibration(unit=unit, noise_density_m_s2_sqrt_hz=(sd * np.sqrt(0.1),) * 3)
 
@@ -103,7 +101,7 @@ CLAIMING = corrected_by(SLOPE, 1e-5)
 class TestWindows:
     @pytest.mark.parametrize('reading_s', [30, 50])
     def test_readings_every_30_or_50_s_remove_no_window(self, tmp_path, reading_s):
-        # WHY: at 2 Hz windows were lost: the time between temperature readings counted as a jump.
+        # WHY: the time between readings counted as a jump, so at 2 Hz windows were lost.
         bag = resting(tmp_path / 'bag', 30.0, minutes=30.0, rate_hz=2.0, reading_s=reading_s)
         windows = judged(bag, corrected_by(SLOPE)).windows
         assert len(windows) >= 28
@@ -116,7 +114,7 @@ class TestWindows:
         models = [('right', corrected_by(SLOPE)), ('half', corrected_by(SLOPE / 2))]
         judgements = evaluate([bag], models).judgements
         drift = SLOPE * 10.0 / K
-        # The estimated board temperature has an error of 1e-7 K: an error of |f| of 1e-9 m/s^2.
+        # The estimated board temperature errs by 1e-7 K, which changes |f| by 1e-9 m/s^2.
         for name, expected in (('right', 0.0), ('half', drift / 2)):
             windows = judgements[name].windows
             np.testing.assert_allclose(windows.raw_residual, drift, atol=1e-9)
@@ -126,7 +124,7 @@ class TestWindows:
         np.testing.assert_allclose(judgement.windows.residual, -1e-3, atol=1e-9)
 
     def test_a_window_is_the_mean_of_the_samples_that_the_node_publishes(self, tmp_path):
-        # The temperature rises by 1 K/min, so that a wrong time or reading changes the correction.
+        # The temperature rises by 1 K/min, so a wrong time or reading changes the correction.
         bag = resting(tmp_path / 'bag', (15.0, 33.0), minutes=18.0, noise=0.2)
         unit = corrected_by(SLOPE)
         windows = judged(bag, unit).windows
@@ -138,13 +136,13 @@ class TestWindows:
         for start_ns, mean in zip(windows.start_ns, windows.force, strict=True):
             inside = (stamps >= start_ns) & (stamps < start_ns + 60 * 10**9)
             assert inside.sum() == 600
-            # The judgement takes the correction as linear over 10 s: a force error < 0.001 ug.
+            # The judgement takes the correction as linear over 10 s: the error is below 0.001 ug.
             np.testing.assert_allclose(mean, force[inside].mean(axis=0), atol=1e-8)
 
     @pytest.mark.parametrize('rate_hz', [0.5, 1.0, 3.0, 4.0, 50.0])
     @pytest.mark.parametrize('window_s', [60.0, 120.0])
     def test_windows_at_rest_have_the_stated_length(self, tmp_path, rate_hz, window_s):
-        # WHY: at 4 Hz windows consisted of means of 32 samples (8 s): 10 s windows lasted 16 s.
+        # WHY: at 4 Hz windows were made of 8 s means (32 samples), so 10 s windows lasted 16 s.
         bag = resting(tmp_path / 'bag', 20.0, minutes=20.5, rate_hz=rate_hz, noise=0.3)
         windows = judged(bag, calibration(), window_s=window_s).windows
         assert windows.window_s == window_s
@@ -164,7 +162,7 @@ class TestWindows:
 
     @pytest.mark.parametrize('rate_hz', [10, 40])
     def test_residuals_of_white_noise_agree_with_their_claimed_sd(self, tmp_path, rate_hz):
-        # At both rates the noise has the density in the calibration: 0.3 counts/sample at 10 Hz.
+        # At both rates the noise has the calibrated density: 0.3 counts per sample at 10 Hz.
         knows, noise = of_noise(0.3 / K), 0.3 * np.sqrt(rate_hz / 10.0)
         bag = resting(tmp_path / 'bag', 20.0, minutes=40.0, rate_hz=rate_hz, noise=noise)
         windows = judged(bag, knows, window_s=10.0).windows
@@ -175,7 +173,7 @@ class TestWindows:
     def test_the_limit_of_noise_at_rest_follows_from_the_calibration_and_slow_samples_are_refused(
         self, tmp_path
     ):
-        # WHY: for a unit with a noise of 100 mg no window counted as rest (limit: 50 mg).
+        # WHY: a unit with 100 mg of noise had no window at rest, because the limit was 50 mg.
         bag = resting(tmp_path / 'bag', 20.0, noise=0.1 * K * GRAVITY)
         assert len(judged(bag, of_noise(0.1 * GRAVITY)).windows) >= 8
         with pytest.raises(RecordingError, match='no window of 60 s at rest'):
@@ -217,7 +215,7 @@ class TestVerdict:
             (121.0, 1000.0, 60.0, None, 'recalibrate'),
             (1100.0, 9000.0, 1500.0, None, 'valid, but it only claims 1.5 mg'),
             (50.0, 100.0, 60.0, None, 'valid, but it only claims 60 ug'),
-            # A residual not below the raw residual is never 'valid', for any claimed sd.
+            # A verdict is never 'valid' if the residual is not below the raw residual.
             (1100.0, 1000.0, 1500.0, None, 'no better than raw'),
             (1000.0, 1000.0, 1500.0, None, 'no better than raw'),
             (90.0, 1000.0, 10.0, 100.0, 'valid'),  # residual > claimed sd, < tolerance
@@ -238,12 +236,12 @@ class TestVerdict:
             assert ug_text(value * MICRO_G) in judgement.reason
         limited = 'in the worse regime, limit 100 ug' in judgement.reason
         assert limited == (tolerance is not None)
-        # WHY: the regime was called the worse one also if only one regime had been judged.
+        # WHY: the reason named a worse regime also if only one regime had been judged.
         one = judge(made(residual, raw, claimed, dynamic=0), CLAIMING, limit).reason
         assert ('over these windows, limit' in one) == limited
 
     def test_the_verdict_on_bags_of_the_fit_states_the_left_out_error_first(self):
-        # WHY: the verdict stated the error in fitted, not in new attitudes: 61 ug, not 1091 ug.
+        # WHY: the stated error was that of fitted attitudes, 61 ug, not of new attitudes, 1091 ug.
         fitted = ResidualSummary('all', 40, 1e-3, 5e-4, 1e-3, left_out_rms_m_s2=300.0 * MICRO_G)
         unit = dataclasses.replace(CLAIMING, provenance=Provenance(residuals=(fitted,)))
         windows = made(50.0, 1000.0, 60.0)
@@ -253,7 +251,7 @@ class TestVerdict:
         assert seen.headline_rms / MICRO_G == pytest.approx(300.0)
         left_out = '300 ug RMS of |f| - g on positions left out; in sample '
         assert seen.reason.startswith(f'{left_out}50 ug RMS of |f| - g, 1 mg raw')
-        # The in-sample error is judged by the claimed sd, the left-out error by a tolerance.
+        # The claimed sd judges the in-sample error, a tolerance judges the left-out error.
         assert seen.verdict == unseen.verdict == 'valid'
         limited = judge(windows, unit, 100.0 * MICRO_G, is_seen=True)
         assert limited.verdict == 'recalibrate'
@@ -261,7 +259,7 @@ class TestVerdict:
         assert judge(windows, unit, 100.0 * MICRO_G).verdict == 'valid'
 
     def test_the_error_is_printed_beside_that_on_data_left_out_of_the_fit(self, cli, tmp_path):
-        # 2 counts on z are an error of 2 / 300 m/s^2 = 680 ug; without noise there is no drift.
+        # 2 counts on z are an error of 2 / 300 m/s^2 = 680 ug; there is no noise, so no drift.
         bag = resting(tmp_path / 'bag.mcap', 25.0, error=2.0)
         path = tmp_path / 'it.yaml'
         for norm, drift, rows in (
@@ -309,7 +307,7 @@ class TestVerdict:
     def test_the_worse_regime_decides_the_verdict(self):
         windows = made(50.0, 1000.0, 60.0)
         windows.force[:10, 2] = GRAVITY + 150.0 * MICRO_G
-        # Residuals: 150 ug in the dynamic regime, 84 ug RMS in all windows. Claimed sd: 60 ug.
+        # The residual is 150 ug in the dynamic regime and 84 ug RMS in all; 60 ug are claimed.
         judgement = judge(windows, CLAIMING)
         assert judgement.sections['all'].ratio < 2.0
         assert judgement.verdict == 'recalibrate'
@@ -332,10 +330,10 @@ class TestVerdict:
         _, upper = CLAIMING.static.temperature_range_c
         judgement = judged(resting(tmp_path / 'out', upper + 2.0), CLAIMING)
         assert judgement.kind is Verdict.OUTSIDE
-        # WHY: for windows outside the range of rates, the message named temperatures only.
+        # WHY: for windows outside the range of rates the message named only temperatures.
         assert '+0.00 K/min; calibrated at 5.0 to 35.0 degC and -1.00 to +1.00' in judgement.reason
         assert f'at {upper + 2.0:.1f} to {upper + 2.0:.1f} degC' in judgement.reason
-        # A soak 0.01 K above the range counts as inside, because thermometer noise may be 0.01 K.
+        # Thermometer noise may be 0.01 K, so a soak 0.01 K above the range counts as inside.
         edge = judged(resting(tmp_path / 'edge', upper + 0.01), CLAIMING)
         assert edge.sections['outside'].n == 0
 
@@ -355,7 +353,7 @@ class TestShifts:
     @pytest.mark.parametrize('n', [6, 18])
     def test_changed_parameters_are_named(self, n):
         moved = around(n, (20.0 * MICRO_G, 0.0, 0.0), (0.0, 30e-6, 0.0), noise=0.5 * MICRO_G)
-        # 12 windows per position with a noise of 0.5 ug determine bias to 1 ug, scale to 1.5 ppm.
+        # 12 windows per position, with 0.5 ug of noise, determine bias to 1 ug, scale to 1.5 ppm.
         judgement = judge(moved, corrected_by(SLOPE, 1e-5), None)
         assert judgement.n_positions >= min(n, 12)
         assert judgement.shifts[0].bias / MICRO_G == pytest.approx(20.0, abs=1.0)
@@ -385,7 +383,6 @@ class TestShifts:
 
 
 def test_evaluate_reports_exchanged_thermometers_and_temperatures_out_of_range(tmp_path):
-    """Exchanged thermometers make a verdict invalid; temperatures out of range give a note."""
     exchanged = Topics(board='temperature/case', case='temperature/board')
     for topics, text in ((Topics(), []), (exchanged, [SWAPPED])):
         bag = ROOT / 'bags' / 'held_out.mcap'
@@ -401,14 +398,14 @@ def test_evaluate_reports_exchanged_thermometers_and_temperatures_out_of_range(t
 
 
 def test_a_bag_in_kelvins_or_with_an_axis_that_repeats_one_value_is_refused(tmp_path):
-    # WHY: a bag whose level y axis repeated one number, which hardly changes |f|, was valid.
+    # WHY: a bag whose level y axis repeated one number was valid, as y hardly changes |f|.
     bag = resting(tmp_path / 'dead.mcap', 20.0, noise=5.0, dead='y')
     noisy = of_noise(5.0 / K)
     with pytest.raises(RecordingError, match=r'dead\.mcap: dead axis: y reads exactly 0 for 0\.'):
         judged(bag, noisy)
-    # An axis with less noise than a step of the converter may repeat values and is not reported.
+    # An axis whose noise is below a step of the converter may repeat values, and is not reported.
     assert judged(bag, dataclasses.replace(noisy, noise_density_m_s2_sqrt_hz=(1e-5,) * 3))
-    # WHY: the verdict on a bag in kelvins was only that it is outside the calibrated temperatures.
+    # WHY: the verdict on a bag in kelvins only named temperatures outside the calibrated range.
     bag = resting(tmp_path / 'hot.mcap', 293.15)
     reason = r'hot\.mcap: temperature/board reads 293\S* degC .* kelv'
     with pytest.raises(RecordingError, match=reason):

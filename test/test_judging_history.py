@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Changes between calibrations and the verdicts and forecasts of the drift watch are right."""
+"""The history of a unit and the verdicts and forecasts of the drift watch are right."""
 
 import json
 from dataclasses import replace
@@ -39,7 +39,7 @@ def dated(created, bias_ug=0.0, ppm=0.0, sd_ug=3.0):
 
 
 def test_changes_between_calibrations_equal_those_found_by_hand_if_they_form_a_history():
-    # Dates give the order of calibrations. The change of z bias has the sd hypot(3, 4) = 5 ug.
+    # Dates order the calibrations; the change of the z bias has an sd of hypot(3, 4) = 5 ug.
     drifts = drifts_of(history_of([dated('2026-02-01', 20.0, 50.0, 4.0), dated('2026-01-01')]))
     names = [f'{kind} {axis}' for kind in ('bias', 'scale') for axis in 'xyz']
     assert [drift.constant for drift in drifts] == names
@@ -101,7 +101,6 @@ def folder(tmp_path_factory):
 @pytest.mark.usefixtures('no_figures')
 @pytest.mark.parametrize('options', [(), ('--tolerance', '1ug', '--window', '120')])
 def test_evaluate_and_report_give_equal_verdicts(cli, folder, options):
-    # WHY: two commands printed contradictory verdicts on one bag and calibration.
     page = folder / f'page{len(options)}.html'
     given = (folder / 'held_out.mcap', '-c', folder / 'unit.yaml', *options, '--json')
     printed = cli('evaluate', *given, code=None)
@@ -124,16 +123,16 @@ SLOW = pytest.mark.slow
 
 
 def walked(rate, bound, axes=1, mean=0.0):
-    """Forecast a random walk from `mean`, whose variance on each axis grows by `rate` per day."""
+    """Forecast a random walk from `mean`; on each axis its variance grows by `rate` per day."""
     start = np.full(axes, mean)
     return passage(start, np.zeros((axes, axes)), np.sqrt(rate) * np.eye(axes), bound)
 
 
 def test_the_probability_of_a_first_passage_agrees_with_closed_forms():
-    # A random walk of rate r stays within (-c, c) up to t with the probability: sum over k of
-    # (-1)^k [N((2 k + 1) c / s) - N((2 k - 1) c / s)], s^2 = r t, N: normal distribution. In three
-    # dimensions a walk of rate r on each axis stays in a ball of radius c up to t with the
-    # probability: 2 sum over k > 0 of (-1)^(k + 1) exp(-(k pi)^2 r t / 2 c^2).
+    # In one dimension a random walk of rate r stays within (-c, c) up to t with the probability
+    # sum over k of (-1)^k [N((2 k + 1) c / s) - N((2 k - 1) c / s)], s^2 = r t, N: normal
+    # distribution. In three dimensions it stays in a ball of radius c with the probability 2 sum
+    # over k > 0 of (-1)^(k + 1) exp(-(k pi)^2 r t / 2 c^2).
     rate, bound = 4.0, 50.0
     k, n = np.arange(-40, 41), np.arange(1, 200)
     both = walked(rate, bound), walked(rate, bound, 3)
@@ -144,7 +143,7 @@ def test_the_probability_of_a_first_passage_agrees_with_closed_forms():
         assert float((-1.0) ** k @ inside) == pytest.approx(1.0 - probability, abs=0.025)
         stays = 2.0 * (-1.0) ** (n + 1) @ np.exp(-((n * np.pi) ** 2) * rate * of_ball / 5000.0)
         assert stays == pytest.approx(1.0 - probability, abs=0.025)
-    # A random walk passes a nearer bound earlier; a unit that does not age never passes a bound.
+    # A random walk reaches a nearer bound earlier; a unit without ageing never reaches a bound.
     assert walked(rate, bound, mean=30.0)[1] < walked(rate, bound)[1]
     assert walked(1e-12, bound) == (np.inf,) * 3
     assert walked(rate, bound, mean=51.0) == (0.0,) * 3
@@ -152,29 +151,28 @@ def test_the_probability_of_a_first_passage_agrees_with_closed_forms():
 
 @pytest.mark.slow
 def test_forecasts_agree_with_the_simulated_future_of_units():
-    # WHY: errors of opposite attitudes cancelled: forecasts were 3 to 5 times too long.
+    # WHY: errors of opposite attitudes cancelled, so forecasts were 3 to 5 times too long.
     shares, ratios = [], []
     for kind in ('fixed', 'up and down', 'faces', 'carried'):
         for rows in field_watch.forecasts(kind, 3, 20).values():
             shares += rows[:, 0].tolist()
             ratios.append(float(np.median(rows[:, 3] / rows[:, 1])))
-    # The interval must contain 80 % of the simulated days on which a unit leaves the tolerance;
-    # the mean of 24 such shares has an error of 6 %.
+    # The interval must contain 80 % of the simulated days; a mean of 24 shares errs by 6 %.
     assert np.mean(shares) == pytest.approx(0.8, abs=0.12)
-    # The median time to the limit is uncertain by a factor of 1.5, the mean of eight by 1.3.
+    # A forecast's median is uncertain by a factor of 1.5, the mean of eight medians by 1.3.
     assert 1.0 / 1.6 < np.exp(np.mean(np.log(ratios))) < 1.6
     assert 0.45 < min(ratios) < max(ratios) < 2.2
 
 
 @pytest.mark.parametrize('attitudes', [upright, pytest.param(in_any_attitude, marks=SLOW)])
 def test_the_verdict_follows_the_true_error_on_each_day(attitudes):
-    # The RMS error is 1.5 times the limit on days 20 to 34, 20 times on day 12, else 0.6 times.
+    # RMS error / limit is 1.5 on days 20 to 34, 20 on day 12, and 0.6 on all other days.
     unit = precise()
     limit = LIMIT * np.sqrt(np.mean(series_of(rests(unit, attitudes, no_error), unit).claim ** 2))
 
     def error(day):
         size = 1.5 if 20.0 <= day < 34.0 else 0.6
-        # A bias error of s on each axis has an RMS component of s along random directions.
+        # A bias error of s on each axis has an RMS of s along random directions.
         return np.full(3, limit * (20.0 if 12.0 <= day < 13.0 else size))
 
     series = series_of(rests(unit, attitudes, error, 40, turn_on=5.0 * MICRO_G), unit)
@@ -185,8 +183,8 @@ def test_the_verdict_follows_the_true_error_on_each_day(attitudes):
         outside = None if since is None else str(np.datetime64(first + since, 'D'))
         assert (result.exit_code, result.outside_since) == (int(outside is not None), outside)
         assert ('outside its claim since' in str(result)) == (since is not None)
-        # With gravity along (1, 1, 1), bias errors of 0.6 times the limit change |f| by 1.04 times
-        # the limit: the day on which the unit returns to its claim may be printed a day late.
+        # If gravity is along (1, 1, 1), biases of 0.6 times the limit change |f| by 1.04 times the
+        # limit: the unit may return to its claim a day late.
         back = [str(np.datetime64(first + day, 'D')) for day in (34, 35)]
         assert (result.inside_since in back) == (n_days > 34)
         assert ('again within its claim since' in str(result)) == (result.inside_since is not None)

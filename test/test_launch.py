@@ -15,7 +15,7 @@ FILES = sorted((ROOT / 'launch').glob('*.launch.xml'))
 OURS = ROOT / 'launch' / 'thermo_comp.launch.xml'
 BESIDE = ROOT / 'launch' / 'beside_ins.launch.xml'
 
-# Parameters of nodes of other packages in ROS Jazzy; ROS ignores misspelt parameters silently.
+# Parameters of nodes of other packages in ROS Jazzy: ROS silently ignores misspelt parameters.
 OTHERS = {
     ('tf2_ros', 'static_transform_publisher'): set(),
     ('imu_filter_madgwick', 'imu_filter_madgwick_node'): {
@@ -60,7 +60,6 @@ class TestEveryFile:
 
 
 def parameters_set(arguments):
-    """Return the parameters that thermo_comp.launch.xml sets for the given arguments."""
     given = {arg.get('name', ''): arg.get('default', '') for arg in parse(OURS).findall('arg')}
     given |= arguments
 
@@ -76,7 +75,6 @@ def parameters_set(arguments):
 
 
 def test_a_parameter_is_set_only_where_its_argument_was_given(tmp_path):
-    # WHY: defaults of launch arguments replaced values in the user's parameter file.
     pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
     import rclpy
     import yaml

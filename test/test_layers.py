@@ -18,7 +18,7 @@ from thermo_comp.unit.terms import GROUPS
 
 PACKAGE = ROOT / 'thermo_comp'
 
-# Layer of each package (a folder or file in thermo_comp): a package imports no higher layer.
+# Layer of each package, a folder or file of thermo_comp. No package imports from a higher layer.
 LAYERS = {
     **dict.fromkeys(('__init__', 'errors', 'typing', 'files', 'plain_yaml', 'quantities'), 0),
     **dict.fromkeys(('topics', 'text'), 0),
@@ -30,7 +30,7 @@ LAYERS = {
     **dict.fromkeys(('ros', 'cli', '__main__'), 6),
 }
 
-# The packages that may import each library; any package may import a library not listed here.
+# Packages that may import a library; any package may import a library that is not listed.
 ROS = ['rclpy', 'rcl_interfaces', 'sensor_msgs', 'geometry_msgs', 'std_msgs', 'diagnostic_msgs']
 HOMES = {
     **{name: {'ros'} for name in ROS}, 'rosgraph_msgs': {'ros'}, 'builtin_interfaces': {'ros'},
@@ -41,7 +41,7 @@ HOMES = {
     'rich': {'cli', '__main__'},
 }  # fmt: skip
 
-# Packages of mathematics, which must not read a clock, except for the files `CLOCK_EXCEPTIONS`.
+# Packages of mathematics; except for `CLOCK_EXCEPTIONS` their files must not read a clock.
 PURE = {'thermal', 'unit', 'online', 'simulation', 'fitting', 'field'}
 CLOCKS = {'time', 'datetime', 'sched', 'threading', 'asyncio'}
 CLOCK_EXCEPTIONS = {'fitting/assembly.py'}  # writes the date of a fit into the provenance
@@ -55,7 +55,7 @@ def unit_of(path):
 
 @cache
 def imports_of(path, with_types=True):
-    """Return (line, absolute dotted name) of every import, also of those inside functions."""
+    """Return line and absolute dotted name of every import, also of imports inside functions."""
     here = ('thermo_comp', *path.relative_to(PACKAGE).with_suffix('').parts)
     tree = ast.parse(path.read_text(encoding='utf-8'), str(path))
     typing = {
@@ -139,11 +139,11 @@ def test_imports_between_packages_and_between_files_form_no_circle(by):
         targets = {own_unit(name) if by == 'package' else own_file(name) for name in names}
         uses.setdefault(here, set()).update(target for target in targets if target != here)
     left = circle(uses)
-    assert not left, f'import each other: {left}'
+    assert not left, f'these import each other: {left}'
 
 
 def loaded_after(statement, *watched):
-    """Return which of the watched modules a new interpreter has imported after one statement."""
+    """Run a statement in a new interpreter; return the watched modules that it imported."""
     code = f'{statement}\nimport sys\nprint(*[m for m in {watched!r} if m in sys.modules])'
     return ran(sys.executable, '-c', code, check=True, timeout=120).stdout.split()
 
@@ -176,6 +176,6 @@ def test_tables_of_packages_and_of_groups_equal_those_of_the_source():
 def test_the_files_that_a_page_names_exist(page):
     for name in re.findall(r'[\w*/]+\.py\b', (DOCS / page).read_text()):
         places = (ROOT, ROOT / 'thermo_comp', ROOT / 'test')
-        # A page names a file by its path, or by its name alone if the folder is named before.
+        # A page gives the path of a file, or only its name after it has named the folder.
         is_path = any(list(place.glob(name)) for place in places)
         assert is_path or any(path.name == name for path in SOURCES), name

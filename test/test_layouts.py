@@ -86,7 +86,7 @@ def test_foxglove_paths_name_numbers_of_messages_and_each_panel_is_shown_once(to
         else:
             assert field_kind(topics[topic], fields) in ('float64', 'bool')
         used.add(topic)
-    # `regime/stamped` repeats the flags of `regime/dynamic`, which the Foxglove layout shows.
+    # The layout shows `regime/dynamic`, so it does not need `regime/stamped` with equal flags.
     assert used == {output, *topics} - {'/regime/stamped'}
     (inputs,) = re.findall(r'export const inputs = (\[.*\])', script())
     assert set(json.loads(inputs)) <= set(topics)
@@ -113,7 +113,7 @@ def test_plotjuggler_curves_name_numbers_and_splitters_count_their_panels(topics
     for series in (curves - set(snippets)) | sources:
         topic = max((name for name in topics if series.startswith(f'{name}/')), key=len)
         fields = series[len(topic) + 1 :].split('/')
-        # PlotJuggler names entries of a covariance [row;column]; messages number them from 0 to 8.
+        # PlotJuggler names entries of a covariance [row;column], a message numbers them 0 to 8.
         if match := re.fullmatch(r'\[([012]);([012])\]', fields[-1]):
             place = 3 * int(match[1]) + int(match[2])
             fields = [*fields[:-2], f'{fields[-2]}[{place}]']
@@ -126,8 +126,8 @@ def test_plotjuggler_curves_name_numbers_and_splitters_count_their_panels(topics
 @pytest.mark.parametrize(
     ('name', 'expected'),
     [
-        # T = 20 + 0.5 m + 0.01 m^2 with m in minutes has a rate of 1.7 K/min at 60 min, or 1.68
-        # K/min after two low-passes of 30 s, and a second derivative of 0.02 K/min^2.
+        # At 60 min T = 20 + 0.5 m + 0.01 m^2 (m: minutes) has a rate of 1.7 K/min, or 1.68 K/min
+        # after two low-passes of 30 s, and a second derivative of 0.02 K/min^2.
         ('/thermo_comp/board_k_min', 1.68),
         ('/thermo_comp/case_k_min', 1.68),
         ('/thermo_comp/case_k_min2', 0.02),

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A fit recommends a bag that separates two terms whose effects its bags do not separate."""
+"""If its bags do not separate two terms, a fit recommends a bag that separates them."""
 
 from functools import cache
 
@@ -22,7 +22,7 @@ def fitted(bags):
 
 @cache
 def chamber():
-    """Record a unit whose board is cooled by the fan, in 9 positions in the chamber."""
+    """Record 9 positions in the chamber of a unit whose board is cooled by the chamber's fan."""
     rng = rng_of('alike', 0)
     unit = navigation(rng, vent_share=0.3)
     return unit, positions(unit, HALF, spread(9, rng), rng)
@@ -39,13 +39,13 @@ def inflation_of(result, *groups):
 
 def test_bags_of_one_environment_do_not_separate_lags_of_board_and_gradient():
     result = fitted(chamber()[1])
-    # Thermometers and unknown initial lag states limit the correlation of the two lags.
+    # Unknown initial lag states and thermometer noise limit the correlation of the two lags.
     assert inflation_of(result, 'board', 'gradient_lag') > 300.0
     (message,) = advice_of(result)
     assert 'do not tell a lag of the board temperature from a lag of T_case - T_board' in message
     assert 'such as with the fan off' in message
     assert any(note.startswith('alike: ') for note in result.calibration.provenance.notes)
-    # Lag states and tilts are below the noise: the unit starts in a soak, on rigid supports.
+    # The unit starts in a soak, on rigid supports: lag states and tilts are below the noise.
     noise = result.fit.selected.score.noise
     assert max(result.contributions.initial_lag_states, result.contributions.support_tilt) < noise
     assert result.contributions.thermal_response > 50.0 * noise
@@ -81,7 +81,7 @@ def test_one_attitude_in_the_chamber_does_not_separate_bias_and_scale():
         (('bias', 'bias'), 0.996, 1, True),  # variance inflation factor: 125
         (('bias', 'bias'), 0.994, 9, False),  # variance inflation factor: 84
         (('bias', 'scale'), 0.996, 6, True),
-        # The finding `positions` says that five attitudes do not separate bias and scale.
+        # The finding `positions` states that five attitudes do not separate bias and scale.
         (('bias', 'scale'), 0.996, 5, False),
     ],
 )

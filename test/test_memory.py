@@ -18,7 +18,7 @@ TWO_STAGES = Lag('board', 900.0, 150.0)
 
 @pytest.mark.parametrize('step_s', [0.5, 5.0, 77.0])
 def test_the_lag_of_a_ramp_agrees_with_the_closed_formula(step_s):
-    # For a ramp u = r t after a soak, u - lagged u = r tau (1 - exp(-t / tau)), for any step.
+    # After a soak, in a ramp u = r t, u - lagged u is r tau (1 - exp(-t / tau)) for any step.
     rate, n = 0.01, 200
     bank = LagBank(TAUS)
     for k in range(n + 1):
@@ -32,7 +32,7 @@ def test_the_lag_of_a_ramp_agrees_with_the_closed_formula(step_s):
 def test_errors_of_a_lag_after_a_gap_a_jump_wrong_or_stuck_readings_agree_with_formulas():
     bank = LagBank((100.0, 1000.0))
     bank.step(0, 0.0)
-    # A gap above tau / 10 adds variance to a lag: a gap of 50 s if tau = 100 s, not if 1000 s.
+    # A gap above tau / 10 adds variance to a lag: 50 s if tau is 100 s, but not if it is 1000 s.
     bank.step(50 * SECOND_NS, 2.0)
     lost = 2.0 * (1.0 - math.exp(-0.5))
     assert bank.extra == pytest.approx([lost**2, 0.0])
@@ -65,7 +65,7 @@ def test_errors_of_a_lag_after_a_gap_a_jump_wrong_or_stuck_readings_agree_with_f
 
 
 def after_two_stages(times, board):
-    """Integrate two lags in series after a soak, with the board as input; return the output."""
+    """Integrate two lags in series after a soak, whose input is the board; return the output."""
 
     def slope(t, parts):
         return [(np.interp(t, times, board) - parts[0]) / 900.0, (parts[0] - parts[1]) / 150.0]
@@ -117,7 +117,7 @@ def test_the_lag_of_a_part_coupled_to_board_and_case_agrees_with_a_solver(rng):
     np.testing.assert_allclose(board - streamed[:, 0], part, atol=1e-5)
     on_grid = memory_on_grid(spec, 30.0, board, [case - board])
     np.testing.assert_allclose(on_grid[:, [0, 2, 4]], streamed[:, [0, 2, 4]], atol=1e-9)
-    # The lag of a part contains the lagged gradient with a minus sign: their covariance is < 0.
+    # The lag of a part contains the lagged gradient with a minus sign: the covariance is < 0.
     P = start_covariance(spec.lags)
     assert P[0, 1] < 0.0 < P[0, 0] + 2.0 * P[0, 1] + P[1, 1]
     # A lag with two inputs begins with the first value of the input that begins later.
@@ -165,7 +165,7 @@ def test_the_prior_of_the_initial_state_of_two_stages_is_that_of_a_random_walk(r
         parts[:, 0] *= math.exp(-step / tau[0])
         parts[:, 1] += (parts[:, 0] - parts[:, 1]) * -math.expm1(-step / tau[1])
     P = start_covariance([TWO_STAGES])
-    # The variance of n draws is uncertain by sqrt(2 / n) = 2.2 %; time step: 4 % of tau = 150 s.
+    # n draws determine the variance to sqrt(2 / n) = 2.2 %; a time step is 4 % of tau = 150 s.
     assert np.mean(parts[:, 1] ** 2) == pytest.approx(P[0, 0], rel=0.11)
     for age in (150.0, 900.0, 2700.0):
         first = parts[:, 0] * math.exp(-age / tau[0])
@@ -177,7 +177,7 @@ def test_the_prior_of_the_initial_state_of_two_stages_is_that_of_a_random_walk(r
 
 
 def test_the_hysteresis_loop_of_a_play_agrees_with_the_formula():
-    # For an input v a play is v - 1 in rises, v + 1 in falls, constant for 2 K after a reversal.
+    # The play of an input v is v - 1 in rises, v + 1 in falls, and constant for 2 K at a reversal.
     memory = ThermalMemory(MemorySpec(plays=((0.0, 1.0),)))
     way = np.concatenate((np.linspace(0, 5, 51), np.linspace(5, 0, 51), np.linspace(0, 5, 51)))
     P = []
@@ -202,7 +202,7 @@ def test_initial_lag_states_have_the_prior_of_a_random_walk_and_decay(rng):
         e = np.exp(-step / tau)
         m = m * e + walk * (tau / step) * (1.0 - e)
     P = start_covariance([('board', t) for t in tau])
-    # The variance of n draws is uncertain by sqrt(2 / n) = 2.2 %; time step: 10 % of tau = 60 s.
+    # n draws determine the variance to sqrt(2 / n) = 2.2 %; a time step is 10 % of tau = 60 s.
     np.testing.assert_allclose(m.T @ m / n, P, rtol=0.11)
     P = start_covariance((('board', 60.0), ('board', 3600.0), ('case', 3600.0), ('tip', 3600.0)))
     assert math.sqrt(P[1, 1]) == pytest.approx(3.0, rel=START_JITTER)

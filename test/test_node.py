@@ -116,7 +116,7 @@ def test_the_regime_flag_is_latched_and_not_published_while_unknown(peer, saved)
         late = peer.listen(Bool, 'regime/dynamic', LATCHED)
         peer.wait_for(lambda: late, 'the latched flag')
         assert not late[0].data
-        # `regime/stamped` (stamp: that of the deciding reading) is latched like `regime/dynamic`.
+        # `regime/stamped` has the stamp of the deciding reading, and is latched, too.
         latched = peer.listen(DiagnosticArray, 'regime/stamped', LATCHED)
         peer.wait_for(lambda: latched and len(stamped_flags) == len(flags), 'the stamped flags')
         last_ns = ros.stamp_of(stamped_flags[-1])
@@ -158,7 +158,7 @@ def test_diagnostics_name_faults_of_samples(peer, saved):
         wait(lambda s, _: 'no samples are coming in' in s.message and 'sat' not in s.message)
         driver.temperatures(stamp_ns, 40.0, 40.0)
         driver.counts(stamp_ns + ros.CYCLE_NS, 1.0, 2.0, 3.0)
-        # A stamp that falls by less than 1 s is out of order, by more than 1 s a jump of time.
+        # A stamp that falls by up to 1 s is out of order; a fall by more is a jump of time.
         driver.counts(stamp_ns - 5, 1.0, 2.0, 3.0)
         _, status, _ = wait(lambda s, _: 'out of order' in s.message)
         driver.counts(ros.START_NS - 10 * ros.SECOND_NS, 1.0, 2.0, 3.0)

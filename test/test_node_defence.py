@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node answers any request, and publishes all samples, whatever unknown peers send."""
+"""Whatever unknown peers send, the node answers any request and publishes all samples."""
 
 import contextlib
 import math
@@ -36,7 +36,7 @@ from thermo_comp.unit.calibration_file import save_calibration
 SLOW = pytest.mark.slow
 
 
-#: Parameters that a request may contain; the node must answer each request.
+#: A request may contain these parameters, and must be answered.
 STRANGE = [
     *[ParameterMessage(name=name, value=ParameterValue(type=kind))
       for name in ('frame_id', '', 'no such') for kind in (0, 77, 255)],
@@ -248,7 +248,6 @@ def test_while_a_calibration_file_hangs_the_node_can_be_ended(peer, unit, number
 
 
 def test_a_fault_that_comes_and_goes_does_not_fill_the_log(peer, unit, capfd):
-    # WHY: a sample dropped every other second logged 3600 lines per hour.
     with ros.node_in_thread(*ros.node_arguments(unit)) as node:
         samples = ros.Samples(peer, node)
         for _ in range(8):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node, with a bag played over DDS, and the offline replay of the bag give the same bits."""
+"""The node, into which a bag is played over DDS, and the offline replay give the same bits."""
 
 import csv
 import gc
@@ -12,7 +12,7 @@ from recording_helpers import imu_columns
 
 pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 
-from builders import rich_calibration
+from builders import START_NS, rich_calibration
 from live_node import through_the_node
 from rosbags.highlevel import AnyReader
 
@@ -26,7 +26,6 @@ from thermo_comp.unit.calibration import Unit
 from thermo_comp.unit.calibration_file import save_calibration
 
 TOPICS = Topics()
-START_NS = 1_767_225_600_000_000_000
 RATE_HZ = 1
 MINUTES = 18
 UNIT = Unit('T-1', 'counts', 32767.0, 1.0 / RATE_HZ)
@@ -34,7 +33,7 @@ UNIT = Unit('T-1', 'counts', 32767.0, 1.0 / RATE_HZ)
 
 @pytest.fixture(autouse=True)
 def _collected():
-    """Free objects in circular references: their ROS nodes would be visible to the next test."""
+    """Free objects in circular references, as the next test would see their ROS nodes."""
     yield
     gc.collect()
 
@@ -100,7 +99,7 @@ def run(calibration, bag, folder, *node_args, **keys):
     assert np.flatnonzero((out.accel != expected.accel).any(axis=1)).tolist() == []
     for name in ImuColumns._fields:
         assert getattr(out.imu, name).tobytes() == getattr(expected.imu, name).tobytes(), name
-    # There is one regime flag for each case reading, so equal flags mean equal switching times.
+    # Each case reading has a regime flag, so equal flags mean equal switching times.
     assert [flags, stamped] == expected_flags
     assert ({*flags}, len(stamped)) == ({False, True}, len(flags))
     assert recorded['imu/data_raw'] == result.counters.n_out
@@ -117,7 +116,6 @@ def test_node_and_replay_give_equal_output_for_counts(tmp_path):
 
 @pytest.mark.slow
 def test_without_a_case_sensor_the_board_rate_selects_the_regime(tmp_path):
-    # WHY: without a case sensor `regime/dynamic` was never published.
     n = thermal_test(tmp_path / 'bag', has_case=False)
     unit = replace(rich_calibration(), unit=UNIT)
     assert run(unit, tmp_path / 'bag', tmp_path) == n
@@ -138,10 +136,10 @@ def test_node_and_replay_give_equal_output_for_imu_messages(tmp_path):
     published, _, _ = output_of(tmp_path / 'live.mcap')
     given = given.imu.take(np.flatnonzero(np.isin(given.accel_stamp_ns, published.accel_stamp_ns)))
     is_rate = given.angular_velocity_covariance[:, 0] != -1.0
-    # The node corrects measured angular rates, and does not change rates marked as missing.
+    # The node corrects measured angular rates, and keeps rates that are marked as missing.
     moved = np.abs(published.imu.angular_velocity - given.angular_velocity)
     assert moved[~is_rate].max() == 0.0
-    # WHY: a rate that is NaN was published with the variances of a corrected rate.
+    # WHY: a rate of NaN was published with the variances of a corrected rate.
     assert (given.linear_acceleration_covariance[:, 0] != -1.0).all()
     is_nan = np.isnan(published.imu.angular_velocity).any(axis=1)
     assert 0 < np.count_nonzero(is_nan) < len(is_nan) / 10

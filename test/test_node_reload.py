@@ -12,13 +12,13 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 
 import rclpy
-from builders import calibration
+from builders import SECOND_NS, START_NS, calibration
 from live_node import lossless
 from node_process import NodeProcess
 from rcl_interfaces.srv import GetParameters
 from rclpy.context import Context
 from rclpy.parameter import Parameter
-from ros_helpers import SECOND_NS, TIMEOUT, Driver, node_in_thread, stamp_of, standing
+from ros_helpers import CYCLE_NS, TIMEOUT, Driver, node_in_thread, stamp_of, standing
 from sensor_msgs.msg import Imu
 
 from thermo_comp.online.compensator import Compensator
@@ -27,13 +27,11 @@ from thermo_comp.thermal.settings import DetectorSettings
 from thermo_comp.unit.calibration import Axes, AxisReference, Unit
 from thermo_comp.unit.calibration_file import dump_calibration, save_calibration
 
-START_NS = 1_767_225_600 * SECOND_NS
-CYCLE_NS = 10_000_000
 K = 300.0
 
 
 def of_bias(counts, **keys):
-    """Make a calibration that a test recognises by its bias of the x axis [counts]."""
+    """Make a calibration that a test recognises by the bias of the x axis [counts]."""
     axes = Axes(AxisReference(K, counts), AxisReference(K, 0.0), AxisReference(K, 0.0))
     return calibration(axes=axes, **keys)
 
@@ -106,7 +104,7 @@ def test_a_reload_while_samples_flow_loses_no_sample(peer, tmp_path):
         values = peer.call(GetParameters, 'thermo_comp/get_parameters', request).values
         assert values[0].double_value == 30.0
         assert flow.bias(flow.more() - 1) == 2.0
-        # Setting the present path reads its file again; a float parameter accepts an integer.
+        # If the path is set again, its file is read again; a float parameter accepts an integer.
         save_calibration(of_bias(3.0), second)
         result = peer.set_atomically(transition_time=5, calibration_file=str(second))
         assert result.successful, result.reason
@@ -165,10 +163,9 @@ def raising_at(number, call):
 
 
 def test_a_change_that_fails_at_any_line_is_not_applied(tmp_path):
-    # WHY: a calibration was refused, but samples were corrected with its bias.
     first, second = tmp_path / 'first.yaml', tmp_path / 'second.yaml'
     save_calibration(of_bias(1.0), first)
-    # As the detector settings of the files differ, every part of the correction is built anew.
+    # The detector settings of the files differ, so every part of the correction is built anew.
     save_calibration(of_bias(2.0, detector=DetectorSettings(dwell_s=61.0)), second)
     context = Context()
     rclpy.init(args=['--ros-args', '-p', f'calibration_file:={first}'], context=context)
@@ -209,7 +206,6 @@ def test_a_change_that_fails_at_any_line_is_not_applied(tmp_path):
 
 
 def test_a_calibration_of_another_unit_is_named(peer, tmp_path, capfd):
-    # WHY: a calibration of another unit was used unwarned; errors were 890 times the claimed sd.
     first, second = tmp_path / 'first.yaml', tmp_path / 'second.yaml'
     save_calibration(of_bias(1.0), first)
     unit = of_bias(1.0).unit

@@ -34,7 +34,6 @@ def contested(peer, heard, topic, send):
 
 
 def test_samples_of_a_second_publisher_are_never_published(peer, unit):
-    # WHY: the node corrected and published samples of a second driver, in a different attitude.
     with ros.node_in_thread(*ros.node_arguments(unit)) as node:
         samples = ros.Samples(peer, node)
         other = peer.node.create_publisher(Vector3Stamped, 'accel/counts', ros.DEEP)
@@ -51,7 +50,7 @@ def test_samples_of_a_second_publisher_are_never_published(peer, unit):
         assert {value.key: value.value for value in status.values}['sample publishers'] == '2'
         peer.node.destroy_publisher(other)
         peer.poll(lambda: node._relay.running.samples.count_publishers() == 1, 'one left')
-        # After one of two drivers has ended, samples that it sent before may still arrive.
+        # Samples of the driver that has ended may still arrive after its end.
         samples.send(20)
         before = len(samples.heard)
         peer.poll(lambda: (samples.send(1), len(samples.heard) > before)[1], 'samples again')
@@ -59,7 +58,7 @@ def test_samples_of_a_second_publisher_are_never_published(peer, unit):
         assert all(ros.stamp_of(imu) % ros.CYCLE_NS == 0 for imu in samples.heard)
 
 
-#: A driver process: once it has a subscriber it sends samples at 100 Hz; frame_id: its name.
+#: A driver process sends samples at 100 Hz once it has a subscriber; frame_id is its name.
 DRIVER = """
 from thermo_comp.text import keep_standard_output
 keep_standard_output()
@@ -94,7 +93,7 @@ rclpy.spin(node)
 
 @contextlib.contextmanager
 def driver_process(name):
-    """Run a driver until the context ends; yield the process and its first sample's stamp [ns]."""
+    """Run a driver until the context ends; yield its process and the first sample's stamp [ns]."""
     command, environment = [sys.executable, '-c', DRIVER, name], {**os.environ, **OVER_UDP}
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
     try:
@@ -151,7 +150,7 @@ def test_two_publishers_that_send_are_never_mixed(offset, period_s):
         if not sources.first_of_single_source(n_known, [number], [round(at_s * 1e9)]):
             used.append((at_s, name))
     assert {name for _, name in used} == {'own'}
-    # Driver 2 ends at 8 s; from 10 s on all samples of driver 1 are used.
+    # Driver 2 ends at 8 s, and from 10 s on all samples of driver 1 are used.
     assert sum(at_s < 2.0 for at_s, _ in used) >= 199
     assert sum(at_s > 10.0 for at_s, _ in used) >= 199
 
@@ -208,9 +207,8 @@ def test_a_driver_with_incompatible_qos_or_type_is_named(peer, unit):
 
 
 def test_reports_more_frequent_than_samples_report_no_missing_samples(peer, tmp_path):
-    # WHY: with a diagnostics_period below the sample interval, some reports had level ERROR.
     slow = tmp_path / 'slow.yaml'
-    # An error needs 5 cycles (1.5 s) without a sample: no busy machine pauses for so long.
+    # An error requires 5 cycles (1.5 s) without a sample; no busy machine pauses for 1.5 s.
     save_calibration(calibration(unit=Unit('T-1', 'counts', 32767.0, 0.3)), slow)
     with ros.node_in_thread(*ros.node_arguments(slow, 'diagnostics_period:=0.01')) as node:
         heard = peer.listen(DiagnosticArray, '/diagnostics')
@@ -231,7 +229,6 @@ def test_reports_more_frequent_than_samples_report_no_missing_samples(peer, tmp_
 
 
 def test_the_warning_of_a_reading_a_day_ahead_ends(peer, unit):
-    # WHY: after a temperature with a stamp one day ahead, the status stayed WARN for a day.
     with ros.node_in_thread(*ros.node_arguments(unit)) as node:
         samples = ros.Samples(peer, node)
         samples.driver.temperatures(ros.START_NS + 86_400 * ros.SECOND_NS, 25.0)

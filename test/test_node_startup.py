@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A node that cannot start ends with one line; a node that has started ends cleanly."""
+"""A node that cannot start ends with one line on stderr; a node that has started ends cleanly."""
 
 import signal
 import subprocess
@@ -82,7 +82,7 @@ def test_an_unusable_ros_environment_is_one_line(name, value, text, unit, monkey
 
 
 def test_a_node_with_closed_streams_runs(unit, peer):
-    # WHY: with stderr closed, the pipe for signals had descriptor 2, so log text became a signal.
+    # WHY: with stderr closed the pipe for signals got descriptor 2: log text became a signal.
     shell = ['sh', '-c', 'exec "$0" "$@" <&- >&- 2>&-', sys.executable]
     words = [*shell, '-m', 'thermo_comp.ros.node', *arguments(f'calibration_file:={unit}')[1:]]
     with subprocess.Popen(words, cwd=Path(__file__).parents[1]) as node:
@@ -104,7 +104,7 @@ ABSENT = ('typer', 'rich', 'rosbags', 'mcap', 'zstandard', 'scipy', 'matplotlib'
 
 
 def test_node_and_commands_without_ros_end_with_advice(tmp_path, monkeypatch):
-    # ROS 2 for another version of Python, such as that of conda.
+    # This ROS 2 belongs to another version of Python, such as that of conda.
     absent = 'rclpy._rclpy_pybind11'
     (tmp_path / 'rclpy').mkdir()
     text = f'raise ImportError("No module named {absent}\\nSee another page")\n'
@@ -121,7 +121,7 @@ def test_node_and_commands_without_ros_end_with_advice(tmp_path, monkeypatch):
 
 
 def test_the_node_needs_only_ros_numpy_and_yaml(unit, peer, tmp_path, monkeypatch):
-    # Python imports sitecustomize at its start, in the node and in its child processes.
+    # Python imports sitecustomize when it starts, in the node and in its child processes.
     (tmp_path / 'sitecustomize.py').write_text(
         'import sys\n'
         'class Absent:\n'

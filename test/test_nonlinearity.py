@@ -91,7 +91,7 @@ def test_a_nonlinearity_without_terms_changes_no_bit_and_with_a_slope_needs_a_th
 
 
 def test_the_variance_includes_all_parameters_and_beyond_the_fit_an_unknown_square(rng):
-    # The unit has no term |f| f, for which the claimed variance exceeds the exact variance.
+    # The unit has no term |f| f, with which the claimed variance would exceed the exact one.
     unit = with_covariance(calibration(nonlinearity=replace(BENT, terms=(SQUARE, CUBE))), rng)
     layout, correction = parameter_layout(unit), Correction(unit)
     whole, t = unit.posterior.covariance(), 7.0
@@ -148,5 +148,5 @@ def test_rests_in_the_field_depend_on_every_nonlinear_coefficient():
         changed = values + step * (np.arange(len(values)) == k)
         moved = with_parameters(unit, scale, changed, covariance)
         slope = (series.residual - series_of(logged, moved).residual) / step
-        # The derivatives neglect d(K2 f^2)/df, which gives them a relative error of 2 * K2 * 1 g.
+        # The derivatives neglect d(K2 f^2)/df, and so have a relative error of 2 * K2 * 1 g.
         assert np.allclose(slope, series.by_parameter[:, k], atol=1e-3 * abs(slope).max() + 1e-7)

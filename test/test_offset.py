@@ -6,27 +6,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders import source_of
-from position_helpers import START_NS
+from position_helpers import GRAVITY, source
 
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.coverage import rough_centre
 from thermo_comp.fitting.fit import with_code_offset
 from thermo_comp.simulation.campaign import positions
 
-GRAVITY = 9.80665
 OPTIONS = FitOptions(gravity=GRAVITY)
 K = np.array((4130.0, 4080.0, 4200.0)) / GRAVITY
 BIAS = np.array((120.0, -340.0, 55.0))
 M = np.array(((1.0, 0.0, 0.0), (0.004, 1.0, 0.0), (-0.006, 0.003, 1.0)))
 
 
-def source(words, name='words'):
-    return source_of(START_NS + np.arange(len(words)) * 10_000_000, words, name=name)
-
-
 def words_of(ups, rng, seconds=20.0):
-    """Draw integer codes at 100 Hz: for each attitude 1 s of motion, then `seconds` at rest."""
+    """Draw integer codes at 100 Hz: in each attitude 1 s of motion, then `seconds` of rest."""
     parts = []
     for up in ups:
         n = round(100 * seconds)
@@ -59,7 +53,7 @@ def test_constants_of_unsigned_words_equal_those_of_signed_words(words, plain, o
     bias, scale = constants(result)
     np.testing.assert_allclose(bias - offset, constants(plain)[0], atol=0.02)
     np.testing.assert_allclose(scale, constants(plain)[1], rtol=1e-6)
-    # The tolerances follow from 14 means of 2000 samples with a noise of 12 counts.
+    # The tolerances are for 14 means over 2000 samples with 12 counts of noise.
     np.testing.assert_allclose(bias - offset, BIAS, atol=1.0)
     np.testing.assert_allclose(scale, K, rtol=3e-4)
     np.testing.assert_allclose(result.calibration.misalignment, M, atol=3e-4)
@@ -69,10 +63,10 @@ def test_constants_of_unsigned_words_equal_those_of_signed_words(words, plain, o
 
 
 def test_a_bag_per_position_needs_no_other_bag_for_the_offset(rng):
-    # Only readings above 32767 show that 16-bit words are unsigned, and some bags have none.
+    # Only readings above 32767 show that 16-bit words are unsigned; some bags have none.
     ups = positions(10, 3)
     ups[0] = -np.full(3, 3.0**-0.5)
-    bags = [source(words_of([up], rng) + 32768.0, f'bag{k}') for k, up in enumerate(ups)]
+    bags = [source(words_of([up], rng) + 32768.0, name=f'bag{k}') for k, up in enumerate(ups)]
     result = fit(bags, OPTIONS)
     bias, scale = constants(result)
     np.testing.assert_allclose(bias - 32768.0, BIAS, atol=2.0)
@@ -83,7 +77,7 @@ def test_a_bag_per_position_needs_no_other_bag_for_the_offset(rng):
 def test_16_bit_words_in_one_attitude_have_the_right_scale_and_are_saturated_at_their_limits(rng):
     result = fit([source(words_of([np.array((0.0, 0.0, 1.0))], rng) + 32768.0)], OPTIONS)
     bias, scale = constants(result)
-    # In one attitude scale and bias keep their prior sd, 5 % and 1 m/s^2 (about 400 counts).
+    # In one attitude scale and bias keep their prior, with sd 5 % and 1 m/s^2 (about 400 counts).
     np.testing.assert_allclose(scale, 4200.0 / GRAVITY, rtol=0.05)
     np.testing.assert_allclose(bias, 32768.0, atol=400.0)
     assert result.calibration.unit.full_scale == 65535.0
@@ -101,7 +95,7 @@ def test_the_offset_of_a_prior_is_used(rng, plain):
 
 
 def test_an_offset_is_found_only_if_positions_determine_it(rng):
-    # WHY: readings in one pose fit a sphere by chance; the corrected drift had an error of 143 mg.
+    # WHY: readings in one pose fit a sphere by chance: the corrected drift had an error of 143 mg.
     for up in (np.eye(3)[2], np.array([-0.06, -0.25, -0.97])):
         for n in (4, 6, 8):
             for _ in range(100):
@@ -111,7 +105,7 @@ def test_an_offset_is_found_only_if_positions_determine_it(rng):
     ups = positions(12, 5)
     assert not rough_centre(4096.0 * ups + (800.0, -900.0, 700.0)).any()
     np.testing.assert_allclose(rough_centre(100.0 * ups + 338.0), 338.0, atol=1e-6)
-    # Positions in one plane do not determine the component of the offset normal to this plane.
+    # Positions in one plane do not determine the offset along the normal of this plane.
     flat = ups * (1.0, 1.0, 0.0)
     flat /= np.linalg.norm(flat, axis=1, keepdims=True)
     assert not rough_centre(100.0 * flat + 338.0).any()

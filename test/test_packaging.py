@@ -16,7 +16,7 @@ import thermo_comp
 
 MANIFEST = ET.parse(ROOT / 'package.xml').getroot()  # noqa: S314 - our own file
 
-# Dependency names that rosdep can install on Ubuntu 24.04: Python packages and ROS 2 Jazzy.
+# rosdep can install these dependencies on Ubuntu 24.04: Python packages and ROS 2 Jazzy.
 KNOWN_KEYS = {
     *('rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'rcl_interfaces'),
     *('rosgraph_msgs', 'sensor_msgs', 'std_msgs', 'launch_xml', 'launch_ros', 'ament_flake8'),
@@ -34,13 +34,13 @@ def test_version_and_dependencies_are_equal_wherever_they_are_stated():
     assert MANIFEST.findtext('export/build_type') == 'ament_python'
     tags = ('depend', 'exec_depend', 'build_depend', 'test_depend')
     assert {node.text for tag in tags for node in MANIFEST.iter(tag)} == KNOWN_KEYS
-    # Commands have further dependencies, which come from PyPI.
+    # Further dependencies of the commands come from PyPI.
     keys = {node.text for node in MANIFEST.iter('exec_depend')}
     assert {key for key in keys if key.startswith('python3-')} == {'python3-numpy', 'python3-yaml'}
     install = re.search(r'^INSTALL = (\[.*?^\])', (ROOT / 'setup.py').read_text(), re.M | re.S)[1]
     install = ast.literal_eval(install)
     assert isinstance(install, list)
-    assert all('>=' in requirement for requirement in install), 'no floor'
+    assert all('>=' in requirement for requirement in install), 'no lowest version'
 
 
 def test_every_source_file_states_the_apache_licence_and_has_at_most_500_lines():
@@ -93,7 +93,7 @@ def test_the_installed_share_folder_contains_the_files_that_ros_needs(tmp_path):
 
 
 SOURCES = [str(ROOT / name) for name in ('thermo_comp', 'test', 'setup.py')]
-#: Ignored docstring rules, as in setup.cfg: a summary may begin on line 2 and have two lines.
+#: Docstring rules that setup.cfg ignores, too: a summary may begin on line 2 and have two lines.
 STYLE = ['D200', 'D205', 'D400', 'D403']
 
 

@@ -53,7 +53,7 @@ def test_parameters_are_described_and_overrides_are_applied():
         ('transition_time:=.nan', 'parameter `transition_time` must be between 0 and 3600'),
         ('transition_time:=-1', '`transition_time` must be between 0 and 3600, got -1'),
         ('temperature_timeout:=0', 'parameter `temperature_timeout` must be between 0.1'),
-        # ROS takes 0042 for a number, without its zeros; the message asks for quotation marks.
+        # ROS takes 0042 for the number 42, so the message asks for quotation marks.
         ('serial:=0042', 'parameter `serial` must be a string, got .*quote it'),
     ],
 )
@@ -82,7 +82,7 @@ def test_an_update_ignores_other_nodes_and_one_wrong_parameter_changes_none(name
 
 def test_the_parameter_file_states_the_defaults():
     text = (ROOT / 'config' / 'thermo_comp.params.yaml').read_text(encoding='utf-8')
-    # The file has QoS settings only as a comment, because they do not apply to remapped topics.
+    # QoS settings do not apply to remapped topics, so the file has them only as a comment.
     before, overrides_text = text.split('    # The defaults of the QoS overrides:\n    #\n')
     stated = yaml.safe_load(before)['/**']['ros__parameters']
     expected = {entry.name: entry.default for entry in fields(NodeConfig)}

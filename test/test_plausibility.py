@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Faults of a thermometer are detected, and readings of a working thermometer are accepted."""
+"""Faults of thermometers are detected, and readings of working thermometers are accepted."""
 
 import math
 from functools import cache
@@ -35,7 +35,7 @@ def tracker_of(sensor='continuous', memory=None, board_lag_s=900.0, **config):
 
 
 def soak(tracker, celsius=20.0, seconds=60, start_s=0):
-    """Give both thermometers a reading per second, alternating by some mK; return the end [s]."""
+    """Give both thermometers a reading per second, alternating by +-4 mK; return the end [s]."""
     for second in range(start_s, start_s + seconds):
         flicker = 0.004 * (-1) ** second
         tracker.read('board', second * SECOND_NS, celsius + flicker)
@@ -67,7 +67,7 @@ def test_a_wrong_first_reading_does_not_change_later_thermal_states(sensor, wron
 def test_a_fast_change_at_the_start_is_not_taken_for_a_wrong_reading(lag_s):
     tracker = tracker_of(memory=LAG)
     for second in range(0, 60, 5):
-        # A ramp of 12 K/min, or a step of the air by 40 K that the board follows with tau = 300 s.
+        # The board's temperature changes by 12 K/min, or by 40 K with a time constant of 300 s.
         changed = 40.0 * (1.0 - math.exp(-second / lag_s)) if lag_s else 0.2 * second
         tracker.read('board', second * SECOND_NS, 20.0 + changed)
     assert tracker.memory.board.start_ns == 0
@@ -101,7 +101,7 @@ def test_a_frozen_sensor_is_detected_by_changes_of_the_second_sensor(sensor, fro
     other = tracker.checks['case'] if frozen == 'board' else tracker.checks['board']
     assert other.fault == Fault.NONE
     seen = getattr(tracker, frozen)
-    # Until detected a frozen board reading errs by <= 4 quanta + 2 K, a case reading by 10 K more.
+    # Until detected a frozen board reading errs by up to 4 quanta + 2 K, the case by 10 K more.
     lead = 10.0 if frozen == 'case' else 0.0
     off = (board if frozen == 'board' else case) - seen.temperature
     assert abs(off) < 4.0 * quantum + 2.0 + lead
@@ -125,7 +125,7 @@ def test_a_jump_that_stays_is_claimed_until_the_readings_jump_back(sensor):
         if second == 5999:
             assert tracker.sample(second * SECOND_NS)[place] == pytest.approx(25.0, rel=0.02)
             assert tracker.checks[sensor].finding == (Fault.SHIFTED, pytest.approx(5.0, abs=0.02))
-    # The square of a jump fades with the time constant of 600 s: 25 K^2 exp(-10) is left.
+    # The square of the jump fades with a time constant of 600 s, to 25 K^2 * exp(-10).
     assert tracker.sample(12_000 * SECOND_NS)[place] < 0.1**2
     assert tracker.checks[sensor].finding[0] is Fault.NONE
 
@@ -136,7 +136,7 @@ def test_constant_readings_are_no_fault_and_do_not_end_the_dynamic_regime():
         tracker.read('board', second * SECOND_NS, 20.0)
         tracker.read('case', second * SECOND_NS, 20.0)
     assert tracker.checks['board'].fault == tracker.checks['case'].fault == Fault.NONE
-    # With a noise of 0.5 quanta a reading repeats with p = 0.68, and 54 times with p = 1e-9.
+    # With noise of 0.5 quanta a reading repeats with p = 0.68, and 54 times with p = 1e-9.
     assert still_readings(ThermometerSettings(0.005, 0.01)) == 54
     assert still_readings(ThermometerSettings(0.005, 0.0)) == STILL_READINGS
     tracker = tracker_of()
@@ -177,7 +177,7 @@ def test_no_fault_is_reported_of_a_working_unit_in_a_chamber(preset, sensor):
         assert tracker.checks['case'].fault == Fault.NONE
 
 
-# The preset 'mems' is left out: its board lags the case by seconds, so T_case - T_board < 1 K.
+# The board of the preset 'mems' lags the case by seconds: T_case - T_board is below 1 K.
 @pytest.mark.parametrize(
     ('preset', 'sensor'),
     [
@@ -197,7 +197,6 @@ def test_swapped_topics_are_reported(preset, sensor):
 
 
 def test_a_ramp_after_a_soak_without_board_readings_has_finite_variances():
-    # WHY: a board thermometer that started after the soak gave a variance of NaN in the ramp.
     tracker = tracker_of()
     for second in range(120):
         tracker.read('case', second * SECOND_NS, 20.0 + 0.004 * (-1) ** second)
@@ -210,7 +209,6 @@ def test_a_ramp_after_a_soak_without_board_readings_has_finite_variances():
 
 
 def test_the_warm_up_after_power_on_is_not_taken_for_swapped_topics():
-    # WHY: a warm-up of the board by 4 K, of the case by 1.3 K, was taken for exchanged topics.
     tracker = tracker_of(memory=LAG)
     for second in range(3 * 3600):
         warm = 4.0 * (1.0 - math.exp(-second / 500.0))
@@ -231,10 +229,10 @@ def test_one_topic_given_for_both_thermometers_is_named_and_claimed(order):
             tracker.read(name, second * SECOND_NS, celsius)
     state = tracker.sample(300 * SECOND_NS)
     assert tracker.copies['case'].is_copy
-    # In a ramp of 1 K/min the case of a unit with a board lag of 900 s is 15 K above the board.
+    # With a board lag of 900 s the case is 15 K above the board in a ramp of 1 K/min.
     assert abs(state[GRADIENT]) < 0.1
     assert state[VAR_GRADIENT] ** 0.5 == pytest.approx(15.0, rel=0.2)
-    # Once a case reading differs from the board reading, the topics count as two thermometers.
+    # If one case reading differs from the board reading, the topics are two thermometers.
     tracker.read('board', 300 * SECOND_NS, 25.0)
     tracker.read('case', 300 * SECOND_NS, 25.1)
     assert not tracker.copies['case'].is_copy

@@ -15,7 +15,7 @@ pytest.importorskip('rclpy', reason='rclpy of the extra `ros` is not installed')
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from recording_helpers import imu_columns
-from ros_helpers import TIMEOUT
+from ros_helpers import START_NS, TIMEOUT
 from rosbags.highlevel import AnyReader
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, Temperature
@@ -26,7 +26,6 @@ from thermo_comp.recording.writer import BagWriter
 from thermo_comp.ros import player
 from thermo_comp.ros.player import play
 
-START_NS = 1_767_225_600_000_000_000
 CYCLE_NS = 2_500_000
 TOPICS = Topics()
 UNLIMITED = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
@@ -101,7 +100,7 @@ print(digest.hexdigest())
 
 
 def test_the_player_waits_for_a_slow_subscriber_which_loses_no_message(tmp_path, rng):
-    # More messages than the middleware stores (5000) are sent faster than the subscriber reads.
+    # The player sends more messages (7000) than the middleware stores, faster than they are read.
     with BagWriter(tmp_path / 'bag.mcap') as writer:
         stamps = START_NS + np.arange(7000) * CYCLE_NS
         writer.write_counts(TOPICS.counts, stamps, rng.integers(-9, 9, (7000, 3)), 'imu_link')

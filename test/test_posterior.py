@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders import axis_set, calibration, regime_set, term
+from builders import FACES, axis_set, calibration, regime_set, term
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from position_helpers import GRAVITY, Rest
@@ -82,7 +82,7 @@ def test_the_order_of_parameters_equals_one_found_by_hand():
         response=(term('gradient'), term('board', tau_s=60.0)),
     )
     layout = parameter_layout(value)
-    # Bias parameters of x: static level, t, t^2; dynamic level, three knots; two response weights.
+    # Bias of x: static level, t, t^2; dynamic level and three knots; two weights of the response.
     assert layout.bias == [Block(0, 3, 7, 9), Block(13, 14, 15, 17), Block(21, 22, 23, 25)]
     assert layout.scale == [Block(9, 10, 11, 13), Block(17, 18, 19, 21), Block(25, 27, 28, 30)]
     assert (layout.misalignment, layout.n_parameters) == (30, 33)
@@ -108,9 +108,8 @@ def test_a_model_of_all_columns_of_two_thermometers_can_be_saved_and_of_three_no
         dump_calibration(whole_bank(('case', 'frame', 'window')))
 
 
-#: The sd of bias changes from mounting to mounting is stated, as six faces do not determine it.
+#: Six faces do not determine the sd of bias changes between mountings, so it is stated.
 OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2', groups=('curve',), mounting_sd=1e-6)
-FACES = np.vstack((np.eye(3), -np.eye(3)))
 
 
 def fitted(rng, ups):
@@ -126,7 +125,7 @@ def test_the_least_determined_attitude_is_found_and_printed_if_a_side_was_never_
     result = fitted(rng, FACES)
     least = result.least_known
     assert least_known(replace(result.calibration, posterior=None), FACES) is None
-    # Near a corner of the cube the variance changes little: the direction found may lie beside it.
+    # Near a corner of the cube the variance hardly changes, so the direction may be beside it.
     np.testing.assert_allclose(np.abs(least.up), 3.0**-0.5, atol=0.05)
     assert least.away_deg == pytest.approx(np.degrees(np.arccos(3.0**-0.5)), abs=4.0)
     # Each of three angles (sd 0.01 rad) changes |f| by g * product of two components, here 1 / 3.

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fits to little data are right with a prior: an earlier calibration, or units of the type."""
+"""With a prior, an earlier calibration or units of the type, fits to few data are right."""
 
 from dataclasses import replace
 from functools import cache
@@ -27,19 +27,19 @@ from thermo_comp.unit.prediction import in_a_soak
 
 PROGRAM = parse_cyclogram('20 5min, 33@1 15min, 8@1 15min')
 KIND = triad('products', 1)
-#: Groups of columns that the unit needs: with a third of all columns a fit takes half the time.
+#: The unit needs only these groups of columns, a third of all: this halves the time of a fit.
 OPTIONS = FitOptions(STANDARD_GRAVITY, groups=('curve', 'board', 'product'))
 
 
 def source(record):
-    # A reading every 8 s is sufficient in ramps of 1 K/min, and saves most of the time of a fit.
+    # In ramps of 1 K/min a reading every 8 s suffices, and saves most of the time of a fit.
     arrays = arrays_of(record, 8)
     return source_of(*[array + 10**18 if array.dtype == np.int64 else array for array in arrays])
 
 
 @cache
 def test_of(number, first, last):
-    """Record positions `first` to `last` - 1 (of twelve) of sibling `number`."""
+    """Record positions `first` to `last` - 1, of twelve, of the unit's sibling `number`."""
     stations = [Position(PROGRAM, up) for up in positions(12, number)[first:last]]
     return tuple(arrays(sibling(KIND, number, 0.15), stations, 100 * number + first))
 
@@ -49,7 +49,7 @@ test_of.__test__ = False
 
 @cache
 def fitted(number):
-    """Fit a sibling to nine positions, which do not determine the sd of mounting offsets."""
+    """Fit nine positions of a sibling; they do not determine the sd of mounting offsets."""
     options = replace(OPTIONS, serial=f'unit-{number}', mounting_sd=1e-6 * STANDARD_GRAVITY)
     return fit([source(record) for record in test_of(number, 0, 9)], options)
 
@@ -82,26 +82,24 @@ def test_a_population_has_mean_and_scatter_of_its_units_and_keeps_equal_curves_e
     covariance, layout = prior.posterior.covariance(), parameter_layout(prior)
     at = layout.bias[0].static + 1
     sd = np.sqrt(covariance[at, at]) / prior.axes.x.scale_factor
-    # Expected variance of a fourth unit: 4/3 of the variance of three units, times 6 / (6 - 2) for
-    # Student's distribution with 6 degrees of freedom, plus the claimed variance.
+    # A fourth unit has 4/3 of the variance of three units, times 6 / (6 - 2) for Student's
+    # distribution with 6 degrees of freedom, plus the claimed variance.
     own = np.array(own) / K[:, 0] ** 2
     expected = np.var(slopes, axis=0, ddof=1).mean() * 4.0 / 3.0 * 6.0 / 4.0 + own.mean()
     assert sd == pytest.approx(np.sqrt(expected), rel=1e-3)
-    # WHY: in the prior from siblings equal curves of both regimes were not fully correlated: a fit
-    # had an error of 3.1 ug with this prior, and of 0.7 ug without a prior.
+    # WHY: equal curves of both regimes were not fully correlated: the error was 3.1, not 0.7 ug.
     for block in (*layout.bias, *layout.scale):
         curves = range(block.static + 1, block.dynamic), range(block.dynamic + 1, block.response)
         for static, dynamic in zip(*curves, strict=True):
             contrast = np.zeros(layout.n_parameters)
             contrast[[static, dynamic]] = 1.0, -1.0
-            # 1e-24: largest variance that rounding to single precision leaves unused coefficients.
+            # Rounding to single precision leaves unused coefficients a variance of up to 1e-24.
             limit = 1e-5 * covariance[static, static] + 1e-24
             assert float(contrast @ covariance @ contrast) <= limit
 
 
 def test_the_scatter_of_an_axis_is_averaged_over_the_axes_of_three_units(rng):
-    # WHY: by chance three siblings had nearly equal biases on one axis: with their prior the force
-    # error of a fit was 363 ug, without a prior 77 ug.
+    # WHY: three siblings had nearly equal biases of an axis by chance: forces erred by 363 ug.
     layout = parameter_layout(rich_calibration())
     deviations = rng.standard_normal((3, layout.n_parameters))
     level = layout.bias[1].static
@@ -117,7 +115,7 @@ def test_chance_correlations_between_parameters_of_twelve_units_are_reduced(rng)
     n = layout.n_parameters
 
     def share_left(units, k):
-        """Return the share of the variance of parameter k that no other parameter explains."""
+        """Return the share of parameter k's variance that the other parameters do not explain."""
         deviations = (units - units.mean(axis=0)) / np.sqrt(len(units) - 1.0)
         scatter = _scatter(deviations, layout, np.ones(3))
         return 1.0 / (np.linalg.inv(scatter)[k, k] * scatter[k, k])
@@ -125,7 +123,7 @@ def test_chance_correlations_between_parameters_of_twelve_units_are_reduced(rng)
     independent = rng.standard_normal((12, n))
     bias, M = layout.bias[1].response - 1, layout.misalignment
     assert share_left(independent, M) == pytest.approx(1.0)
-    # In the prior the dynamic level of a bias is correlated only with the static level.
+    # The prior correlates the dynamic level of a bias only with its static level.
     level = layout.bias[0].dynamic
     pair = np.corrcoef(independent[:, [layout.bias[0].static, level]].T)[0, 1]
     assert share_left(independent, level) == pytest.approx(1.0 - pair**2)
@@ -136,8 +134,8 @@ def test_chance_correlations_between_parameters_of_twelve_units_are_reduced(rng)
 
 @pytest.mark.slow
 def test_a_fit_begins_with_the_widest_of_its_priors(monkeypatch):
-    # WHY: a fit that began with a narrow prior found mounting offsets of 190 ug, a local minimum.
-    seen = []  # all priors that the fit of one position tries, the initial one last
+    # WHY: from a narrow prior a fit found a local minimum with mounting offsets of 190 ug.
+    seen = []  # the priors that the fit of one position tries, the initial one last
 
     def fitted_with(*given):
         (prior,) = (argument for argument in given if isinstance(argument, Prior))
@@ -162,7 +160,7 @@ def test_three_positions_reduce_the_sd_of_an_aged_calibration():
     later = [source(record) for record in test_of(9, 9, 12)]
     options = replace(OPTIONS, serial='unit-9', prior=old, ageing_bias=1e-4, ageing_scale=2e-5)
     new = fit(later, options).calibration
-    # Three positions determine three of the six sums bias +- scale * g: half the variance remains.
+    # Three positions determine 3 of the 6 sums bias +- scale * g, and so halve the variance.
     grown = np.mean(sd_of_levels(old) ** 2 + options.ageing_bias**2)
     assert np.mean(sd_of_levels(new) ** 2) < 0.75 * grown
     bias = [(a.bias - b.bias) / a.scale_factor for a, b in zip(new.axes, old.axes, strict=True)]
@@ -192,7 +190,7 @@ def test_rests_at_one_temperature_correct_a_bias_change_and_keep_the_response():
     pairs = (old, held_out), (old, [*map(aged, held_out)]), (new, [*map(aged, held_out)])
     left = [np.sqrt(np.mean([left_by(unit, r) ** 2 for r in records])) for unit, records in pairs]
     assert left[1] > 10.0 * left[0]
-    # Six means of |f| determine three biases to 10 ug (1 sd), with three scale factors to 20 ug.
+    # Six means of |f| determine three biases to 10 ug (1 sd), or to 20 ug besides three scales.
     sd = float(sd_of_levels(new).max())
     assert sd < 20e-6 * STANDARD_GRAVITY
     assert left[2] < np.hypot(left[0], sd)
@@ -201,8 +199,8 @@ def test_rests_at_one_temperature_correct_a_bias_change_and_keep_the_response():
 
 def after(change, ups):
     """
-    Update sibling 9 by rests of 10 min with changed counts; return the change of the bias at 20
-    degC, its new sd [m/s^2], and relative change and sd of the scale factor, shape (4, 3).
+    Update sibling 9 by rests of 10 min with changed counts. Return the change of the bias at 20
+    degC and the new sd [m/s^2], then relative change and sd of the scale factor, shape (4, 3).
     """
     old, day = fitted(9).calibration, parse_cyclogram('20 10min')
     records = arrays(sibling(KIND, 9, 0.15), [Position(day, up) for up in ups], 999)
@@ -218,7 +216,7 @@ def after(change, ups):
 def test_one_to_three_faces_of_an_unchanged_unit_keep_the_calibration(n_faces):
     # WHY: a rest on one face increased the claimed sd of bias and scale from 0.2 to 424 ug.
     bias, bias_sd, scale, scale_sd = after(lambda counts, _: counts, np.eye(3)[:n_faces])
-    # Limit of the claimed sd: 30 ug, a tenth of the usual repeatability of turn-ons, 300 ug.
+    # The limit of the claimed sd, 30 ug, is a tenth of the usual sd of turn-ons, 300 ug.
     assert max(bias_sd.max(), scale_sd.max() * STANDARD_GRAVITY) < 30e-6 * STANDARD_GRAVITY
     assert np.abs(bias).max() < 2.0 * bias_sd.max()
     assert np.abs(scale).max() < 2.0 * scale_sd.max()
@@ -226,8 +224,7 @@ def test_one_to_three_faces_of_an_unchanged_unit_keep_the_calibration(n_faces):
 
 @pytest.mark.parametrize('kind', ['bias', pytest.param('scale', marks=pytest.mark.slow)])
 def test_three_faces_halve_the_error_of_a_change_of_bias_or_scale(kind):
-    # WHY: an update with three faces took a bias change of 100 ug for mounting offsets.
-    # WHAT: the bias or the scale changes so that each face reads 1 count (300 ug) more or less.
+    # The bias or the scale changes so that each face reads 1 count (300 ug) more or less.
     K = np.array([axis.scale_factor for axis in fitted(9).calibration.axes])
     change = np.array([1.0, -1.0, 1.0]) / (K * STANDARD_GRAVITY)
 
@@ -239,7 +236,7 @@ def test_three_faces_halve_the_error_of_a_change_of_bias_or_scale(kind):
     bias, bias_sd, scale, scale_sd = after(changed, np.eye(3))
     wrong = np.array([bias / STANDARD_GRAVITY, scale])
     wrong[('bias', 'scale').index(kind)] -= change
-    # Rests determine only the sum of bias and scale errors, to some ug: each gets half the change.
+    # Rests determine the sum of bias and scale errors to some ug; each gets half of the change.
     assert np.abs(wrong.sum(axis=0)).max() < 10e-6
     assert np.abs(np.abs(wrong) / np.abs(change) - 0.5).max() < 0.1
     assert (np.abs(wrong) < 2.0 * np.array([bias_sd / STANDARD_GRAVITY, scale_sd])).all()
@@ -288,7 +285,6 @@ def test_a_prior_without_covariance_or_in_another_unit_is_refused():
 
 @pytest.mark.slow
 def test_the_calibration_of_another_unit_is_refused_as_a_prior():
-    # WHY: the constants of a sibling, with their small sd, were used for the new unit.
     all_twelve = [source(record) for record in test_of(9, 0, 12)]
     options = replace(OPTIONS, serial='unit-9', prior=fitted(1).calibration)
     with pytest.raises(FitError, match='calibration of unit unit-1, the bags are of unit unit-9'):

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import yaml
-from builders import UNCHECKED, rich_calibration
+from builders import START_NS, UNCHECKED, rich_calibration
 from fault_rig import unit
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
@@ -26,13 +26,11 @@ from thermo_comp.unit.calibration import Calibration
 from thermo_comp.unit.calibration_file import dump_calibration, parse_calibration
 from thermo_comp.unit.schema import SchemaError, build
 
-START_NS = 1_767_225_600_000_000_000
 UNITS = (rich_calibration(), unit())
 TREE = yaml.safe_load(dump_calibration(rich_calibration()))
 
 
 def leaves(tree, path=()):
-    """List the path of every value of a calibration file, including nested values."""
     items = tree.items() if isinstance(tree, dict) else enumerate(tree)
     for key, value in items:
         yield (*path, key)
@@ -67,13 +65,13 @@ def test_a_wrong_value_at_any_key_is_refused_with_the_key(place, value):
 
 EXAMPLE = Path(__file__).parents[1] / 'config' / 'calibration.example.yaml'
 TREES = (TREE, yaml.safe_load(dump_calibration(unit())), yaml.safe_load(EXAMPLE.read_text()))
-#: Each value of the calibrations in TREES: index of its calibration, and path to the value.
+#: For each value of the calibrations in TREES: number of its calibration, and path to the value.
 EDITS = [(k, place) for k, tree in enumerate(TREES) for place in leaves(tree)]
 magnitudes = st.builds(
     lambda sign, digits, power: sign * digits * 10.0**power,
     *(st.sampled_from([1.0, -1.0]), st.floats(1.0, 9.99), st.integers(-308, 307)),
 )
-#: Limits of all quantities of a calibration file, and values just below and above each limit.
+#: The limits of all quantities of a calibration file, and the numbers next to each limit.
 edges = st.sampled_from(
     [
         near
@@ -87,7 +85,7 @@ factors = st.integers(-60, 60).map(lambda power: 2.0**power)
 
 
 class Edited(dict[str, Any]):
-    """The content of a calibration file, of which hypothesis prints only the changed values."""
+    """The content of a calibration file; hypothesis prints only the changed values."""
 
     edits: tuple[Any, ...] = ()
 
@@ -97,7 +95,7 @@ class Edited(dict[str, Any]):
 
 @st.composite
 def edited(draw):
-    """Draw a calibration file in which one to three values are replaced by any others."""
+    """Draw a calibration file in which one to three values are replaced by other values."""
     which = draw(st.sampled_from(range(len(TREES))))
     tree = Edited(json.loads(json.dumps(TREES[which])))
     own = [place for k, place in EDITS if k == which]
@@ -128,7 +126,6 @@ def edited(draw):
 
 
 def changed(which, place, value):
-    """Return the tree of a calibration file with one value replaced."""
     tree = Edited(json.loads(json.dumps(TREES[which])))
     reduce(getitem, place[:-1], tree)[place[-1]] = value
     tree.edits = (place, value)
@@ -136,7 +133,7 @@ def changed(which, place, value):
 
 
 def whole_range(of):
-    """List messages over the temperature range of a calibration, and far outside of the range."""
+    """List messages over the temperature range of a calibration, and far outside this range."""
     edges_c = [edge for regime_set in of.regime_sets() for edge in regime_set.temperature_range_c]
     middle = of.reference_temperature_c
     temperatures = [middle, middle + 0.5, *edges_c, middle, -273.0, 999.0, middle, middle]
@@ -146,7 +143,7 @@ def whole_range(of):
     now_ns = START_NS
     for k, (celsius, step_s) in enumerate(zip(temperatures, steps_s, strict=True)):
         for m in range(6):
-            # Each temperature is read six times, as a single reading may count as an outlier.
+            # Each temperature is read six times, because a single reading may count as an outlier.
             now_ns += round(step_s / 6.0 * 1e9)
             sent.append(('board', now_ns, celsius))
             sent += [(name, now_ns, celsius + 0.1 * m) for name in of.sensors]
@@ -160,7 +157,7 @@ def whole_range(of):
 
 @settings(deadline=None, max_examples=max(120, settings.default.max_examples))
 @given(edited())
-# In example 1 variances of axes differ by 23 powers of ten; in example 2 two lags almost agree.
+# Variances of axes differ by 23 powers of ten (example 1), or two lags are almost equal (2).
 @example(changed(1, ('axes', 'z', 'scale_factor'), 1.0))
 @example(changed(0, ('response', 3, 'sensor_share'), 1e-12))
 def test_whatever_file_is_accepted_gives_finite_numbers_over_its_whole_range(tree):
@@ -215,7 +212,7 @@ configs = st.builds(
 
 
 def largest(axis, regime, of):
-    """Return upper limits of the change of an axis' bias [counts] and of its relative scale."""
+    """Return upper limits of |bias change| [counts] and of |relative scale change| of an axis."""
     edges = (*of.static.temperature_range_c, *of.dynamic.temperature_range_c)
     # Curves continue along their tangents by a quarter of the temperature range.
     t = max(abs(edge - of.reference_temperature_c) for edge in edges)

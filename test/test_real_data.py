@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fits to recordings that other people made give the figures of docs/real_data.md."""
+"""Fits to recordings that other people made have the figures of docs/real_data.md."""
 
 import re
 from contextlib import suppress
@@ -40,13 +40,13 @@ def means_of(result):
 
 def test_the_residual_of_handheld_units_is_the_noise_of_their_samples(unit):
     assert 21 <= len(unit.positions) <= 23
-    # Means over 1 s have a noise of 0.48 to 0.57 mg; the fit has means over 0.5 s.
+    # Means over 1 s have 0.48 to 0.57 mg of noise; the fit uses means over 0.5 s.
     assert 0.5 < unit.residuals[-1].fitted.rms / MG < 0.9
     assert unit.residuals[-1].left_out.rms < 1.15 * unit.residuals[-1].fitted.rms
 
 
 def test_fits_of_handheld_units_agree_with_a_least_squares_solution_by_scipy(unit):
-    # scipy minimises |M (N - b) / K| - g of all positions over nine parameters.
+    # scipy minimises |M (N - b) / K| - g over nine parameters, for the means of all positions.
     means = means_of(unit)
 
     def residual(parameters):
@@ -70,10 +70,10 @@ def test_six_faces_leave_the_misalignment_at_its_prior(real_data, work):
     result = fit(sources, replace(OPTIONS, input=kind))
     calibration = result.calibration
     assert len(result.positions) == 6
-    # Six faces hardly determine misalignments: their sd stays near that of a MEMS, 0.01 rad.
+    # Six faces hardly determine misalignments, whose sd remains that of the prior, 0.01 rad.
     np.testing.assert_allclose(calibration.misalignment, np.eye(3), atol=1e-4)
     np.testing.assert_allclose(calibration.misalignment_sd, 1e-2, rtol=0.01)
-    # Expected bias: half of the sum of opposite faces; scale factor: half of their difference.
+    # The bias is half the sum of opposite faces, the scale factor half of their difference.
     means = means_of(result)
     high, low = means.max(axis=0), means.min(axis=0)
     axes = calibration.axes
@@ -90,7 +90,7 @@ def test_the_freezer_run_is_refused_for_its_jumps(real_data, work):
         fit(sources, OPTIONS)
     pattern = r'at ([\d.]+) s the sensor jumped by \+([\d.]+) mg along gravity'
     jumps = re.findall(pattern, str(refused.value))
-    # Times in the message begin with the first sample, 1.5 s after time 0 of the log.
+    # The message counts from the first sample, which is 1.5 s after time 0 of the log.
     assert [float(at) for at, _ in jumps] == pytest.approx([365.4, 465.4, 511.6], abs=0.2)
     assert [float(size) for _, size in jumps] == pytest.approx([20.0, 17.0, 2.0], abs=4.0)
 
@@ -100,7 +100,7 @@ def test_the_bias_slope_of_the_freezer_run_before_its_jumps_is_that_of_the_norm(
     topics = Topics(part=BagPart(47.5, 358.5))
     result = fit(fit_sources([freezer_bag(real_data, work)], topics)[0], OPTIONS)
     z = result.calibration.static.z
-    # In the freezer run the slope of |a| over temperature is 1.61 mg/K from 36 to 15 degC.
+    # The slope of |a| over temperature is 1.61 mg/K from 36 to 15 degC.
     slope = np.diff(z.bias_function.value(np.array([-4.0, 14.0])))[0] / 18.0 / MG
     assert slope == pytest.approx(1.61, abs=0.2)
     assert result.residuals[-1].fitted.rms / MG < 0.75
@@ -114,7 +114,7 @@ def test_the_bias_slope_of_the_freezer_run_before_its_jumps_is_that_of_the_norm(
 def test_the_error_of_the_freezer_run_on_held_out_minutes(
     real_data, work, length, n_sets, sets, drift, mg
 ):
-    # Held-out parts of the 1420 s after the last jump are corrected by a fit to the other parts.
+    # Parts of the 1420 s after the last jump are corrected by a fit to the other parts.
     bag = freezer_bag(real_data, work)
     starts = np.arange(518.5, 1938.5, length).tolist()
     parts = [BagPart(start, start + length) for start in starts]
@@ -125,24 +125,23 @@ def test_the_error_of_the_freezer_run_on_held_out_minutes(
         seen = [fit_sources([bag], topics)[0][0] for topics in others]
         calibration = fit(seen, OPTIONS).calibration
         for part in held_out:
-            # Some held-out parts have no minute at rest, because the freezer was knocked.
+            # The freezer was knocked, so some parts have no minute at rest.
             with suppress(RecordingError):
                 judged = evaluate([bag], [('unit', calibration)], topics=Topics(part=part))
                 windows = judged.judgements['unit'].windows
                 raw += np.linalg.norm(windows.mean, axis=1).tolist()
                 left += windows.residual.tolist()
     assert len(raw) >= 17 * len(sets) // n_sets
-    # One attitude does not determine the constants, so compare the sd of |a|.
+    # The constants are undetermined in one attitude, so compare the sd of |a|.
     assert np.std(raw) / MG == pytest.approx(drift, abs=0.2)
-    # Means over 60 s have 0.19 mg of noise; the first of 5 parts is outside the temperature range
-    # of the other parts.
+    # Means over 60 s have 0.19 mg of noise; the first of 5 parts is outside the temperature range.
     assert np.sqrt(np.mean(np.square(left))) / MG == pytest.approx(mg, rel=0.35)
 
 
 @pytest.mark.slow
 def test_the_gyroscope_error_of_the_freezer_run_in_215_s_held_out(real_data, work):
     bag = freezer_bag(real_data, work)
-    # Leave out the knocks of the freezer near 860 and 1134 s, and the time before the last jump.
+    # The parts exclude knocks of the freezer (860 and 1134 s) and the time up to the last jump.
     parts = [BagPart(518.5, 638.5), BagPart(860.5, 1130.5), BagPart(1134.5, 1938.5)]
     seen = [fit_sources([bag], Topics(part=part))[0][0] for part in parts]
     calibration = fit(seen, OPTIONS).calibration
@@ -154,7 +153,7 @@ def test_the_gyroscope_error_of_the_freezer_run_in_215_s_held_out(real_data, wor
     assert section.raw_rms > 1.7 * floor
     assert section.rms < 1.3 * floor
     assert 0.3 < section.ratio < 2.0
-    # The data sheet states 5 mdeg/s/sqrt(Hz); samples without anti-aliasing have a larger density.
+    # The data sheet states 5 mdeg/s/sqrt(Hz); sampling without anti-aliasing gives more.
     assert 30.0 < np.degrees(density) * 1e3 < 45.0
 
 

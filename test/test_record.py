@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The command `record` writes a bag per position, from a growing bag or from a driver on DDS."""
+"""The command `record` writes a bag per position, from a growing bag or a driver on DDS."""
 
 import json
 import shlex
@@ -30,7 +30,7 @@ START_NS = 1_767_225_600_000_000_000
 
 
 def write_session(path, ups=UPS, chunk_bytes=1 << 14):
-    """Write a bag of a unit that rests in each attitude in turn, with handling between rests."""
+    """Write a bag of a unit that rests in each attitude in turn, and is handled between rests."""
     rng = np.random.default_rng(5)
     program = parse_cyclogram(f'20 {SOAK_S:g}s')
     start_ns = START_NS
@@ -74,16 +74,15 @@ def contents(paths):
 def check_positions(result):
     assert result['is_complete']
     for position, up in zip(result['positions'], UPS, strict=True):
-        # The unit's bias gives the measured direction an error below 1 degree.
+        # The unit's bias turns the measured direction by less than 1 degree.
         assert np.array(position['up']) @ up > np.cos(np.radians(1.0))
         assert position['reason'] == ''
         assert set(position['thermometers']) == {'board', 'case', 'lid'}
-        # Means of samples (over 3 s at 10 Hz) next to a motion do not count as rest.
+        # Means over 3 s, next to a motion, do not count as rest.
         assert position['still_s'] == pytest.approx(SOAK_S, abs=20.0)
 
 
 def check_fit(result, cli, folder):
-    """Run the fit that `record` printed, and compare its constants with the true constants."""
     given = '--gravity 9.80665 --model golovach'
     words = shlex.split(result['command'].replace('--gravity G', given))
     assert words.pop(0) == 'thermo_comp'
@@ -91,7 +90,7 @@ def check_fit(result, cli, folder):
     cli(*(part for word in words for part in (bags if '*' in word else [word])), cwd=folder)
     calibration = load_calibration(folder / 'unit.yaml')
     assert calibration.unit.serial == 'lab-7'
-    # The board is at 20.39 degC in all positions, so the constants are compared at 20.39 degC.
+    # The board is at 20.39 degC in all positions, so compare the constants at 20.39 degC.
     bias, _, scale, _ = in_a_soak(calibration, 20.39)
     # `record` computes `scale_sd` from the noise in the positions.
     assert scale / UNIT.scale_factor == pytest.approx(1.0, abs=5.0 * max(result['scale_sd']))
@@ -179,7 +178,6 @@ class TestGrowing:
 
 
 def test_a_bag_left_by_a_crash_is_reported_and_completed(session, cli, tmp_path):
-    # WHY: after a killed run the next run did not report the hidden file with its last bag.
     bags = tmp_path / 'bags'
     words = ('-c', CRASH, session, bags, START_NS + 200 * 10**9)
     assert ran(sys.executable, *words).returncode == -signal.SIGKILL
@@ -244,7 +242,7 @@ class TestLive:
         assert code == 0
         check_positions(result)
         assert len(numbered_bags(bags)) == N_POSITIONS
-        # When the last position is complete the recording ends; no earlier message is missing.
+        # The recording ends when the last position is complete; no earlier message is missing.
         sent, got = contents([session]), contents(numbered_bags(bags))
         assert got.keys() == sent.keys()
         for topic, messages in got.items():

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Jumps of a recording's clock are shortened; a survey reports missing and faulty data."""
+"""Jumps of a recording's clock are shortened; a survey reports missing and wrong data."""
 
 from contextlib import suppress
 
@@ -79,7 +79,6 @@ def test_a_clock_that_jumps_repeatedly_or_a_message_per_hour_is_refused(tmp_path
 
 @pytest.mark.parametrize(('zone_s', 'n'), [(3600, 40000), (-3600, 1000), (1800, 1000), (20, 1000)])
 def test_thermometers_with_stamps_of_another_time_zone_are_reported(tmp_path, zone_s, n):
-    # WHY: `replay` corrected samples with the temperatures of another hour, without a warning.
     true_ns = START_NS + STEP_NS * np.arange(n)
     text = f'board readings are stamped {zone_s:+} s from the samples around them: do the stamps'
     with suppress(RecordingError):
@@ -129,7 +128,7 @@ def test_a_survey_finds_no_fault_in_a_good_bag_and_the_duration_is_the_span_of_s
     assert (board.lowest, board.highest) == (5.0, 35.0)
     assert board.steepest_heating_k_min == pytest.approx(1.5, rel=0.01)
     assert board.steepest_cooling_k_min == pytest.approx(-1.5, rel=0.01)
-    # WHY: the duration was the last stamp less the first: -0.2 s.
+    # WHY: the duration was the stamp of the last sample less that of the first: -0.2 s.
     result = survey(tmp_path / 'back', up_and_down(5.0, 35.0), gap_s=-3600.0)
     assert result.duration_s == pytest.approx(3600.0, abs=1.0)
     assert result.still_s <= result.duration_s

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Truncated bags are read up to the last complete message; corrupt bags give a one-line error."""
+"""Cut bags are read up to the last complete message; corrupt bags give an error of one line."""
 
 import resource
 import struct
@@ -29,7 +29,7 @@ def read(path):
 
 
 def outcome(path):
-    """Read a damaged bag, or return its `RecordingError`; any other exception fails the test."""
+    """Read a damaged bag, or return its `RecordingError`; other exceptions fail the test."""
     try:
         return read(path)
     except RecordingError as error:
@@ -37,7 +37,7 @@ def outcome(path):
 
 
 def chunk_places(path):
-    """Return position and length of each chunk record, from the summary read by `mcap`."""
+    """Return position and length of each chunk record, as stated in the summary of the file."""
     with path.open('rb') as file:
         summary = make_reader(file).get_summary()
     return [(c.chunk_start_offset, c.chunk_length) for c in summary.chunk_indexes]
@@ -57,7 +57,7 @@ def small_bag(compression, use_chunking=True):
 def test_a_bag_cut_in_its_last_chunk_is_read_up_to_the_cut(tmp_path):
     content, position, length = small_bag('none')
     messages = regular_messages(24)
-    # `last`: the positions in the file at which the messages of the last chunk end.
+    # `last` has the positions in the file at which messages of the last chunk end.
     at = position + 9 + 40
     last = []
     while at < position + length:
@@ -66,7 +66,7 @@ def test_a_bag_cut_in_its_last_chunk_is_read_up_to_the_cut(tmp_path):
     n_before = len(messages) - len(last)
     assert 0 < n_before < len(messages)
     path = tmp_path / 'bag.mcap'
-    # The bag is cut at each byte of the last chunk, and at every 17th byte after this chunk.
+    # Cut the bag at each byte of the last chunk, and after this chunk at every 17th byte.
     end = position + length
     for cut in (*range(position, end), *range(end, len(content), 17), len(content) - 1):
         path.write_bytes(content[:cut])
@@ -83,7 +83,7 @@ def test_a_bag_cut_in_its_last_chunk_is_read_up_to_the_cut(tmp_path):
 
 
 def test_the_messages_before_a_cut_in_a_large_chunk_are_read(tmp_path):
-    """The compressed blocks before a cut are decompressed, so at most one block is lost."""
+    """A compressed block that is cut is lost; the blocks before it are decompressed."""
     n = 60_000
     stamps = np.arange(n) * 2_500_000
     xyz = np.random.default_rng(3).integers(-30_000, 30_000, (n, 3))
@@ -111,14 +111,14 @@ def test_a_bag_cut_anywhere_is_read_or_refused(data, compression):
         path.write_bytes(content[:cut])
         result = outcome(path)
         if isinstance(result, RecordingError):
-            assert cut < 60, result  # only a file without a complete header is refused
+            assert cut < 60, result  # only without a complete header is a file refused
         else:
             assert result.info.truncated is not None
             assert_columns(result.columns, regular_messages(24)[: result.info.n_messages])
 
 
 def test_messages_overwritten_by_zeros_are_not_returned(tmp_path):
-    """After a power failure the end of a file may be zeros; no message with zeros is returned."""
+    """After a power failure a file may end in zeros, which must not give messages."""
     messages = regular_messages(24)
     path = tmp_path / 'bag.mcap'
     for is_chunked in (True, False):
@@ -234,7 +234,7 @@ def test_false_lengths_in_a_file_need_little_memory(tmp_path, record, reason):
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(RecordingError, match=reason):
         read(path)
-    # For any stated length of a record the reader uses less than 100 MB (ru_maxrss is in KiB).
+    # Whatever length a record states, the reader uses less than 100 MB (ru_maxrss is in KiB).
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000
 
 

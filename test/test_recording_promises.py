@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Messages that a bag lists but lacks are reported; a scan of a chunk equals a plain loop."""
+"""Missing messages that a bag lists are reported; a scan of a chunk equals a plain loop."""
 
 import os
 import sqlite3
@@ -59,7 +59,7 @@ def test_messages_that_a_topic_lacks_are_reported_at_the_end_of_the_first_readin
     with open_recording(tmp_path / 'bag.mcap') as reader:
         kind = reader.info.topics[rec.ACCEL][0]
         reader.info = replace(reader.info, topics={**reader.info.topics, rec.ACCEL: (kind, 64)})
-        for _ in range(2):  # a second pass over the bag must not add a second message
+        for _ in range(2):  # a second pass must not add a second message
             assert sum(map(len, reader.blocks())) == 40
         assert reader.info.truncated == f'{rec.ACCEL}: 40 of 64 listed messages are in the bag'
 
@@ -122,7 +122,6 @@ def test_a_compressed_file_expands_within_limits_and_leaves_no_file(tmp_path, mo
 
 @pytest.mark.parametrize('packing', ['BZ2', 'LZ4'])
 def test_a_chunk_of_a_ros1_bag_expands_within_limits(tmp_path, packing, monkeypatch):
-    # WHY: reading a ROS 1 bag of 10 kB used 1 GB of memory.
     store, kind = get_typestore(Stores.ROS1_NOETIC), 'sensor_msgs/msg/Temperature'
     header = store.types['std_msgs/msg/Header']
     stamp = store.types['builtin_interfaces/msg/Time']
@@ -179,7 +178,7 @@ def other(content):
 
 
 def one_by_one(data):
-    """Return (place, size, channel, log time) of each message, other records, end of the last."""
+    """Return place, size, channel and log time of each message; other records; end of the last."""
     at, messages, others = 0, [], []
     while at + 9 <= len(data):
         opcode, length = struct.unpack_from('<BQ', data, at)
@@ -199,7 +198,7 @@ def listed(messages):
     return list(zip(*(column.tolist() for column in columns), strict=True))
 
 
-#: Contents of messages that look like MCAP records.
+#: These contents of messages look like MCAP records.
 DECEITFUL = [
     b'\x05' * 40, message(1, 5, b'\x05' * 9), (message(1, 7, b'') * 3)[:40],
     struct.pack('<BQ', MESSAGE, 22 + 40) * 4, bytes(40),
@@ -245,7 +244,7 @@ def test_a_scan_with_a_right_or_false_index_equals_a_plain_loop(data, cut, tail,
     if all(log_ns < 2**63 for _, _, _, log_ns in wanted):
         others.clear()
         messages, reason = scan_records(np.frombuffer(torn, np.uint8), keep)
-        # If zeros follow a message, its end may be lost, too, so the scan leaves out the message.
+        # Zeros after a message may have replaced its end, too, so the scan omits the message.
         is_wiped = len(torn) >= wanted_end + 9 and torn[wanted_end] == 0
         assert listed(messages) == (wanted[:-1] if is_wiped else wanted)
         assert others == wanted_others

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bags written by other tools: the columns have all messages, in the order of log times."""
+"""Bags written by other tools give columns with all messages, in the order of log times."""
 
 import shutil
 import tempfile
@@ -67,7 +67,7 @@ def test_any_file_gives_its_messages_in_order_of_log_time(messages, **options):
         assert recording.info.end_ns == max(message.log_ns for message in messages)
         is_indexed = options['index_types'] == IndexType.ALL
         if options['use_chunking'] and is_indexed and options['repeat']:
-            # Versions of rosbags sort messages with equal log times differently.
+            # Versions of rosbags differ in the order of messages with equal log times.
             with Reader2(path) as reader:
                 order = [(log_ns, link.topic) for link, log_ns, _ in reader.messages()]
             wanted = [(m.log_ns, m.topic) for m in in_reading_order(messages)]
@@ -117,7 +117,7 @@ def test_directories_written_by_rosbags_are_read(messages, storage, compression)
 @settings(max_examples=10, deadline=None)
 @given(messages=bags(lowest=1))
 def test_bags_of_ros_1_are_read(messages):
-    # All log times differ: for equal log times a ROS 1 bag has no order between topics.
+    # A ROS 1 bag has no order between topics for equal log times, so all log times differ.
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'bag.bag')
         rec.write_rosbag1(path, messages)
@@ -154,7 +154,7 @@ def test_blocks_end_where_the_frame_changes_and_together_have_all_messages(tmp_p
     assert [frame for block in blocks for frame in [block.frame_id] * len(block)] == frames
     before, n_accel = 0, 0
     for block in blocks:
-        # `after`: for each reading, the index in the block of the first sample after it.
+        # For each reading, `after` is the index in its block of the first sample after it.
         after = block.temperatures['board'].after
         assert ((after >= 0) & (after <= len(block))).all()
         before += len(after)
@@ -201,7 +201,7 @@ def test_the_files_of_a_split_bag_are_read_in_order(tmp_path):
     rec.assert_columns(recording.columns, messages)
     assert recording.info.truncated is None
     assert recording.info.n_messages == len(messages)
-    # Without metadata.yaml, as after a killed recorder, numbers in the file names give the order.
+    # Without metadata.yaml, as after a kill of the recorder, numbers in file names give the order.
     (tmp_path / 'bag' / 'bag.mcap').rename(tmp_path / 'bag' / 'bag_0.mcap')
     (tmp_path / 'bag' / 'bag_1.mcap').rename(tmp_path / 'bag' / 'bag_2.mcap')
     for text in (None, ''):
@@ -216,7 +216,6 @@ def test_the_files_of_a_split_bag_are_read_in_order(tmp_path):
 
 
 def test_databases_without_metadata_are_read_and_a_folder_of_several_bags_is_refused(tmp_path):
-    # WHY: bags of different positions in a folder were read as the files of one truncated bag.
     for name in ('01.mcap', '02.mcap'):
         (tmp_path / name).write_bytes(b'')
     with pytest.raises(RecordingError, match=r'folder of several bags: name its 2 \*\.mcap'):
@@ -276,14 +275,14 @@ def test_the_only_topic_of_a_type_is_used_and_of_two_both_are_named(tmp_path):
             '/imu/ticks, the only Vector3Stamped of the bag, is taken for counts; '
             '/imu/die, the only Temperature of the bag, is taken for board'
         )
-    # No board topic is chosen by type if one is named, if there are two, or if it is the case's.
+    # By its type a board topic is chosen only if none is named, and if only one may be meant.
     with pytest.raises(RecordingError, match='my/die: no such topic'):
         open_recording(path, Topics(board='my/die'), require=('board',))
     for topics in (('imu/die', 'baro/air'), ('temperature/case',), ('x/temperature/case',)):
         several = written(tmp_path / topics[0].replace('/', '_'), *topics)
         with pytest.raises(RecordingError, match='temperature/board: no such topic'):
             open_recording(several, require=('board',))
-    # WHY: `fit` read neither thermometer; its message was that no temperature was recorded.
+    # WHY: `fit` used neither thermometer, and stated that no temperature was recorded.
     path = written(tmp_path / 'two', 'imu/die', 'baro/air')
     with open_recording(path, require=('accel',)) as reader:
         assert 'board' not in reader.topics

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Wrong layouts, encodings and topics, and files that are not bags, are refused with a reason."""
+"""Wrong layouts, encodings and topics, and files other than bags, are refused with the reason."""
 
 import struct
 
@@ -146,7 +146,6 @@ def test_absent_empty_and_ambiguous_topics_and_topics_of_a_wrong_type_are_refuse
 
 
 def test_topic_names_with_control_characters_are_escaped_in_messages(tmp_path):
-    """A topic's name may contain any characters; a message must stay one line on a terminal."""
     path = tmp_path / 'bag.mcap'
     with BagWriter(path) as bag:
         for row in range(30):
@@ -188,19 +187,19 @@ def driver_bag(path, *topics, metadata=None):
 @pytest.mark.parametrize(
     ('topics', 'taken'),
     [
-        # imu/data_raw of REP 145 is chosen, the vector of a magnetometer is not.
+        # The input is imu/data_raw of REP 145, not the vector of a magnetometer.
         ([('imu/data_raw', 'imu'), ('imu/mag', 'vector')], '/imu/data_raw'),
-        # The vectors that an Xsens publishes, free acceleration and angular rate, are not chosen.
+        # The input is not a vector that an Xsens publishes: free acceleration or angular rate.
         ([('imu/data', 'imu'), ('filter/free_acceleration', 'vector')], '/imu/data'),
         ([('imu/data', 'imu'), ('imu/angular_velocity', 'vector')], '/imu/data'),
-        # The input of a filter, imu/data_raw, is chosen, not the output of the filter, imu/data.
+        # The input is imu/data_raw, the input of a filter, not imu/data, the output of a filter.
         ([('imu/data', 'imu'), ('imu/data_raw', 'imu')], '/imu/data_raw'),
         ([('a/imu/data_raw', 'imu'), ('a/accel/counts', 'vector')], '/a/accel/counts'),
         ([('adc/words', 'vector'), ('imu/mag', 'vector')], '/adc/words'),
-        # If two topics suit equally, neither is chosen; a magnetometer is never chosen.
+        # Of two equally suitable topics none is chosen, and a magnetometer is never chosen.
         ([('left/imu', 'imu'), ('right/imu', 'imu'), ('adc/words', 'vector')], None),
         ([('imu/mag', 'vector')], None),
-        # imu/data_raw is an output of the node if regime/dynamic has the same namespace.
+        # The node publishes imu/data_raw if regime/dynamic has the same namespace.
         ([('imu/data_raw', 'imu'), ('regime/dynamic', 'flag')], None),
         ([('a/imu/data_raw', 'imu'), ('regime/dynamic', 'flag')], '/a/imu/data_raw'),
         ([('imu/data_raw', 'imu'), ('regime/dynamic', 'flag'), ('d/imu', 'imu')], '/d/imu'),

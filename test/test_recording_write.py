@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Written bags are read by other tools; a bag exists under its name only when complete."""
+"""Other tools can read written bags; only complete bags have their final name."""
 
 import tempfile
 from pathlib import Path
@@ -87,7 +87,7 @@ def test_rosbags_and_mcap_read_the_written_messages(
             topics = {connection.topic for connection in rosbag.connections}
             assert topics == {rec.ACCEL, rec.BOARD, rec.IMU_IN, '/regime/dynamic', '/diagnostics'}
             listed = [(log, link.topic, bytes(data)) for link, log, data in rosbag.messages()]
-        # The order of messages with equal log times in two chunks depends on rosbags' version.
+        # rosbags' version determines the order of messages with equal log times in two chunks.
         assert [log for log, *_ in listed] == times
         assert sorted(listed) == sorted(wanted)
 
@@ -107,7 +107,7 @@ def test_a_written_bag_has_its_metadata_and_regime_topics_with_the_qos_of_the_no
         content = (tmp_path / name).read_bytes()
         (tmp_path / name).write_bytes(content[: len(content) // 2])
         assert read_recording(tmp_path / name, require=()).info.metadata == pairs
-    # WHY: a bag had `regime/stamped` as volatile: a subscriber that joined later got no regime.
+    # WHY: `regime/stamped` was volatile in a bag, so a subscriber that joined later got no regime.
     folder = tmp_path / 'qos'
     with BagWriter(folder / name) as bag:
         bag.write_raw('imu0/regime/dynamic', BOOL, [1], [b''])
@@ -150,7 +150,7 @@ def test_a_written_directory_equals_that_of_rosbag2_and_a_file_contains_its_name
     assert qos == topic['topic_metadata']['offered_qos_profiles']
     assert qos[0]['reliability'] == 'reliable'
     assert yaml.safe_load(metadata['rosbag2']['serialized_metadata']) == content
-    # A bag is written under a temporary name, which must not be in its metadata.
+    # The metadata of a bag must not contain its temporary name.
     small(tmp_path / 'bag.mcap')
     with (tmp_path / 'bag.mcap').open('rb') as stream:
         (metadata,) = make_reader(stream).iter_metadata()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The regime detector detects ramps early and with few false alarms; the runs are seeded."""
+"""In seeded runs the regime detector detects ramps early, with few false alarms."""
 
 import math
 from dataclasses import replace
@@ -37,7 +37,7 @@ def case_and_board(t, corners, lag=LAG_S, start=20.0):
 
 
 def onsets(noise, quantum, rate_k_min, lag, n, *, dt=1.0, end_s=1500.0, soak_s=1500.0):
-    """Run n ramps; return each ramp's regime switches, and the number of ramps begun in STATIC."""
+    """Run n ramps; return the regime switches of each, and how many ramps began in STATIC."""
     settings = detector_settings(noise, quantum, lag)
     collected, n_static = [], 0
     for seed in range(n):
@@ -56,7 +56,7 @@ def onsets(noise, quantum, rate_k_min, lag, n, *, dt=1.0, end_s=1500.0, soak_s=1
 
 @cache
 def headline(sensor):
-    """Run the ramps of docs/regime.md: 0.5 K/min, thermal lag 15 min, 1 Hz, after a soak."""
+    """Run the ramps of docs/regime.md: 0.5 K/min at 1 Hz, thermal lag of 15 min, after a soak."""
     return onsets(*SENSORS[sensor], 0.5, LAG_S, 12, end_s=300.0, soak_s=1800.0)
 
 
@@ -83,14 +83,14 @@ def test_the_onset_of_a_ramp_is_detected_early(sensor, median_s, late_s):
     ('sensor', 'threshold'), [('1 mK', 9.65), pytest.param('10 mK', 8.87, marks=pytest.mark.slow)]
 )
 def test_the_onset_delay_is_below_twice_that_of_a_cusum_test(sensor, threshold):
-    # A CUSUM that knows the ramp has the least delay; `threshold` gives one false alarm in 50 h.
+    # A CUSUM test that knows the ramp has the least delay; `threshold`: a false alarm per 50 h.
     noise = SENSORS[sensor][0]
     rng = np.random.default_rng(4)
     k = np.arange(1.0, 121.0)
     signature = lagged(np.append(0.0, k), [(0.0, 0.5)], LAG_S)[1:]
     delays = []
     for _ in range(40):
-        # A likelihood-ratio test that also knows the onset is at most 1 s faster than CUSUM.
+        # A likelihood-ratio test that also knows the onset is faster than CUSUM by 1 s at most.
         x = signature + rng.normal(0.0, noise, len(k))
         ratio = np.cumsum(signature * x - 0.5 * signature**2) / noise**2
         delays.append(k[np.argmax(ratio > threshold)])
@@ -116,7 +116,7 @@ def test_each_ramp_switches_the_regime_to_dynamic_once(noise, quantum, rate_k_mi
     delays, _ = onsets(noise, quantum, rate_k_min, lag, 2 if dt < 1.0 else 3, dt=dt, end_s=end_s)
     for each in delays:
         assert [regime for _, regime, _ in each] in ([DYNAMIC], [STATIC, DYNAMIC])
-        # The slowest detection waits for two steps of 1 K, at 0.2 K/min behind a lag of 15 min.
+        # The slowest detection needs two steps of 1 K, at 0.2 K/min behind a lag of 15 min.
         assert each[-1][0] < 0.5 * end_s
 
 
@@ -128,7 +128,7 @@ def test_each_ramp_switches_the_regime_to_dynamic_once(noise, quantum, rate_k_mi
     ],
 )
 def test_three_soaks_of_5_h_have_at_most_two_false_alarms(sensor):
-    # At the default of 0.02 false alarms per hour more than two in 15 h have p = 0.4 %.
+    # With the default of 0.02 false alarms per hour, more than two in 15 h have p = 0.4 %.
     noise, quantum = SENSORS[sensor]
     n_openings = 0
     for seed in range(3):
@@ -146,9 +146,8 @@ def test_three_soaks_of_5_h_have_at_most_two_false_alarms(sensor):
 
 
 def test_the_rate_of_false_alarms_is_below_that_of_the_setting():
-    # The setting allows 20 false alarms per hour, 1000 in 50 h; the readings are noise only. The
-    # threshold is set by Rice's formula for crossings; as crossings come in groups, there are
-    # fewer separate alarms. The lower limit 50 excludes a detector without alarms.
+    # The setting allows 1000 false alarms in 50 h of noise. Rice's formula for the threshold
+    # counts crossings, several per alarm; the lower limit excludes a detector without alarms.
     settings = ThermometerSettings(0.01, lag_s=LAG_S)
     test = ChangeDetector(settings, 0.2 / 60.0, ripple=0.0, false_alarms=20.0 / 3600.0)
     rng = np.random.default_rng(6)
@@ -169,8 +168,8 @@ def test_the_rate_of_false_alarms_is_below_that_of_the_setting():
 
 @pytest.mark.parametrize('dt', [0.1, 1.0, 10.0])
 def test_the_threshold_follows_from_the_noise_of_the_filter(dt):
-    # Expected threshold: filter gain by the Riccati equation, noise and correlation by the impulse
-    # response, alarms by Rice's formula. `_tune` has first-order formulas: errors up to 4 %.
+    # Expected are the filter gain by the Riccati equation, noise and correlation by the impulse
+    # response, alarms by Rice's formula. `_tune` uses first-order formulas with errors up to 4 %.
     test = ChangeDetector(ThermometerSettings(0.01, lag_s=LAG_S), 0.2 / 60.0, 0.0, 0.02 / 3600.0)
     test._tune(dt)
     for threshold, power in zip(test._thresholds, test._powers, strict=True):
@@ -204,7 +203,7 @@ def recorded(corners, begin, end, *, quantum=0.0, start=20.0):
 
 
 def run_once(corners, *, quantum=0.0, begin=-1800.0, end=8000.0, **parts):
-    """Return a run's regime switches; `parts`: functions of (t, readings) changing readings."""
+    """Return a run's regime switches; `parts`: functions of (t, readings) that change readings."""
     t, *both = recorded(corners, begin, end, quantum=quantum)
     readings = dict(zip(('case', 'board'), both, strict=True))
     for name, change in parts.items():
@@ -216,7 +215,7 @@ RAMP = [(0.0, 0.5), (3600.0, 0.0)]
 
 
 def test_the_dynamic_regime_ends_when_the_board_or_else_the_case_has_the_relaxed_rate():
-    # The regime ends when the board's rate has been below 0.05 K/min for the dwell time, 60 s.
+    # The regime ends when the board's rate has been below 0.05 K/min for 60 s, the dwell time.
     changes = run_once(RAMP)
     assert [regime for _, regime, _ in changes] == [STATIC, DYNAMIC, STATIC]
     t = np.arange(3600.0, 12000.0)
@@ -230,16 +229,15 @@ def test_the_dynamic_regime_ends_when_the_board_or_else_the_case_has_the_relaxed
         switches(detector_settings(0.001, relaxed_rate_k_min=rate), *readings)[-1][0]
         for rate in (0.025, 0.05, 0.1)
     ]
-    # If the relaxed rate is halved, the dynamic regime ends later by LAG_S (longest lag) * ln 2.
+    # With half the relaxed rate the dynamic regime ends later by LAG_S (longest lag) * ln 2.
     assert -np.diff(ends) == pytest.approx([LAG_S * math.log(2.0)] * 2, rel=0.25)
 
 
 @pytest.mark.parametrize('sensor', ['1 mK', '1 mK, 62.5 mK steps', '10 mK, 62.5 mK steps'])
 def test_the_dynamic_regime_ends_by_the_case_or_the_board(sensor):
-    # The case lags the chamber by 3 min, the board lags the case by 15 min. After the ramp the
-    # case's rate falls as exp(-t / 180 s), the board's as 900 / 720 exp(-t / 900 s): case and
-    # board reach the relaxed rate, 0.1 of the ramp's, after 7 and 38 min. Readings with steps of
-    # 62.5 mK do not show the last 5 min of the case's change.
+    # The case lags the chamber by 3 min, the board lags the case by 15 min. After the ramp their
+    # rates fall to the relaxed rate, 0.1 of the ramp's, within 7 and 38 min. Steps of 62.5 mK do
+    # not show the last 5 min of the case's change.
     noise, quantum = SENSORS[sensor]
     lag, behind = 180.0, 900.0
     of_case = ThermometerSettings(noise, quantum, lag_s=lag)
@@ -255,7 +253,7 @@ def test_the_dynamic_regime_ends_by_the_case_or_the_board(sensor):
     assert [regime for _, regime, _ in early] == [STATIC, DYNAMIC, STATIC]
     assert early[1] == late[1]
     assert late[2][0] - early[2][0] == pytest.approx(earlier, abs=300.0)
-    # End condition 'case' uses only the case or, if there is no case thermometer, the board.
+    # For the end condition 'case' the board matters only if there is no case thermometer.
     assert early == switches(board_too, t, case, None)
     t, board = t[:3000], board[:3000]
     assert switches(case_alone, t, None, board) == switches(board_too, t, None, board)
@@ -267,7 +265,7 @@ TRIANGLE = [(0.0, 0.5), (3600.0, -0.5), (7200.0, 0.5), (10800.0, 0.0)]
 @pytest.mark.parametrize('lost', [None, 'case', 'board'])
 @pytest.mark.parametrize('quantum', [0.0, 0.0625])
 def test_the_regime_stays_dynamic_at_a_reversal_of_the_ramp(lost, quantum):
-    # At a reversal of the ramp, readings with steps of 62.5 mK are constant for minutes.
+    # Readings with steps of 62.5 mK are constant for minutes at a reversal of the ramp.
     parts = {lost: lambda *_: None} if lost else {}
     changes = run_once(TRIANGLE, quantum=quantum, end=16000.0, **parts)
     assert [regime for _, regime, _ in changes] == [STATIC, DYNAMIC, STATIC]
@@ -282,7 +280,7 @@ def test_the_direction_changes_when_the_case_reverses_and_not_by_repeated_readin
     turn = next(at for at in directions if at > 3600.0 and directions[at] == -1)
     assert turn == pytest.approx(3600.0 + 616.0, abs=60.0)
     assert directions[7199.0] == -1
-    # WHY: temperatures measured every 30 s and published every second gave false reversals.
+    # WHY: readings taken every 30 s, but published every second, gave false reversals.
     rng = np.random.default_rng(1)
     t = np.arange(-2400.0, 6000.0)
     truths = case_and_board(t, [(0.0, 2.0), (3000.0, 0.0)], 300.0)

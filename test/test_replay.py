@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`replay` equals, bit for bit, a compensator that processes the messages one by one."""
+"""`replay` has the bits of a compensator that processes the messages one by one."""
 
 import csv
 import dataclasses
@@ -8,7 +8,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from builders import calibration, equal_axes, rich_calibration
+from builders import SECOND_NS, START_NS, calibration, equal_axes, rich_calibration
 from recording_helpers import BOOL, OTHER, Message, imu_columns, regular_messages, write_rosbag1
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
@@ -22,12 +22,10 @@ from thermo_comp.topics import IMU_OUT, REGIME
 from thermo_comp.unit.calibration import Unit
 
 TOPICS = Topics()
-START_NS = 1_767_225_600_000_000_000
-SECOND_NS = 1_000_000_000
 
 
 def thermal_test(path, minutes=30.0, rate_hz=5.0, serial='', is_imu=False):
-    """Write a bag, in seven parts, of a ramp between two soaks with a board that lags."""
+    """Write a bag of a ramp between two soaks, in seven parts; the board lags the case."""
     rng = np.random.default_rng(7)
     n = round(minutes * 60.0 * rate_hz)
     stamps = START_NS + np.rint((np.arange(n) + 1.0) * (1e9 / rate_hz)).astype(np.int64)
@@ -92,7 +90,6 @@ def test_replay_of_constants_needs_no_thermometer(tmp_path):
 
 
 def test_infinite_board_readings_hide_no_warning_of_the_range(tmp_path):
-    # WHY: infinite readings gave a RuntimeWarning, and the note about the range was missing.
     bag, stamps = tmp_path / 'bag', START_NS + np.arange(300) * SECOND_NS
     celsius = np.full(300, 90.0)
     celsius[100:150], celsius[200:205] = np.inf, -np.inf
@@ -138,7 +135,7 @@ def test_another_unit_is_refused_unless_serial_names_it_or_is_empty_and_another_
 
 
 def test_memory_does_not_grow_with_the_bag(tmp_path, monkeypatch):
-    # With blocks of 2048 messages each bag has many blocks; a unit cycle of 2 ms allows 500 Hz.
+    # Blocks have 2048 messages, so each bag has many blocks; a unit cycle of 2 ms allows 500 Hz.
     monkeypatch.setattr('thermo_comp.recording.blocks.BLOCK_MESSAGES', 1 << 11)
     calibration = rich_calibration()
     unit = dataclasses.replace(calibration.unit, cycle_time_s=0.002)
@@ -158,7 +155,7 @@ def test_memory_does_not_grow_with_the_bag(tmp_path, monkeypatch):
         parts, held_bytes = zip(*held, strict=True)
         assert list(parts) == sorted(parts)
         assert parts[-1] == 1.0
-    # A bag with three times the messages needs more memory only for its list of regime flags.
+    # Three times the messages need more memory only for the list of regime flags.
     assert peaks[1] < 1.1 * peaks[0]
     third = len(parts) // 3
     assert max(held_bytes[-third:]) < 1.15 * max(held_bytes[:third])
@@ -166,7 +163,7 @@ def test_memory_does_not_grow_with_the_bag(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize('imu', [False, True])
 def test_an_output_table_has_the_values_of_the_output_bag(tmp_path, imu):
-    pq = pytest.importorskip('pyarrow.parquet', reason='pyarrow is the extra `parquet`')
+    pq = pytest.importorskip('pyarrow.parquet', reason='pyarrow is not installed')
     bag = thermal_test(tmp_path / 'bag', rate_hz=2.0, is_imu=imu)
     unit = {'unit': Unit('T-1', 'm/s^2', 100.0, 0.1)} if imu else {}
     calibration = dataclasses.replace(rich_calibration(), **unit)

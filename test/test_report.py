@@ -29,8 +29,6 @@ VOID = {'meta', 'br', 'path', 'use', 'rect', 'image'}
 
 
 class Page(HTMLParser):
-    """Collects the tags, attributes and texts of a page."""
-
     def __init__(self, text):
         super().__init__()
         self.source, self.text, self.tags, self.open = text, '', [], []
@@ -162,7 +160,7 @@ def test_texts_of_a_bag_or_a_calibration_are_escaped_in_the_page(tmp_path, monke
 
 
 def test_the_page_of_a_bag_of_a_day_is_small(monkeypatch):
-    # Readings of a day at 2 Hz are hundreds of points per pixel.
+    # A day of readings at 2 Hz has hundreds of points per pixel.
     shown, windows = evidence().shown, evidence().windows
     time = np.arange(0.0, 86400.0, 0.5)
     value = 20.0 + 15.0 * np.sin(time / 9000.0) + np.random.default_rng(1).normal(size=len(time))
@@ -193,7 +191,7 @@ def test_a_bag_is_read_for_a_page_in_limited_memory(tmp_path):
     finally:
         tracemalloc.stop()
     assert opened.n_samples == n_times * len(simulated.counts)
-    # All samples and stamps in memory would need more than 32 bytes per sample.
+    # The samples and stamps of the whole bag would need more than 32 bytes per sample.
     assert peak < 64 * opened.n_samples
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The certificate prints statements of the laboratory, and right budgets and rounded values."""
+"""The certificate prints the laboratory's statements, correct budgets and rounded values."""
 
 import json
 import math
@@ -44,7 +44,7 @@ from thermo_comp.unit.prediction import in_a_soak
 
 pytestmark = pytest.mark.usefixtures('equal_fits_once', 'no_figures')
 
-#: The row of the budget for the error on data left out of the fit.
+#: Name of the budget's row for the error on data left out of the fit.
 LACK = 'lack of fit'
 LAB = """
 number: 2026-017
@@ -100,9 +100,9 @@ def test_statements_of_a_laboratory_are_printed_and_missing_statements_are_blank
         *('Room 2, Exampleton', 'undamaged', '2026-02-20'),
     ):
         assert text in page, text
-    # Two fields are blank: the address of the customer, and the place of the signature.
+    # Two fields are blank: the customer's address, and the place of the signature.
     assert page.count('class="blank"') == 2
-    # The margin of each printed page has the numbers of certificate and unit, in CSS escapes.
+    # The margin of each printed page shows certificate number and serial, in CSS escapes.
     number, unit = '2026\\00002d017', 'thermostatted\\00002d0001'
     assert f'certificate\\000020{number}\\00002c\\000020unit\\000020{unit}' in page
     order = [
@@ -163,7 +163,7 @@ def test_the_uncertainty_budget_adds_up_to_the_claimed_sd_or_a_larger_residual(t
     standards = {source.name: source.standard for source in budget(evidence(), CertificateInfo())}
     assert standards['gravity'] is None
     assert standards['thermometers'] is None
-    # The claimed sd is the root sum square of four rows of the budget.
+    # The claimed sd squared is the sum of the squares of these four rows of the budget.
     windows = evidence().judgement.windows
     claim = float(np.sqrt(np.mean(windows.claimed_sd[windows.is_inside] ** 2)))
     parts = [standards[name] for name in ('noise', 'attitude', LACK, 'model')]
@@ -183,7 +183,6 @@ def test_the_uncertainty_budget_adds_up_to_the_claimed_sd_or_a_larger_residual(t
 
 @pytest.mark.slow
 def test_the_lack_of_fit_is_a_row_of_the_budget_and_not_part_of_the_model():
-    # WHY: the budget did not name the lack of fit, which the row `model` contained.
     def with_lack(*sds):
         points = [LackOfFit(c, (sd,) * 3) for c, sd in zip((15.0, 30.0), sds, strict=True)]
         sets = [
@@ -199,7 +198,7 @@ def test_the_lack_of_fit_is_a_row_of_the_budget_and_not_part_of_the_model():
     windows, standards, lines = with_lack(1e-3, 2e-3)
     # The variance of the lack of fit is linear between 15 and 30 degC, and equal on all axes.
     variance = 1e-6 + 3e-6 * np.clip((windows.board - 15.0) / 15.0, 0.0, 1.0)
-    # In the first five minutes of a bag the regime may be unknown: the variances of both sets add.
+    # The regime may be unknown for five minutes: then the variances of both sets add.
     known = windows.time > 300.0
     np.testing.assert_allclose(windows.lack_sd[known] ** 2, variance[known], rtol=0.01)
     assert (windows.lack_sd**2 / variance).max() == pytest.approx(2.0, rel=0.01)
@@ -225,7 +224,7 @@ def test_the_budget_of_a_unit_with_a_kink_names_the_lack_of_fit():
     judged = evidence_of_fit(fit(sources, options))
     lines = budget(judged, CertificateInfo())
     standards = {line.name: line.standard for line in lines}
-    # The lack of fit is a part of the drift on left-out data; the rest is the noise of the fit.
+    # The drift on left-out data consists of the lack of fit and of the noise of the fit.
     left_out = judged.calibration.provenance.left_out_drift
     assert 0.3 * left_out < standards[LACK] < left_out
     windows = judged.judgement.windows
@@ -243,18 +242,18 @@ def test_the_uncertainty_of_scale_factors_contains_that_of_gravity_or_is_withhel
     assert 'combined, without gravity' in page
     info = load_certificate_info(lab(tmp_path))
     assert 'withheld' not in render_report(evidence(), info)
-    # WHY: the file of the calibration did not store gravity's sd, so U was withheld after a fit.
+    # WHY: calibration files did not store gravity's sd, so U was withheld after a fit.
     unit = replace(evidence().calibration, gravity_sd_m_s2=2e-5)
     stated = replace(evidence(), calibration=parse_calibration(dump_calibration(unit).encode()))
     page = render_report(stated)
     assert 'withheld' not in page
-    # WHY: gravity's sd was in all expanded uncertainties, but its line in the page was blank.
+    # WHY: all expanded uncertainties contained gravity's sd, but its line on the page was blank.
     assert re.search(r'Standard uncertainty of gravity<[^0-9]*2e-05 m/s²', page)
     assert {source.name: source.standard for source in budget(stated, info)}['gravity'] == 2e-5
     info = load_certificate_info(lab(tmp_path, 'gravity: {standard_uncertainty_m_s2: 9.80665e-3}'))
     rows = {result.quantity: result for result in results(evidence(), info, ())}
     scale = fitted().calibration.axes.x.scale_factor
-    # Gravity, with a relative uncertainty of 1e-3, dominates the scale's uncertainty U = 2e-3.
+    # The relative uncertainty of gravity, 1e-3, dominates U = 2e-3 of the scale factor.
     assert float(rows['scale factor x'].expanded) == pytest.approx(2e-3 * scale, rel=0.05)
     assert rows['bias x'] in results(evidence(), CertificateInfo(), ())
 
@@ -272,7 +271,7 @@ def test_the_table_over_temperature_agrees_with_the_calibration(tmp_path):
         for cells in (cells for program, *cells in table.rows if program == 'soak'):
             at, *numbers = map(float_of, cells)
             bias, sd, scale, scale_sd = in_a_soak(calibration, at)
-            # Values and temperatures are rounded; the tolerance is half of the last digit.
+            # Values and temperatures are rounded, so the tolerance is half of the last digit.
             slack = 0.06 * abs(table.bias_slope) + 0.06 * numbers[1]
             assert numbers[0] == pytest.approx(bias[k] / MICRO_G, abs=slack)
             assert numbers[1] == pytest.approx(2.0 * sd[k] / MICRO_G, rel=0.06)
@@ -343,8 +342,7 @@ def test_conformity_is_stated_only_with_a_tolerance():
 
 
 def test_a_fit_in_one_pose_states_that_the_error_on_data_left_out_is_a_drift(cli, tmp_path):
-    # WHY: after a fit to one pose the certificate stated the drift of left-out data as the error
-    # |f| - g in left-out positions, and the calibration file did not contain this drift.
+    # WHY: after a fit to one pose the drift of left-out data was printed as the error |f| - g.
     bag, page, unit = write_bag(tmp_path / '01.mcap'), tmp_path / 'fit.html', tmp_path / 'fit.yaml'
     given = ('--gravity', '9.80665', '--groups', 'curve,set', '--report', page, '--json')
     facts = json.loads(cli('fit', bag, '-o', unit, *given).stdout)
@@ -358,7 +356,7 @@ def test_a_fit_in_one_pose_states_that_the_error_on_data_left_out_is_a_drift(cli
     shown = cli('info', unit).stdout
     drift = micro_g(known.left_out_drift)
     assert re.search(rf'^all +\d+ .* - +{re.escape(drift)}$', shown, re.MULTILINE)
-    # A file of an earlier version has no left-out drift.
+    # The file of an earlier version has no left-out drift.
     older = re.sub(r',\s+left_out_drift_m_s2: \S+}', '}', unit.read_text(encoding='utf-8'))
     assert math.isnan(parse_calibration(older.encode()).provenance.left_out_drift)
     chosen = [model for model in facts['models'] if model['is_chosen']]

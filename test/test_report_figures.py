@@ -28,7 +28,7 @@ pytestmark = pytest.mark.usefixtures('equal_fits_once')
 
 
 def test_drawn_bias_and_scale_curves_agree_with_formulas():
-    # Bias of x: 0.3 counts/K of board temperature, and 0.3 counts/K of the lag with tau = 600 s.
+    # The bias of x grows by 0.3 counts per K of board temperature, and per K of the lag (600 s).
     static, dynamic = (
         regime_set(*[axis_set((0.0, 0.3), (1.0, 7e-5), delta=delta)] * 3, rate_range_k_min=(0, 2))
         for delta in (0.0, 0.5)
@@ -62,12 +62,12 @@ def test_measured_errors_in_soaks_are_those_of_the_scale_factors():
 
 
 def test_position_errors_and_the_map_of_the_sphere_agree_with_hand_numbers():
-    # A bias of 1 mg causes 9.80665e-3 * 1800 m in 60 s; 1 ug causes up to 1e-6 Earth diameters.
+    # In 60 s 1 mg causes an error of 9.80665e-3 * 1800 m; 1 ug at most 1e-6 Earth diameters.
     assert position_error(1e3 * MICRO_G, 60.0) == pytest.approx(17.652, rel=1e-4)
     assert schuler_peak(MICRO_G) == pytest.approx(12.742, rel=1e-4)
     assert figures.equal_area((0.0, 0.0, 1.0), 1) == (0.0, 0.0)
     assert figures.equal_area((0.0, 1.0, 0.0), -1) == (0.0, 1.0)
-    # The cap above 45 deg has the share 1 - sin 45 of the hemisphere's area, and of the disc's.
+    # The cap above 45 deg has 1 - sin 45 of the area of the hemisphere, and so of the disc.
     x, y = figures.equal_area((np.sqrt(0.5), 0.0, np.sqrt(0.5)), 1)
     assert x**2 + y**2 == pytest.approx(1.0 - np.sqrt(0.5))
 
@@ -90,7 +90,7 @@ UNITS = ('°C', 'K/min', 'µg', 'ppm', 'counts', '%', 'm/s²', 'position')
 
 
 def look(line):
-    """Return dashes, marker and darkness of a line, which distinguish lines without colour."""
+    """Return dashes, marker and darkness of a line, by which lines differ without colour."""
     dashes, colour = line._unscaled_dash_pattern, line.get_color()
     marker = f'{line.get_marker()} {line.get_markerfacecolor()}'
     darkness = round(float(np.dot(to_rgb(colour), (0.2126, 0.7152, 0.0722))), 1)
@@ -165,7 +165,7 @@ HEADLESS = (
 
 
 def browse(folder, page, *options):
-    """Open a page of a folder, beside the certificate, in a browser; return the browser's log."""
+    """Open a page beside the certificate in a browser; return the browser's log."""
     path = next(filter(None, map(shutil.which, ('chromium', 'chromium-browser'))), None)
     if path is None:
         pytest.skip('no Chromium here (Debian: apt install chromium)')
@@ -177,7 +177,7 @@ def browse(folder, page, *options):
 
 
 def test_a_browser_draws_the_page_at_390_pixels_without_errors(tmp_path):
-    # A headless browser has a smallest window width; a frame in the window can be 390 px wide.
+    # The window of a headless browser has a minimum width, but a frame in it can be 390 px wide.
     (
         tmp_path / 'frame.html'
     ).write_text("""<iframe src="page.html" style="width:390px;height:800px;border:0"></iframe>

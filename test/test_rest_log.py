@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The rest log has the right content and size, also after a killed node or a full disk."""
+"""The rest log has the right content and size, also after a kill of the node or on a full disk."""
 
 import json
 import signal
@@ -80,7 +80,7 @@ def finder():
 
 
 def check_blocks(stamps, samples, cuts, whole):
-    """Check that samples in blocks give the same rests as all samples at once (`whole`)."""
+    """Check that samples in blocks give the rests `whole`, found in all samples at once."""
     pieces, found = finder(), []
     for cut in np.split(np.arange(len(samples)), cuts):
         if len(cut):
@@ -90,7 +90,7 @@ def check_blocks(stamps, samples, cuts, whole):
 
 
 def test_logged_windows_are_means_over_10_s_at_rest_with_a_mean_rate_if_none_is_missing():
-    # A rest of 25 s and, after 1 s of handling, a rest of 21 s: each gives two windows of 10 s.
+    # A rest of 25 s, 1 s of handling and a rest of 21 s: each rest has two windows of 10 s.
     first, second = standing(25 * RATE_HZ), standing(21 * RATE_HZ, 2)[:, [2, 1, 0]]
     handled = first[:RATE_HZ] + np.linspace(0.0, 900.0, RATE_HZ)[:, None]
     samples = np.concatenate((first, handled, second))
@@ -102,13 +102,13 @@ def test_logged_windows_are_means_over_10_s_at_rest_with_a_mean_rate_if_none_is_
         assert np.allclose(row.mean, part.mean(axis=0), atol=1e-9)
         assert np.allclose(row.sd, part.std(axis=0), rtol=0.05)
     check_blocks(stamps, samples, [7, 333, 334, 1201], whole)
-    # WHY: blocks of messages with and without rates had 6 and 3 columns, which ended the log.
+    # WHY: messages with and without rates had 6 and 3 columns, which ended the log.
     samples = np.hstack((standing(25 * RATE_HZ), np.full((25 * RATE_HZ, 3), 0.01)))
     samples[7, 3:] = np.nan
     stamps = START_NS + np.arange(len(samples)) * CYCLE_NS
     first, second = finder().add(stamps, samples)
     assert (first.rate, len(second.rate)) == ((), 3)
-    # The second with a sample without acceleration does not count as a rest.
+    # The second that lacks an acceleration does not count as a rest.
     samples[7, :3] = np.nan
     rests = finder().add(stamps, samples)
     assert [(row.stamp_ns - START_NS) / SECOND_NS for row in rests] == [6.0, 16.0]
@@ -116,7 +116,7 @@ def test_logged_windows_are_means_over_10_s_at_rest_with_a_mean_rate_if_none_is_
 
 @pytest.mark.parametrize('rate', [1.0, 2.0, 3.3, 5.0, 50.0, 2000.0])
 def test_rests_are_found_at_any_rate_of_samples(rate, rng):
-    # Two rests of a minute, stamps with jitter; above `RATE_HZ` the noise has a constant density.
+    # Two rests last a minute; stamps have jitter; above `RATE_HZ` the noise density is constant.
     n = round(120 * rate)
     cycles = np.arange(n) + 0.1 * rng.uniform(-1.0, 1.0, n)
     stamps = START_NS + np.rint(cycles * SECOND_NS / rate).astype(np.int64)
@@ -154,7 +154,7 @@ def test_motion_and_bad_samples_are_not_logged_as_rests(fault):
 
 
 def test_a_long_rest_is_logged_with_increasing_intervals():
-    # A rest is logged by 60 windows in its first 10 min, 1 per min up to 1 h, then 1 per 5 min.
+    # 60 windows of a rest are logged in its first 10 min, 1 per min up to 1 h, then 1 per 5 min.
     kept, searching = 0, finder()
     samples = standing(6 * 60)
     for minute in range(71):
@@ -175,7 +175,7 @@ def test_a_damaged_rest_log_loses_only_the_damaged_lines(place, value):
     changed = bytearray(content)
     changed[place % len(content)] = value
     left = [row for _, row in decode(bytes(changed))[0]]
-    # A wrong byte loses one rest, a wrong newline two rests, and a wrong start line all rests.
+    # One wrong byte loses a rest, a wrong newline two, a wrong line of a start all its rests.
     assert all(row in [rest(k) for k in range(9)] for row in left)
     assert len(left) >= 7 or place % len(content) < len(encode(START))
 
@@ -248,7 +248,7 @@ def test_a_killed_node_damages_at_most_one_line_of_its_rest_log(tmp_path, unit, 
     sent = 0
 
     def until(condition, what):
-        """Send bursts of 50 samples until a condition holds; DDS loses those before discovery."""
+        """Send bursts of 50 samples until a condition holds; samples before discovery are lost."""
         nonlocal sent
         pause = threading.Event()
         for _ in range(len(samples) // RATE_HZ):
@@ -268,7 +268,7 @@ def test_a_killed_node_damages_at_most_one_line_of_its_rest_log(tmp_path, unit, 
     with file.open('ab') as torn:
         torn.write(encode(rest(9))[:40])
     before = logged(folder)
-    # A node that is started with this folder appends rests after the incomplete line.
+    # The node appends its rests after the incomplete line.
     with node_in_thread(*words) as node:
         heard = peer.listen(DiagnosticArray, '/diagnostics')
         peer.join(node)
@@ -290,13 +290,12 @@ def test_a_killed_node_damages_at_most_one_line_of_its_rest_log(tmp_path, unit, 
 
 
 def test_a_rest_has_the_temperature_at_its_own_time_at_any_speed_of_playing(tmp_path, unit, peer):
-    # WHY: a rest got the thermal state at the end of its block of samples: 0.75 K off in a ramp.
     folder, rate_k_s = tmp_path / 'rests', 0.02
     words = node_arguments(unit, f'rest_log:={folder}', 'diagnostics_period:=1.0')
     with node_in_thread(*words) as node:
         driver, samples = drive(peer, node), standing(40 * RATE_HZ)
         send(driver, samples, rate_k_s=rate_k_s)
-        # Samples of two seconds that arrive again must not change a rest, nor fail.
+        # Samples of two seconds that arrive again must neither change a rest nor cause an error.
         send(driver, samples[-2 * RATE_HZ :], 38 * RATE_HZ, rate_k_s)
         peer.poll(lambda: len(logged(folder)) >= 3, 'three rests on the disk')
         counters = node._relay.running.compensator.counters

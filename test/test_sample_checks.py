@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Invalid samples are dropped; the gravity check refuses aged calibrations, and ignores motion."""
+"""Invalid samples are dropped; the gravity check refuses aged calibrations and ignores motion."""
 
 import math
 from dataclasses import replace
@@ -39,7 +39,7 @@ def readings(second):
 
 
 def recording(n, rate_hz, sample, start_ns=0):
-    """Make events of the samples sample(0) to sample(n - 1), and of both temperatures at 1 Hz."""
+    """Make events: samples sample(0) to sample(n - 1), and both temperatures at 1 Hz."""
     events = []
     second = start_ns // SECOND_NS
     for k in range(n):
@@ -80,12 +80,12 @@ def test_a_constant_axis_is_stuck_if_the_other_axes_change(axis, value):
         return tuple(counts)
 
     stream(compensator, recording(1000, 100.0, sample))
-    assert compensator.counters.n_out == 201  # two seconds
+    assert compensator.counters.n_out == 201  # samples of two seconds
     assert compensator.counters.n_stuck == 799
 
 
 def noisy_unit(noise_counts, n_in_counts=K):
-    """Make a calibration with a white noise of `noise_counts` (sd of a sample at 100 Hz)."""
+    """Make a calibration whose samples at 100 Hz have white noise of sd `noise_counts`."""
     density = noise_counts / n_in_counts / 10.0
     return calibration(
         axes=equal_axes(n_in_counts),
@@ -105,7 +105,7 @@ def test_a_constant_axis_at_rest_is_stuck_if_its_noise_would_show(dead, rng):
         return tuple(counts)
 
     stream(compensator, recording(1000, 100.0, sample))
-    # An axis counts as stuck after the time-out, 2 s, or later, once the other axes show noise.
+    # An axis counts as stuck after the time-out of 2 s, and not before the other axes show noise.
     assert 201 <= compensator.counters.n_out <= 260
     assert compensator.counters.n_stuck == 1000 - compensator.counters.n_out
 
@@ -116,13 +116,13 @@ def low_passed(rng, correlation):
 
 
 def quiet(rng, step):
-    """Draw a noise at rest of 0.1 rounding steps, for a calibration made in a shaken chamber."""
+    """Draw noise of 0.1 rounding steps at rest; the calibration was made in a shaken chamber."""
     centre = step * np.round(LEVEL / step) + step * np.array([0.5, 0.0, 0.5])
     return step * np.round((centre + rng.normal(0.0, 0.1 * step, (5000, 3))) / step)
 
 
 def below_a_step(rng, _):
-    """Draw a noise below a rounding step: x repeats one value, y and z alternate between two."""
+    """Draw noise below a rounding step: x repeats one value, y and z alternate between two."""
     return np.round(np.floor(LEVEL) + [0.0, 0.5, 0.5] + [0, 0.1, 0.1] * rng.normal(size=(5000, 3)))
 
 
@@ -146,7 +146,7 @@ def test_the_variance_of_samples_in_m_s2_is_proportional_to_their_rate(rng):
     samples = GRAVITY * np.array(UP) + 1e-3 * rng.standard_normal((8000, 3))
     rows, _ = stream(compensator, recording(8000, 400.0, lambda k: tuple(samples[k])))
     assert len(rows) == 8000
-    # At four times the calibrated rate a sample has 1/4 of the time, and 4 times the variance.
+    # At four times the rate a sample lasts 1/4 of the time, and has 4 times the variance.
     assert rows[-1][3] / rows[0][3] == pytest.approx(4.0, rel=1e-6)
 
 
@@ -155,13 +155,13 @@ def test_the_gravity_check_uses_local_gravity_or_that_of_the_calibration(rng):
         compensator = Compensator(calibration(), CompensatorConfig(local_gravity_m_s2=local))
         stream(compensator, recording(6000, 100.0, lambda _: at_rest(rng)))
         gravity = compensator.status().gravity
-        # The tolerance is 5 sd of a mean of 110 samples with a noise of 1.4 mm/s^2, plus rounding.
+        # The tolerance is 5 sd of a mean over 110 samples with 1.4 mm/s^2 of noise, plus rounding.
         assert gravity.residual == pytest.approx(expected, abs=5 * 1.4e-3 / math.sqrt(110) + 2e-4)
 
 
 @st.composite
 def stretches(draw):
-    """Draw sequences of samples, each with one kind of fault or none, and temperatures."""
+    """Draw sequences of samples, each with at most one kind of fault, and temperatures."""
     events = []
     stamp_ns = 0
     k = 0
@@ -190,7 +190,7 @@ def stretches(draw):
     return events
 
 
-#: Numbers of samples in a part of the series, also near the limit of a stuck axis.
+#: Numbers of samples in a part of the series; some are near the limit for a stuck axis.
 LENGTHS = [1, 1, 1, 2, 3, 24, 48, 49, 50, 51, 52, 120]
 
 
@@ -201,7 +201,7 @@ LENGTHS = [1, 1, 1, 2, 3, 24, 48, 49, 50, 51, 52, 120]
 )
 @settings(max_examples=300, deadline=None)
 def test_constant_samples_are_found_in_batches_of_any_size(parts, cuts, period):
-    # In each part of the series an axis is constant or changes with each sample; y has some NaN.
+    # In each part of the series an axis is constant or always changes; some y are NaN.
     stands = np.repeat([which >> np.arange(3) & 1 for _, which in parts], [n for n, _ in parts], 0)
     sizes = 1.0 + np.arange(len(stands)) % 4
     samples = 1.0 + np.cumsum((1.0 - stands.reshape(-1, 3)) * sizes[:, np.newaxis], axis=0)
@@ -224,7 +224,7 @@ def test_constant_samples_are_found_in_batches_of_any_size(parts, cuts, period):
             collected += batched.find(stamps[begin:end], samples[begin:end]).tolist()
         begin = end
     assert collected == expected
-    # `last`, a sample and its stamp, has NaN as x, y, z before the first sample.
+    # Before the first sample `last`, a sample and its stamp, has NaN as x, y and z.
     np.testing.assert_array_equal(batched.last, single.last)
     for run, other in zip(single.runs, batched.runs, strict=bool(single.runs)):
         np.testing.assert_array_equal(np.hstack(run), np.hstack(other))
@@ -253,7 +253,7 @@ def test_a_jump_back_in_time_does_not_restore_a_refuted_calibration(rng, is_mend
     stream(compensator, events(0.0 if is_mended else 100.0))
     assert compensator.counters.n_time_jumps == 1
     if is_mended:
-        # Output returns after three windows of 5 s, as the first has no window before it.
+        # Output returns after three windows of 5 s, as the first window has no window before it.
         assert compensator.counters.n_out - n_out == pytest.approx(4500, abs=200)
     else:
         assert compensator.counters.n_out == n_out
@@ -280,10 +280,10 @@ def watch(rng, *, bias=0.0, seconds=60, motion=0.0, rate_hz=100, monitor=None):
 
 def test_the_residual_is_that_of_the_latest_windows_and_motion_gives_no_verdict(rng):
     result = watch(rng)
-    # The residual averages more than 1500 samples; limit: 5 sd of a mean of 1500 samples.
+    # The residual averages more than 1500 samples; the limit is 5 sd of a mean over 1500.
     assert abs(result.residual) < 5 * NOISE_SD / math.sqrt(100 * 15)
     assert result.residual_sd == pytest.approx(math.hypot(BIAS_SD, NOISE_SD / math.sqrt(99)))
-    assert result.n_windows == 59  # the first of 60 windows has no predecessor to compare with
+    assert result.n_windows == 59  # the first of 60 windows has no earlier window to compare with
     assert result.is_still
     assert watch(rng, motion=0.05) is None
     monitor = GravityCheck(GRAVITY)
@@ -292,7 +292,7 @@ def test_the_residual_is_that_of_the_latest_windows_and_motion_gives_no_verdict(
     monitor = GravityCheck(GRAVITY, tolerance=0.1)
     watch(rng, seconds=40, bias=0.001, monitor=monitor)
     assert not monitor.is_refuted
-    # The stamps start again at 0, so the change of |f| is taken for a restart, not for a step.
+    # Stamps start again at 0, so the change of |f| counts as a restart, not as a step.
     result = watch(rng, seconds=8, bias=0.5, monitor=monitor)
     assert monitor.is_refuted
     assert result.residual == pytest.approx(0.5, abs=1e-3)
@@ -323,7 +323,7 @@ def test_a_step_at_rest_refutes_the_calibration_within_a_second(rng, rate_hz, of
 
 
 def test_a_change_by_motion_does_not_refute_the_calibration_at_once(rng):
-    # |f| changes by 1 m/s^2 within 0.8 s, as in a lift, and with added noise, as in a shaking car.
+    # |f| changes by 1 m/s^2: within 0.8 s as in a lift, or with added noise as in a shaking car.
     assert steps(rng, offset=1.0, ramp_s=0.8, rate_hz=5.0)[0] > 2.0
     assert steps(rng, offset=1.0, scatter=0.05, rate_hz=5.0)[0] > 2.0
 
@@ -344,7 +344,7 @@ def test_a_smooth_coordinated_turn_is_an_acceleration_and_not_a_wrong_calibratio
         monitor.add(round(seconds * 1e9), tuple(force), COVARIANCE, 3 * NOISE_SD**2)
         if monitor.is_refuted:
             break
-    # After a turn by 5 deg the unit may rest in a new attitude, where |f| shows a wrong axis.
+    # A turn by 5 deg may end in a rest in a new attitude, in which |f| shows a wrong axis.
     assert monitor.is_refuted == (tilt_deg > math.degrees(SAME_DIRECTION))
 
 

@@ -86,7 +86,7 @@ def test_a_further_error_source_does_not_change_the_random_numbers_of_other_sour
     moved = plain.truth.bias - still.truth.bias
     moved = moved + (plain.truth.scale - 1.0) * unit.scale_factor * force
     difference = np.cumsum(plain.counts - still.counts, axis=0) - np.cumsum(moved, axis=0)
-    # Both runs begin with the same rounding remainder, so sums of counts agree within one count.
+    # Both runs begin with an equal rounding remainder: sums of counts agree within a count.
     assert np.abs(difference).max() < 1.0 + 1e-6
 
 
@@ -105,13 +105,13 @@ def test_simulated_white_noise_has_the_stated_density(unit):
     run = simulate(replace(unit, drift=()), parse_cyclogram('soak'), UP, rate_hz=50.0, seed=3)
     accel = run.counts / np.array(unit.scale_factor) / MICRO_G
     frequency, power = welch(accel, fs=50.0, nperseg=16384, axis=0)
-    # A sample contains the last rounding remainder: noise rises with f^2, 1 (ug)^2/Hz at 0.4 Hz.
+    # The last rounding remainder is in a sample: noise grows with f^2, by 1 (ug)^2/Hz at 0.4 Hz.
     band = (frequency > 0.01) & (frequency < 0.4)
-    # The mean of 128 spectral lines, each from 86 half-overlapping segments, is uncertain by 1 %.
+    # A mean over 128 lines, each of 86 half-overlapping segments, is uncertain by 1 %.
     density = np.array(unit.noise_density)
     np.testing.assert_allclose(power[band].mean(axis=0), 2.0 * density**2, rtol=0.05)
     means = accel.reshape(-1, 3000, 3).mean(axis=1)
-    # The sd of 240 means is uncertain by 4.6 %; the limit is three times 4.6 %.
+    # 240 means determine the sd to 4.6 %; the limit is three times 4.6 %.
     np.testing.assert_allclose(means.std(axis=0), density / np.sqrt(60.0), rtol=0.15)
 
 
@@ -132,7 +132,7 @@ def test_simulated_thermometers_have_the_stated_rate_and_noise(unit, rate_hz):
     assert run.board_stamp_ns[0] == START_NS + round(0.5e9 / rate_hz)
     since_s = (run.case_stamp_ns - START_NS) * 1e-9
     error = run.case - np.interp(since_s, run.truth.grid_s, of_part(run.truth, 'case'))
-    # 540 readings (noise 5 mK) determine the mean to 0.2 mK, the sd to 3 %; limits: 5 sd.
+    # 540 readings with 5 mK of noise determine the mean to 0.2 mK, the sd to 3 %; limits: 5 sd.
     assert error.mean() == pytest.approx(0.0, abs=1.1e-3)
     assert error.std() == pytest.approx(0.005, rel=0.16)
 
@@ -159,7 +159,7 @@ def test_wrong_arguments_of_simulate_are_refused(unit):
         simulate(unit, Cyclogram((0.0, 0.5), (20.0, 20.0)), UP, rate_hz=1.0)
 
 
-# Rounding error of closed solutions of a thermal network, at some 10 degC [K].
+# Rounding error of closed solutions for a thermal network at some 10 degC [K].
 ROUNDING = 1e-9
 
 
@@ -185,7 +185,7 @@ def test_presets_agree_with_a_numerical_integrator(name):
         (0.0, program.duration_s), states[0], method='LSODA', t_eval=time, rtol=1e-10, atol=1e-10,
         max_step=60.0,
     )  # fmt: skip
-    # The integrator has an error of 2e-5 K, as its steps do not end at corners of the program.
+    # The integrator errs by 2e-5 K, because its steps do not end at corners of the program.
     np.testing.assert_allclose(states, solved.y.T, atol=2e-5)
 
 
@@ -249,11 +249,10 @@ def test_the_true_thermal_model_leaves_only_noise(kind):
         norms.append(np.linalg.norm(force, axis=1) - STANDARD_GRAVITY / MICRO_G)
     vector = np.sqrt(np.mean(np.concatenate(errors)))
     if kind == 'slow-noise':
-        # In 7.3 h the random walk of an axis has a mean square of 9 * 7.3 / 2 ug^2; three runs
-        # determine the RMS to a factor of 2.
+        # In 7.3 h the random walk has a mean square of 9 * 7.3 / 2 ug^2, known to a factor of 4.
         assert 4.0 < vector < 20.0
     else:
-        # The RMS of 1311 means is uncertain by 2 % (|f|) and 1.2 % (vector); limits: 5 sd.
+        # 1311 means determine the RMS to 2 % (|f|) and 1.2 % (vector); the limits are 5 sd.
         assert np.sqrt(np.mean(np.concatenate(norms) ** 2)) == pytest.approx(0.65, abs=0.065)
         assert vector == pytest.approx(1.12, abs=0.07)
 
@@ -270,7 +269,7 @@ def test_plans_have_the_stated_durations_and_attitudes():
     for name, up in ups.items():
         np.testing.assert_allclose(np.linalg.norm(up, axis=1), 1.0)
         assert np.any(up != np.array([p.up for p in plan(name, 2)]))
-    # Between the chamber positions of plan tumble-3 the force on each axis varies by over 0.5 g.
+    # The chamber positions of plan tumble-3 vary the force on each axis by more than 0.5 g.
     assert np.ptp(ups['tumble-3'][18:], axis=0).min() > 0.5
     assert (ups['held-out'] @ ups['chamber-18'].T).max() < 0.999
 
@@ -289,13 +288,12 @@ def test_the_effect_of_heat_flow_is_even_and_may_saturate_and_creep_decays():
     step[0] = 0.0
     history = PartHistory(('case',), step, np.zeros(1), 1.0)
     bias, scale = CreepEffect('case', 7200.0, bias=(1.0, 2.0, 0.0)).change(history)
-    # The tolerance is the length of the step, 1 s, relative to the time constant.
+    # The tolerance is a step of 1 s divided by the time constant.
     np.testing.assert_allclose(bias[-1], np.array([10.0, 20.0, 0.0]) * math.exp(-1.0), atol=2e-3)
     np.testing.assert_array_equal(scale, 0.0)
 
 
 def test_a_switched_load_warms_its_part_by_the_steady_heat_balance():
-    """A load that is off warms nothing; a lasting load warms by power * thermal resistance."""
     unit = triad('own-lags', 1)
     spell, rates = 30_000.0, {'rate_hz': 0.1, 'temperature_rate_hz': 0.01}
     loaded = replace(unit, load=SwitchedLoad('board', 0.5, (spell, 1.0001 * spell)))
@@ -303,7 +301,7 @@ def test_a_switched_load_warms_its_part_by_the_steady_heat_balance():
     on, off = (simulate(model, *given, **rates).truth for model in (loaded, unit))
     warmer = of_part(on, 'board') - of_part(off, 'board')
     np.testing.assert_allclose(warmer[: int(spell)], 0.0, atol=1e-9)
-    # The load of 0.5 W flows through 0.4 W/K to the case, and from there to the air.
+    # The 0.5 W of the load flow through 0.4 W/K to the case, and from the case to the air.
     to_air = next(link.conductance for link in unit.network.links if link.a == 'air')
     assert warmer[-1] == pytest.approx(0.5 / 0.4 + 0.5 / to_air, rel=1e-6)
 
@@ -357,8 +355,8 @@ def test_units_of_equal_seeds_are_equal_and_start_at_the_reference_temperature(n
 
 @pytest.mark.parametrize('seed', range(8))
 def test_the_presets_bare_quartz_and_mems_have_the_published_slopes(seed):
-    # Q-Flex: scale slopes of 68 ppm/K at 5 degC, 87 at 35 degC. Bias slopes: 0.3 to 5 ug/K, of a
-    # MEMS 90 to 550 ug/K.
+    # Published scale slopes of Q-Flex are 68 ppm/K at 5 degC and 87 ppm/K at 35 degC. Bias slopes
+    # are 0.3 to 5 ug/K for Q-Flex, 90 to 550 ug/K for a MEMS.
     unit = unit_preset('bare-quartz', seed)
     bias, scale = _static(unit, np.array([4.5, 5.5, 19.5, 20.0, 20.5, 34.5, 35.5]))
     cold, hot = (scale[1] - scale[0]) * 1e6, (scale[6] - scale[5]) * 1e6
@@ -375,7 +373,7 @@ def test_the_presets_bare_quartz_and_mems_have_the_published_slopes(seed):
 
 
 def test_the_converter_is_exact_to_one_count_a_day_and_saturates_at_16_bits():
-    """The charge is a third of a count above a whole number in each of 8.8 million cycles."""
+    """In each of 8.8 million cycles the charge is a third of a count above a whole number."""
     charge = np.full((400_000, 1), 2978.0 + 1.0 / 3.0)
     remainder = np.zeros(1, dtype=np.int64)
     total, n_cycles = 0, 0
@@ -384,7 +382,7 @@ def test_the_converter_is_exact_to_one_count_a_day_and_saturates_at_16_bits():
         total += int(counts.sum())
         n_cycles += len(counts)
     exact = n_cycles * Fraction(8935, 3)
-    # Rounding the charge to 2^-40 counts in each of 8.8e6 cycles adds up to 8e-6 counts.
+    # In 8.8e6 cycles roundings of the charge to 2^-40 counts add up to 8e-6 counts.
     assert abs(total - exact) < 1 + 1e-4
     charge = np.array([[4e4, -4e4, 0.5], [0.5, 0.5, 0.5], [0.5, 0.5, 0.5]])
     counts, _ = balanced(charge, np.zeros(3, dtype=np.int64))

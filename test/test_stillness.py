@@ -1,29 +1,23 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Rests and jumps of the bias are found; flights, turns and shocks are taken for neither."""
+"""Rests and jumps of the bias are found; flights, turns and shocks are not taken for them."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders import ArrayBlock, source_of
-from position_helpers import GRAVITY, MG, START_NS, Imu, Rest
+from builders import source_of
+from position_helpers import GRAVITY, MG, START_NS, Rest, source
 from scipy.signal import lfilter
 
 from thermo_comp.errors import FitError
-from thermo_comp.fitting import FitOptions, FitSource, fit, reduce_bag
+from thermo_comp.fitting import FitOptions, fit, reduce_bag
 from thermo_comp.fitting.jumps import find_jumps
 from thermo_comp.fitting.reduction import reduce_source
 from thermo_comp.simulation.campaign import positions
 
 RATE_HZ = 100.0
 OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2')
-
-
-def source(accel, gyro=None):
-    stamps = START_NS + np.rint(np.arange(len(accel)) * 1e9 / RATE_HZ).astype(np.int64)
-    block = ArrayBlock(stamps, accel, imu=None if gyro is None else Imu(gyro))
-    return FitSource('log', lambda: [block])
 
 
 def time_of(seconds):
@@ -37,7 +31,7 @@ def ground(rng, seconds):
 
 
 def hover(rng, seconds, vibration):
-    """Simulate a drone: thrust of about g, a slow sway by 3 degrees, vibration of propellers."""
+    """Simulate a drone: thrust of about g, slow swaying by 3 degrees, vibration of propellers."""
     time = time_of(seconds)
     tilt = np.radians(3.0) * np.sin(2.0 * np.pi * time[:, None] / np.array((5.0, 7.0)))
     thrust = GRAVITY * (1.0 + 0.03 * np.sin(2.0 * np.pi * time / 11.0))
@@ -52,7 +46,7 @@ def test_only_the_time_on_the_ground_is_a_rest_of_a_flight(rng):
     for rate in (gyro, None):
         with pytest.raises(FitError, match=r'log: no still interval: .* scatter by at least 9\d'):
             reduce_bag(source(accel, rate), OPTIONS)
-    # A noisy accelerometer at rest may scatter by 15 mg, but the drone sways at up to 4 deg/s.
+    # A noisy accelerometer at rest may scatter by 15 mg, but the drone turns at up to 4 deg/s.
     accel, gyro = hover(rng, 120.0, vibration=15.0 * MG)
     with pytest.raises(FitError, match='the angular rate mostly varies more than at rest'):
         reduce_bag(source(accel, gyro), OPTIONS)
@@ -108,21 +102,21 @@ def test_each_short_rest_of_a_hand_held_unit_is_found(rng, rest_s, shaky):
     result = fit([source(by_hand(rng, 10, rest_s, shaky))], OPTIONS)
     assert len(result.positions) == 10
     axes = result.calibration.axes
-    # With 350 samples and a noise of 3 to 12 mg the mean of a rest has an error of 0.2 to 0.6 mg.
+    # A rest of 350 samples with 3 to 12 mg of noise has a mean with an error of 0.2 to 0.6 mg.
     np.testing.assert_allclose([axes.x.bias, axes.y.bias, axes.z.bias], (0.3, -0.2, 0.1),
                                atol=1.5 * MG)  # fmt: skip
     assert result.residuals[-1].fitted.rms < 2.0 * MG
 
 
 def test_motion_is_not_taken_for_a_rest_nor_a_drift_in_a_ramp_for_a_motion(rng):
-    # For the last 10 s |f| is 1.04 g, with the noise of a shaky rest: the unit is accelerated.
+    # In the last 10 s the unit is accelerated: |f| is 1.04 g, with the noise of a shaky rest.
     accel = by_hand(rng, 14, 6.0, (3,), misalignment=5e-3)
     push = GRAVITY * np.array((0.0, 0.6, 0.8)) * 1.04 + 0.0 * time_of(10.0)[:, None]
     accel = np.concatenate((accel, push + 12.0 * MG * rng.standard_normal(push.shape)))
     result = fit([source(accel)], OPTIONS)
     assert 13 <= len(result.positions) <= 14
     assert result.residuals[-1].fitted.rms < 2.0 * MG
-    # A tilt by 0.1 mrad is a motion; a drift of 60 ug in 30 s (noise of a mean: 1 ug) is not.
+    # A tilt by 0.1 mrad is a motion; a drift of 60 ug in 30 s is none (noise of a mean: 1 ug).
     time = np.arange(7200.0)
     stamps = START_NS + np.rint(time * 1e9).astype(np.int64)
     ramp = np.clip(time - 1800.0, 0.0, 2400.0) * 2e-3 * MG
@@ -142,7 +136,7 @@ def look(rest, **keys):
 @pytest.mark.filterwarnings('error')
 @pytest.mark.parametrize('sd', [0.05, 0.1, 0.2, 0.5])
 def test_steps_of_a_coarse_converter_are_not_taken_for_jumps(rng, sd):
-    # WHY: a rest in which most samples were equal ended in a division by zero.
+    # WHY: a rest in which most samples were equal caused a division by zero.
     rest = Rest(rng, sd=4.0 * sd * MG)
     drift = 20.0 * MG * np.linspace(0.0, 1.0, len(rest.accel))
     rest.accel = np.rint((rest.accel + drift[:, np.newaxis]) / (4.0 * MG)) * 4.0 * MG
@@ -154,20 +148,20 @@ def test_time_and_size_of_a_jump_along_gravity_are_found(rng, with_gyro):
     rest = Rest(rng)
     rest.add((2.0 * MG, 0.0, 20.0 * MG), from_s=301.0)
     (event,) = look(rest, with_gyro=with_gyro)
-    # The jump is between two samples, and `find_jumps` returns the interval between these samples.
+    # The jump is between two samples: `find_jumps` returns the interval between these samples.
     assert event.time == pytest.approx(301.0, abs=1.5 / rest.rate_hz)
     assert event.duration_s == pytest.approx(1.0 / rest.rate_hz, rel=1e-6)
-    # Step between lines fitted to 250 samples of 3 mg: sd 2 * 3 mg * sqrt(2 / 250); limit: 4 sd.
+    # Lines fitted to 250 samples (3 mg) have a step with sd 2 * 3 mg * sqrt(2 / 250); limit: 4 sd.
     np.testing.assert_allclose(np.array(event.step) / MG, (2.0, 0.0, 20.0), atol=2.2)
     assert event.along / MG == pytest.approx(20.0, abs=2.2)
-    # Step between lines fitted to 20 readings of 20 mK noise: sd 2 * 0.02 K * sqrt(2 / 20).
+    # Lines fitted to 20 readings (20 mK noise) have a step with sd 2 * 0.02 K * sqrt(2 / 20).
     assert event.temperature_change_sd == pytest.approx(0.0126, rel=0.4)
     assert abs(event.temperature_change) < 4.0 * event.temperature_change_sd
 
 
 @pytest.mark.parametrize('rate_hz', [0.5, 2.0, 5.0])
 def test_a_jump_is_found_at_low_sample_rates(rng, rate_hz):
-    # WHY: no jump was found: at 2 Hz the gap between the rests beside it was 60 s (limit: 30 s).
+    # WHY: at 2 Hz the rests beside a jump were 60 s apart; jumps were found only within 30 s.
     rest = Rest(rng, duration_s=8000.0 / rate_hz, rate_hz=rate_hz, pace_s=4000.0)
     rest.add((0.0, 0.0, 20.0 * MG), from_s=4000.0 / rate_hz)
     source = rest.source()
@@ -185,7 +179,7 @@ def turned(rest, from_s, angle, with_rate):
 
 @pytest.mark.parametrize('seen', [True, False])
 def test_a_turn_is_recognised_by_the_gyroscope(rng, seen):
-    # A turn by 20 mrad within one sample does not change |f|: only the gyroscope observes it.
+    # Only the gyroscope observes a turn by 20 mrad within one sample: |f| does not change.
     rest = Rest(rng)
     turned(rest, 250.0, 0.02, with_rate=seen)
     assert [round(event.time) for event in look(rest, with_gyro=True)] == ([] if seen else [250])
@@ -205,7 +199,7 @@ def changed_in_motion(rest, end, sd, step):
         lambda rest: changed_in_motion(rest, 312.0, 200.0 * MG, (50.0, 0, 0)),
         lambda rest: changed_in_motion(rest, 360.0, GRAVITY, (0, 0, 20.0)),
         lambda rest: turned(rest, 250.0, 0.02, with_rate=False),
-        lambda rest: rest.add(  # a bias of 2 mg/K, at up to 6 K/min
+        lambda rest: rest.add(  # the bias changes by 2 mg/K, at up to 6 K/min
             np.outer(rest.temperature(rest.time) - 20.0, (0.0, 0.0, 2.0 * MG)), from_s=0.0
         ),
     ],
@@ -236,7 +230,7 @@ def test_jumps_do_not_depend_on_blocks_and_one_rest_is_read_once(rng):
 
 
 def test_a_steep_curve_over_temperature_is_not_taken_for_a_jump(rng):
-    # WHY: a fit refused bags in which the reading changed by 15 mg over 0.2 K, within 4 s.
+    # WHY: a fit refused bags in which readings changed by 15 mg over 0.2 K, within 4 s.
     for _ in range(4):
         rest = Rest(rng)
         rest.accel[:, 2] += 7.5 * MG * np.tanh((rest.temperature(rest.time) - 25.0) / 0.1)
@@ -246,7 +240,7 @@ def test_a_steep_curve_over_temperature_is_not_taken_for_a_jump(rng):
 
 
 def behind_a_low_pass(rng, rest, tau_s, sd):
-    """Replace the noise by first-order noise with time constant `tau_s` and sd `sd`."""
+    """Replace the noise by first-order noise with time constant `tau_s` and sd `sd` [m/s^2]."""
     r = np.exp(-1.0 / (rest.rate_hz * tau_s))
     white = sd * np.sqrt(1.0 - r * r) * rng.standard_normal(rest.accel.shape)
     rest.accel[:] = np.array(rest.level) + lfilter([1.0], [1.0, -r], white, axis=0)
@@ -254,7 +248,7 @@ def behind_a_low_pass(rng, rest, tau_s, sd):
 
 @pytest.mark.parametrize('tau_s', [0.1, 0.5, 1.0, 3.0])
 def test_low_pass_filtered_noise_gives_one_rest_without_a_jump(rng, tau_s):
-    # WHY: low-pass filtered samples were taken for independent: one rest became 8 to 37 rests.
+    # WHY: low-pass filtered samples were taken for independent, and a rest became 8 to 37 rests.
     rest = Rest(rng)
     behind_a_low_pass(rng, rest, tau_s, 3.0 * MG)
     bag = reduce_source(rest.source(), full_scale=None)
@@ -265,7 +259,7 @@ def test_low_pass_filtered_noise_gives_one_rest_without_a_jump(rng, tau_s):
 
 @pytest.mark.parametrize(('tau_s', 'sd'), [(0.1, 1.0), (0.5, 3.0), (1.0, 3.0), (3.0, 3.0)])
 def test_a_jump_in_low_pass_filtered_noise_is_found(rng, tau_s, sd):
-    # WHY: means over 10 s hardly reduce the correlated noise of 3 mg: jumps of 20 mg were missed.
+    # WHY: means over 10 s hardly reduce 3 mg of correlated noise, and jumps of 20 mg were missed.
     rest = Rest(rng)
     behind_a_low_pass(rng, rest, tau_s, sd * MG)
     rest.add((0.0, 0.0, 20.0 * MG), from_s=301.0)
@@ -273,7 +267,7 @@ def test_a_jump_in_low_pass_filtered_noise_is_found(rng, tau_s, sd):
     assert len(bag.intervals) == 2
     (event,) = find_jumps(bag)
     assert event.time == pytest.approx(301.0, abs=1.5 / rest.rate_hz)
-    # `new` is the sd of the part of a sample that does not depend on earlier samples.
+    # `new` is the sd of the part of a sample that earlier samples do not determine.
     new = sd * np.sqrt(1.0 - np.exp(-2.0 / (rest.rate_hz * tau_s)))
     assert event.along / MG == pytest.approx(20.0, abs=4.0 * new)
 

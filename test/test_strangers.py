@@ -30,7 +30,6 @@ ATTITUDES = ATTITUDES / np.linalg.norm(ATTITUDES, axis=1)[:, None]
 
 
 def unit(**given):
-    """Make a unit without errors, noise and rounding."""
     perfect = {
         'bias': np.zeros(3), 'gain': np.zeros(3), 'misalignment': np.zeros(3), 'bias_curve': ZEROS,
         'scale_curve': ZEROS, 'counts': 0.0, 'density': 0.0, 'reading_sd': 0.0,
@@ -40,7 +39,7 @@ def unit(**given):
 
 
 def ramp(given, rate, hours, environment=units.CHAMBER):
-    """Ramp the air at `rate` [K/s] after a soak; return times [s], thermal nodes' temperatures."""
+    """Ramp the air at `rate` [K/s] after a soak; return times [s] and all nodes' temperatures."""
     A, b, h = units.network(given, environment)
     at = np.arange(0.0, 3600.0 * hours, 10.0)
     return at, units.integrate(A, b, h, rate * at, 10.0, np.linalg.solve(A, -h))
@@ -53,13 +52,13 @@ def test_a_node_lags_a_ramp_by_its_time_constant_and_the_hidden_node_depends_on_
     case, board = states[-1, units.CASE], states[-1, units.BOARD]
     assert case - board == pytest.approx(0.01 * 700.0, rel=1e-6)
     assert board - states[-1, units.PARTS] == pytest.approx(0.01 * lags, rel=1e-6)
-    # The lag of x behind a ramp u after a soak is u - x = rate * tau * (1 - exp(-t / tau)).
+    # Behind a ramp u after a soak the lag of x is u - x = rate * tau * (1 - exp(-t / tau)).
     A, b, h = np.array([[-1 / 300.0]]), np.array([1 / 300.0]), np.zeros(1)
     at = np.arange(0.0, 1500.0, 5.0)
     states = units.integrate(A, b, h, 0.01 * at, 5.0, np.zeros(1))
     behind = 0.01 * at - states[:, 0]
     assert behind == pytest.approx(3.0 * (1.0 - np.exp(-at / 300.0)), abs=1e-12)
-    # (hidden node - board) / (case - board) in a ramp differs between still air and chamber.
+    # In a ramp (hidden node - board) / (case - board) depends on the air: still or in a chamber.
     shares = []
     for environment in (units.CHAMBER, units.STILL_AIR):
         _, states = ramp(unit(), 0.01, 12, environment)
@@ -75,7 +74,7 @@ def test_a_board_cooled_by_the_fan_follows_the_case_in_another_way_without_fan()
         at, states = ramp(given, 0.01, 12, environment)
         case, board, air = states[-1, units.CASE], states[-1, units.BOARD], 0.01 * at[-1]
         to_air = 0.3 * environment.vent
-        # In a ramp the heat that the board stores comes from case and air.
+        # In a ramp the board stores heat that comes from the case and from the air.
         stored = 0.7 * (case - board) + to_air * (air - board)
         assert stored == pytest.approx(0.01 * 700.0, rel=1e-6)
         lags.append(case - board)
@@ -95,7 +94,7 @@ def test_simulated_samples_have_the_stated_noise_bias_scale_and_misalignment():
     n = len(error)
     sd = 5.0 * UG * np.sqrt(0.5)
     assert np.abs(error.mean(axis=0)).max() < 4.0 * sd / np.sqrt(n)
-    # The sd of n errors is uncertain by 1 / sqrt(2 n); scale errors change this sd by up to 3 %.
+    # n errors determine their sd to 1 / sqrt(2 n); scale errors change the sd by up to 3 %.
     assert error.std(axis=0) == pytest.approx([sd] * 3, rel=0.03 + 4.0 / np.sqrt(2 * n))
 
 
@@ -104,7 +103,7 @@ def test_a_support_tilts_with_temperature_squared_and_a_cold_start_is_at_air_tem
     bag = record(unit(), units.program(20, 10, (35, 1, 60)), LEVEL, rng_of('tilt'), tilt=axis)
     case = np.interp(bag.time_s - 1.0, *bag.temperatures['case'])
     angle = np.arctan2(-bag.force[:, 1], bag.force[:, 2])
-    # The tolerance is the error of interpolation between case readings 5 s apart.
+    # The tolerance is the error of interpolation between case readings, which are 5 s apart.
     assert angle == pytest.approx(1e-6 * (case - 20.0) ** 2, abs=5e-7)
     assert np.linalg.norm(bag.force, axis=1) == pytest.approx(GRAVITY)
     given = unit(heat_k=2.0)
@@ -112,7 +111,7 @@ def test_a_support_tilts_with_temperature_squared_and_a_cold_start_is_at_air_tem
     warm = record(given, cases.FROST, LEVEL, rng_of('cold'))
     for bag, heat in ((cold, 0.0), (warm, 2.0)):
         board, case = bag.temperatures['board'][1][0], bag.temperatures['case'][1][0]
-        # Tolerance: chamber's ripple, 0.03 K, and self-heating up to the first reading, at 0.3 s.
+        # The tolerance: the chamber's ripple, 0.03 K, and self-heating in the first 0.3 s.
         assert board - case == pytest.approx(heat, abs=0.1)
 
 
@@ -125,7 +124,7 @@ def test_carried_remainders_give_exact_sums_and_flicker_noise_a_flat_allan_devia
     for size in (10, 100, 1000):
         means = noise.reshape(-1, size, 3).mean(axis=1)
         deviation = np.sqrt(0.5 * np.mean(np.diff(means, axis=0) ** 2))
-        # 39 differences of each of three axes determine the Allan deviation to 7 %.
+        # 39 differences on each of three axes determine the Allan deviation to 7 %.
         assert deviation == pytest.approx(3.0, rel=0.2)
 
 
@@ -173,7 +172,7 @@ def test_bias_offsets_of_the_case_turn_on_have_the_stated_sd(recorded):
     assert set(collected) == expected
     for (_, label), shifts in collected.items():
         sd, n = float(label.split()[2]), np.size(shifts)
-        # The sd of n random offsets is uncertain by 1 / sqrt(2 n).
+        # n random offsets determine their sd to 1 / sqrt(2 n).
         assert np.std(shifts) == pytest.approx(sd, rel=5.0 / np.sqrt(2 * n), abs=1e-12)
 
 
@@ -187,7 +186,7 @@ def test_the_cramer_rao_bound_is_proportional_to_noise_over_root_of_the_data():
     assert louder == pytest.approx(2.0 * sd, rel=1e-6)
     twice = cases.bias_bound(given, np.concatenate((up, up)), bags + bags)
     assert twice == pytest.approx(sd / np.sqrt(2.0), rel=1e-6)
-    # If the bias were the only unknown, its sd would be the noise of the mean of all samples.
+    # If only the bias were unknown, its sd would be the noise of the mean of all samples.
     least = UG * given.density / np.sqrt(sum(len(bag.time_s) for bag in bags) * 2.0)
     assert (sd > least).all()
     assert (sd < 100.0 * least).all()
@@ -219,7 +218,7 @@ def test_the_scipy_cubic_fits_a_cubic_bias_in_many_attitudes_and_its_drift_in_on
     held = of_attitudes(given, np.array([8.0, 29]))
     forces = (by_norm([fit], order=order)(held) for order in (3, 0))
     cubic, constants = (strangers.error_of([force], [held], is_drift=False) for force in forces)
-    # The cubic fitted by scipy neglects products below 5 ug, e.g. misalignment times bias.
+    # The cubic by scipy neglects products such as misalignment times bias, which are below 5 ug.
     assert cubic.vector < 5.0
     assert constants.vector > 50.0
     given = replace(curved_unit(), scale_curve=ZEROS)
@@ -235,14 +234,14 @@ def test_the_scipy_cubic_fits_a_cubic_bias_in_many_attitudes_and_its_drift_in_on
 
 
 def test_a_scipy_fit_to_one_attitude_does_not_change_the_scatter_of_forces():
-    # WHY: without bounds, a fit to one attitude found scale factors that made all forces equal.
+    # WHY: without bounds a fit to one attitude found scale factors that made all forces equal.
     samples = GRAVITY * LEVEL + 0.3 * rng_of('few').standard_normal((200, 3))
     few = Minutes(samples, np.full(200, 20.0), np.full((200, 3), np.nan))
     assert by_norm([few])(few).std(axis=0) == pytest.approx(samples.std(axis=0), rel=0.4)
 
 
 def test_the_bias_score_is_error_over_bound_and_error_over_claimed_sd():
-    # In the calibration the bias of x has an error of 1 count, 1 / 300 m/s^2.
+    # The bias of x in the calibration has an error of 1 count, 1 / 300 m/s^2.
     bias = np.array([0.1, -0.2, 0.3])
     axes = Axes(*(AxisReference(300.0, 300.0 * b) for b in bias + np.array([1 / 300.0, 0.0, 0.0])))
     study = cases.Study('', (), {}, bound=cases.Bound(unit(counts=300.0), bias, np.full(3, 1e-3)))
@@ -266,7 +265,6 @@ def test_a_minute_is_a_mean_whose_claimed_sd_is_its_noise():
     mean = minutes(Bag('', time_s, samples, {'board': (time_s, 2.0 * time_s)}))
     assert (mean.samples[:, 0].tolist(), mean.board.tolist()) == ([30.5, 90.5], [61.0, 181.0])
     assert np.isnan(mean.force).all()
-    # The calibration claims only white noise and rounding of counts.
     samples = np.tile(300.0 * GRAVITY * LEVEL, (30000, 1))
     samples[::2] += 1.0
     samples[1::2] -= 1.0
@@ -285,7 +283,7 @@ def test_the_ratio_is_1_for_the_claimed_covariance_and_infinite_if_minutes_are_m
     claim = np.broadcast_to(root @ root.T, (n, 3, 3))
     out = strangers.Corrected(truth + error, claim, np.zeros(3))
     scores = strangers.score([out], [Minutes(truth, np.zeros(n), truth)], is_drift=False)
-    # The RMS of the errors in 20000 windows is uncertain by 0.5 %.
+    # 20000 windows determine the RMS of the errors to 0.5 %.
     assert (scores.ratio, scores.norm_ratio) == pytest.approx((1.0, 1.0), rel=0.02)
     assert scores.claim == pytest.approx(scores.vector, rel=0.02)
     truth = np.broadcast_to(GRAVITY * LEVEL, (100, 3))
@@ -331,7 +329,7 @@ def test_each_case_has_a_limit_and_misses_names_exactly_the_violated_limits():
 
 
 def carried_bag():
-    """Return a day at 1 Hz: a turn to a second attitude after 5 h, handling for 2 min at 10 h."""
+    """Return a day at 1 Hz: a turn to another attitude after 5 h, handling for 2 min at 10 h."""
     time_s = np.arange(1.0, 86401.0)
     force = np.where((time_s > 18000.0)[:, None], GRAVITY * LEVEL, GRAVITY * ATTITUDES[0])
     force[36000:36120] = 0.5
@@ -346,6 +344,6 @@ def test_a_recorded_day_is_divided_into_rests_and_blocks_of_3_h():
     blocks = blocks_of(part(bag, slice(9000, 86400), 'rest'), 'rest')
     assert list(blocks) == list(range(8))
     times = np.concatenate([block.time_s for block in blocks.values()])
-    # The last sample, at 24 h, begins a block of a single sample, which is too short.
+    # The last sample, at 24 h, begins a block of one sample, which is too short.
     assert times.tolist() == bag.time_s[9000:-1].tolist()
     assert all((block.time_s // 10800.0 == number).all() for number, block in blocks.items())

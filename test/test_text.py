@@ -125,7 +125,7 @@ def test_any_terminal_can_show_names_and_serials(tmp_path, cli, monkeypatch, enc
         content = terminal.read()
         assert ('Блок' if encoding == 'utf-8' and not more else r'\u0411') in content
         assert r'not \udcff utf-8.yaml' in content
-    if encoding == 'latin-1':  # test this encoding in a new process, too
+    if encoding == 'latin-1':  # this encoding is also tested in a new process
         assert r'\u0411' in cli('info', name, PYTHONIOENCODING=encoding).stdout
     assert r'no\udcff.mcap: ' in cli('info', tmp_path / os.fsdecode(b'no\xff.mcap'), code=1).stderr
 

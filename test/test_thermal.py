@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The thermal tracker agrees with closed forms: lags, regime blend, lost sensors, restart."""
+"""The thermal tracker agrees with closed formulas: lags, transitions, lost sensors, restarts."""
 
 import math
 
@@ -30,12 +30,12 @@ def test_a_lag_is_known_after_some_time_and_without_readings_follows_the_board()
     tracker = ThermalTracker(DetectorSettings(), LAG)
     feed(tracker, np.full(10, 20.0))
     assert not tracker.is_settled(10 * SECOND_NS)
-    # A lag with tau = 900 s has an sd of 1.5 K at the start, which decays to 50 mK within 3061 s.
+    # A lag of 900 s has an sd of 1.5 K at the start, which decays to 50 mK within 3061 s.
     feed(tracker, np.full(5000, 20.0), start_s=10)
     settled_s = TAU_S * math.log(1.5 / MEMORY_SETTLED_SD)
     assert not tracker.is_settled(round((settled_s - 10.0) * 1e9))
     assert tracker.is_settled(round((settled_s + 10.0) * 1e9))
-    # WHY: without case readings the gradient itself was used as its lag: an error of 3 claimed sd.
+    # WHY: without case readings the gradient was used as its own lag, an error of 3 claimed sd.
     spec = MemorySpec(lags=(('case', 600.0),))
     tracker = ThermalTracker(DetectorSettings(), spec, board_lag_s=500.0)
     feed(tracker, 20.0 + np.maximum(np.arange(1301) - 1000.0, 0.0) / 60.0)

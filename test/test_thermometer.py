@@ -77,8 +77,7 @@ PARTS = {
 @pytest.mark.parametrize('part', PARTS)
 @pytest.mark.parametrize('sensor', SENSORS)
 def test_squared_errors_are_on_average_below_5_claimed_variances(errors, sensor, part):
-    # The claimed variance of soaks and ramps allows for the onset or end of a ramp at any time.
-    # For readings with steps the mean squared error is uncertain by a factor of 2.
+    # The claimed variance allows for the onset or the end of a ramp at any time.
     begin, end = PARTS[part]
     rows = errors[sensor]
     rows = rows[(rows[:, 0] >= begin) & (rows[:, 0] < end)]
@@ -106,14 +105,14 @@ def test_errors_in_a_ramp_are_bounded(errors, sensor, temperature_k, rate_k_min)
 
 
 def test_a_change_of_1_k_steps_shows_the_temperature_and_without_noise_it_is_exact():
-    # Readings with steps of 1 K change from 20 to 21 degC when the temperature is 20.5 degC.
+    # Readings with steps of 1 K change from 20 to 21 degC at a temperature of 20.5 degC.
     thermometer = Thermometer(ThermometerSettings(0.01, 1.0))
     for k in range(600):
         thermometer.update(k * SECOND_NS, 20.0)
     assert thermometer.var_temperature == pytest.approx(1.0 / 12.0, rel=0.2)
     thermometer.update(600 * SECOND_NS, 21.0)
     assert thermometer.temperature == pytest.approx(20.5, abs=0.03)
-    # At a change of the reading the estimate's sd is the noise plus the change between readings.
+    # When the reading changes, the temperature is known to the noise plus the change in a second.
     assert 0.005 < math.sqrt(thermometer.var_temperature) < 0.03
     thermometer = Thermometer(ThermometerSettings())
     for k in range(100):
@@ -132,8 +131,7 @@ def test_a_change_of_1_k_steps_shows_the_temperature_and_without_noise_it_is_exa
 
 @pytest.mark.parametrize(('quantum', 'lag_s'), [(0.1, 120.0), (0.5, 180.0), (1.0, 600.0)])
 def test_equal_readings_each_minute_keep_the_error_below_1_5_quanta(quantum, lag_s):
-    # WHY: when the prediction was more than a quantum from the reading, equal readings had no
-    # weight, and the claimed sd rose to 24 K within an hour of soak.
+    # WHY: equal readings had no weight: the claimed sd rose to 24 K within an hour of soak.
     t = np.arange(-3600.0, 9000.0, 60.0)
     truth = 20.0 + lagged(t, [(0.0, 1.0), (1200.0, 0.0)], lag_s)
     thermometer = Thermometer(ThermometerSettings(0.01 * quantum, quantum, lag_s=lag_s))
@@ -141,7 +139,7 @@ def test_equal_readings_each_minute_keep_the_error_below_1_5_quanta(quantum, lag
     error, sd = out[:, 0] - truth, np.sqrt(out[:, 2])
     assert np.abs(error).max() < 1.5 * quantum
     assert sd[1:].max() < quantum
-    # In the ramp of 1 K/min the estimated rate is right although a reading comes once a minute.
+    # In the ramp of 1 K/min the estimated rate is right, although readings come once a minute.
     rows = np.flatnonzero((t > 2.0 * lag_s) & (t < 1200.0))
     assert np.abs(out[rows, 1] - 1.0 / 60.0).max(initial=0.0) < max(quantum, 0.3) / 60.0
 
@@ -150,7 +148,6 @@ UPPER = np.triu_indices(3)
 
 
 def drawn(rng):
-    """Draw the mean and the covariance of a state of three numbers."""
     root = rng.normal(size=(3, 3))
     return rng.normal(size=3), root @ root.T
 
@@ -203,7 +200,7 @@ def test_a_far_reading_has_little_weight_and_a_lasting_step_is_accepted_after_fo
     assert used == [False, False, False, True, True, True]
     assert thermometer.temperature == pytest.approx(60.0, abs=0.01)
     assert (thermometer.n_in_row, thermometer.n_restarts) == (3, 1)
-    # A reading 6 to 30 sd from its prediction counts as 6 sd away; farther away it is not used.
+    # A reading 6 to 30 sd from its prediction counts as 6 sd away; a farther reading is not used.
     thermometer = settled()
     assert thermometer.update(600 * SECOND_NS, 20.015)
     assert abs(thermometer.temperature - 20.0) < 0.004
@@ -231,7 +228,6 @@ def test_a_gap_increases_the_variance_or_restarts_and_changed_ns_is_the_stamp_of
 
 
 def test_the_noise_is_estimated_if_the_setting_is_too_small():
-    # WHY: readings with a noise of 0.1 K (setting: 5 mK) were all taken for outliers.
     thermometer = Thermometer(ThermometerSettings(0.005))
     rng = np.random.default_rng(3)
     out = run(thermometer, np.arange(4000.0), read(np.full(4000, 20.0), 0.125, 0.0, rng))
@@ -270,7 +266,7 @@ def test_one_reading_is_a_temperature_without_a_rate_also_after_a_reset():
     thermometer = settled()
     thermometer.reset()
     assert thermometer.stamp_ns is None
-    assert thermometer.update(0, 30.0)  # a stamp before those of the old readings
+    assert thermometer.update(0, 30.0)  # this stamp is before the stamps of the old readings
     assert thermometer.temperature == 30.0
 
 

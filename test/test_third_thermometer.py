@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A third thermometer, on a lid warmed by electronics, shows when the lid changes the biases."""
+"""A third thermometer, on a lid that electronics warm, reduces errors that depend on the lid."""
 
 import math
 from dataclasses import replace
@@ -87,7 +87,7 @@ def test_a_third_thermometer_reduces_the_error_to_the_noise(runs, tmp_path):
     switched = float(np.sqrt(np.mean(np.square(LID_UG_K)))) * LOAD_K / 2.0
     assert errors[False] > 0.3 * switched
     assert errors[True] < 0.05 * switched
-    # With the temperature of the lid, means over 60 s scatter by little more than their noise.
+    # If the lid's temperature is known, means over 60 s scatter by little more than their noise.
     noise = float(np.mean(calibration.noise_density_m_s2_sqrt_hz)) / math.sqrt(60.0) / MICRO_G
     assert spreads[False] > 2.0 * noise
     assert spreads[True] < 1.3 * noise

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The claimed covariance covers starts in a ramp, lost thermometers and ranges exceeded."""
+"""The claimed covariance includes errors after a start in a ramp, and outside the ranges."""
 
 import math
 from dataclasses import replace
@@ -33,7 +33,7 @@ def at_1_hz(unit, board, case=()):
     """Correct a sample per second; return all rows and the sd of the last x without noise."""
     compensator, rows = Compensator(unit, UNCHECKED), []
     for second, celsius in enumerate(board.tolist()):
-        # Exactly constant readings would make both thermometers count as faulty.
+        # With exactly constant readings both thermometers would count as faulty.
         stamp, flicker = 10**12 + second * SECOND_NS, 1e-5 * (-1) ** second
         compensator.push('board', stamp, celsius + flicker)
         if second < len(case):
@@ -43,8 +43,7 @@ def at_1_hz(unit, board, case=()):
 
 
 def test_the_claimed_sd_of_lags_covers_a_start_in_a_ramp():
-    # WHY: after a restart in a ramp the claimed sd was a third of the error. An unknown lag (60 s)
-    # has an sd of 0.4 K in a soak, 1 K in a ramp of 1 K/min, also if the ramp ends after 40 s.
+    # WHY: after a restart in a ramp of 1 K/min an unknown lag has an sd of 1 K; 0.4 K was claimed.
     unit = calibration(response=(term('board', (30.0, 0.0, 0.0), tau_s=60.0),))
     soak, *ramps = (
         at_1_hz(unit, *[10.0 + rate / 60.0 * np.minimum(np.arange(61), end)] * 2)[2]
@@ -54,24 +53,22 @@ def test_the_claimed_sd_of_lags_covers_a_start_in_a_ramp():
     left = 30.0 / 300.0 / math.e
     assert soak == pytest.approx(0.387 * left, rel=0.2)
     assert ramps == pytest.approx([math.hypot(1.0, 0.387) * left] * 2, rel=0.2)
-    # WHY: after a start in a ramp with a case 5 K above the board a lagged gradient was wrong by
-    # five claimed sds. A ramp that begins 600 s (tau) after the start does not increase the sd.
+    # WHY: with the case 5 K above the board at the start, a lagged gradient erred by 5 claimed sd.
     response = (term('gradient_lag', (30.0, 0.0, 0.0), tau_s=600.0),)
     unit = replace(calibration(response=response), board_lag_s=300.0)
     risen = (np.maximum(np.arange(761) - begin, 0) / 60.0 for begin in (0, 700))
     at_once, late = (at_1_hz(unit, 10.0 + rise, 15.0 + rise)[2] for rise in risen)
-    # Sensitivity 30 counts/K, scale factor 300 counts per m/s^2; decay with tau = 600 s for 760 s.
+    # A gradient error of 1 K is 30 / 300 m/s^2; it decays with tau = 600 s for 760 s.
     left = 30.0 / 300.0 * math.exp(-760.0 / 600.0)
     assert at_once == pytest.approx(math.hypot(5.0, 0.41) * left, rel=0.2)
     assert late < 0.2 * at_once
 
 
 def test_without_case_readings_the_gradient_is_that_at_rest():
-    # WHY: without case readings a gradient of 0 K was assumed, although the board is 1 K warmer.
     of_gradient = (term('gradient', (30.0, 0.0, 0.0)),)
     soak = np.full(2000, 20.0)
     _, corrected, _ = at_1_hz(calibration(response=of_gradient), soak, soak[:1500] - 1.0)
-    # 0.1 K of gradient error at 30 counts/K is 3 counts: 0.01 m/s^2 at 300 counts per m/s^2.
+    # An error of 0.1 K of the gradient is 3 counts (30 counts/K), or 0.01 m/s^2.
     assert corrected[-1][0] == pytest.approx(corrected[1499][0], abs=0.01)
     unit = calibration(response=of_gradient, rest_gradient_range_k=(-1.1, -0.9))
     compensator, corrected, _ = at_1_hz(unit, soak[:60])
@@ -81,7 +78,7 @@ def test_without_case_readings_the_gradient_is_that_at_rest():
 
 
 def test_beyond_1_g_the_covariance_includes_an_unknown_k2():
-    # Above 1.01 g the claimed error grows by K2 (|f| - 1.01 g)^2, with an sd of K2 of 100 ug/g^2.
+    # Beyond 1.01 g the claimed sd contains K2 (|f| - 1.01 g)^2, where K2 has an sd of 100 ug/g^2.
     compensator = Compensator(calibration(), UNCHECKED)
     warm(compensator, start_s=1000, until_s=1001)
     at_1_g, at_4_g = (
@@ -95,7 +92,7 @@ def test_beyond_1_g_the_covariance_includes_an_unknown_k2():
 
 @pytest.mark.parametrize('fault', ['both stand still', 'swapped topics'])
 def test_the_claimed_sd_covers_thermometer_errors_for_parts_that_lag_the_board(fault):
-    # WHY: the claimed sd lacked lasting errors of T_board, which act through a lagging part.
+    # WHY: the claimed sd lacked errors of T_board that last and act through a part that lags.
     per_kelvin, axis = 30.0, axis_set((0.0, 30.0))
     part = term('board', (-per_kelvin, 0.0, 0.0), tau_s=600.0)
     parts = regime_set(x=axis, rate_range_k_min=(-5.0, 5.0))
@@ -105,7 +102,7 @@ def test_the_claimed_sd_covers_thermometer_errors_for_parts_that_lag_the_board(f
     for second in range(3600):
         stamp = 10**12 + second * SECOND_NS
         ramp_s = max(second - 1200.0, 0.0)
-        # The case ramps at 1 K/min; the board lags the case by 60 s, which is 1 K.
+        # The case changes by 1 K/min, and the board lags the case by 60 s, which is 1 K.
         case, board = 20.0 + ramp_s / 60.0, 20.0 + max(ramp_s - 60.0, 0.0) / 60.0
         of_part += (board - of_part) / 600.0
         flicker = 2e-3 * (second % 3)
@@ -128,8 +125,7 @@ def test_the_claimed_sd_covers_thermometer_errors_for_parts_that_lag_the_board(f
 
 
 def test_the_lack_of_fit_is_included_in_the_sd_of_bias_and_of_scale():
-    # WHY: the lack of fit increased the sd of the bias only: a certificate stated the scale factor
-    # of an axis that was never along gravity to 11 ppm.
+    # WHY: the lack of fit increased the sd of the bias only, not the sd of the scale factor.
     lacks = LackOfFit(0.0, (0.0, 3e-3, 4e-3)), LackOfFit(20.0, (0.0, 0.0, 0.0))
     plain = calibration()
     lacking = replace(plain, static=replace(plain.static, lack_of_fit=lacks))
@@ -147,14 +143,14 @@ def test_a_state_beyond_the_edge_of_a_column_is_limited_and_increases_the_sd():
     edge, beyond = (correction.line(s, s, np.zeros(N_ROWS), 0.0) for s in (inside, outside))
     assert beyond[:12].tolist() == edge[:12].tolist()
     assert math.sqrt(beyond[12] - edge[12]) == pytest.approx(30.0 / 300.0 * 2.0)
-    of_y = [27, 29, 32]  # coefficients of 1, f and f^2 in the variance of axis y
+    of_y = [27, 29, 32]  # rows with the coefficients of 1, f and f^2 in the variance of axis y
     assert beyond[of_y].tolist() == edge[of_y].tolist()
     excess = correction.excess(outside, is_dynamic=False)
     assert (excess.relative, excess[:3]) == (pytest.approx(2.0), (0.0, 0.0, 2.0))
 
 
 def sd_at(unit, board, behind=0.0, force=0.0):
-    """Return the x axis' claimed sd in a soak, without noise; `behind`: lag of parts [K]."""
+    """Return the claimed sd of x in a soak, without noise; `behind`: lag of its part [K]."""
     correction = Correction(unit)
     layout = StateLayout(correction.memory)
     state = [0.0] * layout.width
@@ -176,7 +172,7 @@ def test_a_line_of_many_states_takes_one_noise_excess_for_all():
 
 
 def test_outside_the_range_the_claimed_sd_is_that_of_curve_and_parts():
-    # Outside the range no lag cancels the curve's slope: the claimed sd is that of the slope.
+    # Outside the range no lag cancels the slope of the curve, so the slope adds to the claimed sd.
     parts = regime_set(axis_set((0.0, 0.5), residual_sd_m_s2=1e-6))
     lag = term('board', (-0.5, 0.0, 0.0), tau_s=600.0)
     unit = calibration(static=parts, dynamic=parts, response=(lag,))
@@ -184,7 +180,7 @@ def test_outside_the_range_the_claimed_sd_is_that_of_curve_and_parts():
     # The board is at 41 degC, 6 K above the range of 20 +- 15 degC.
     far = math.sqrt(1.0 + (6.0 / 15.0) ** 2)
     assert sd_at(unit, 41.0) == pytest.approx(0.5 * 6.0 / 300.0 * far, rel=1e-3)
-    # At 35 degC the bias slope is 0.8 counts/K, which the scale slope cancels at 10 m/s^2.
+    # At 35 degC the bias slope is 0.8 counts/K; at 10 m/s^2 the scale slope cancels it.
     bent = axis_set((0.0, 0.5, 0.01), (1.0, -0.8 / 3000.0), residual_sd_m_s2=1e-6)
     unit = calibration(static=regime_set(bent), dynamic=regime_set(bent))
     # The bias slope changes by 0.02 counts/K^2: over 30 K its sd is 0.02 * 30 / sqrt(12) counts/K.
@@ -197,9 +193,9 @@ def test_outside_the_range_the_claimed_sd_is_that_of_curve_and_parts():
     # The range is 5 to 35 degC. A part at 34 degC adds no variance; a part at 41 degC does.
     assert sd_at(unit, 33.0, behind=-1.0) == pytest.approx(1e-6, rel=1e-6)
     assert sd_at(unit, 33.0, behind=-8.0) == pytest.approx(bends * 6.0 / 300.0, rel=0.05)
-    # WHY: for a bump of the bias over part temperature the error was 230 ug, claimed sd 14 ug.
+    # WHY: a bump of the bias over a part's temperature caused 230 ug of error, 14 ug were claimed.
     unit = calibration(response=(term('bend', (0.5, 0.0, 0.0), tau_s=600.0),))
-    # The slope is 0 below 20 degC, 0.5 counts/K above: its sd over the range is 0.25 counts/K.
+    # The slope is 0 below 20 degC and 0.5 counts/K above: over the range its sd is 0.25 counts/K.
     assert sd_at(unit, 7.0, behind=5.0) == pytest.approx(0.25 * 3.0 / 300.0, rel=0.1)
 
 
@@ -232,7 +228,7 @@ def test_beyond_the_range_curves_follow_their_tangent_or_the_other_set():
     )
     celsius = [-20.0, -7.5, -3.0, 0.0, 5.0, 30.0, 35.0, 38.0, 42.5, 60.0]
     static, dynamic = curves_at(unit, celsius)[:, 0]
-    # Outside 5 to 30 degC, the common range, the sets differ as at the nearer end of this range.
+    # Outside their common range, 5 to 30 degC, the sets differ as at the nearer end of this range.
     np.testing.assert_allclose((dynamic - static)[:5], dynamic[4] - static[4], rtol=1e-12)
     np.testing.assert_allclose((dynamic - static)[5:], dynamic[5] - static[5], rtol=1e-12)
     wavy, bent = np.polynomial.Polynomial(WAVY), np.polynomial.Polynomial(BENT)
@@ -242,7 +238,7 @@ def test_beyond_the_range_curves_follow_their_tangent_or_the_other_set():
 
 
 def test_the_sd_beyond_the_range_includes_every_parameter_of_the_tangents(rng):
-    # A change of the parameters times the regressors must equal the change of bias and scale.
+    # A change of the parameters times the regressors is the change of bias and scale.
     spline = CubicSpline((-15.0, 0.0, 15.0), (-4.0, 0.0, 6.0))
     exponential = Exponential(-1.0, (1.0,), (18.0,))
     splined = AxisSet(spline, Polynomial((1.0, 1e-4)))
@@ -289,8 +285,7 @@ def test_the_claimed_sd_grows_with_the_distance_from_the_range():
 
 
 def test_rates_and_squares_beyond_their_range_increase_the_sd_by_their_distance():
-    # WHY: in a ramp the variance of a unit fitted to soaks was multiplied by several hundred,
-    # although it contained the variance of the lag.
+    # WHY: in a ramp the variance of a unit fitted to soaks was too large by a factor of hundreds.
     soaks = regime_set(axis_set(residual_sd_m_s2=1e-5), rate_range_k_min=(-0.1, 0.1))
     sds = []
     for response in ((), (term('board', tau_s=600.0),)):
@@ -299,11 +294,9 @@ def test_rates_and_squares_beyond_their_range_increase_the_sd_by_their_distance(
         state[BOARD], state[RATE] = 20.0, 2.0 / 60.0
         line = correction.line(state, state, np.zeros(N_ROWS), 0.0)
         sds.append(math.sqrt(line[VARIANCES[0]] - correction.noise[0]))
-    # The rate of 2 K/min exceeds the calibrated 0.1 K/min by 19 times 0.1 K/min: only the unit
-    # without lags gets additional variance.
+    # 2 K/min exceed the calibrated 0.1 K/min by 19 times 0.1 K/min: without lags the sd grows.
     assert sds == pytest.approx([1e-5 * math.hypot(1.0, 19.0), 1e-5], rel=1e-6)
-    # WHY: for a lag of 100 times the largest lag in the bags the ratio of the squares, 10000, was
-    # used: the claimed sd was 0.1 g.
+    # WHY: for 100 times the largest fitted lag the ratio of squares, 10000, gave an sd of 0.1 g.
     unit = calibration(response=(term('square', (1.0, 0.0, 0.0), tau_s=600.0, range=(0.0, 0.01)),))
     correction = Correction(unit)
     state = np.zeros(StateLayout(correction.memory).width)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Claimed errors are right for few attitudes, unseen axes, and units turned in a recording."""
+"""The claimed errors are right for few attitudes, unseen axes and turns within a recording."""
 
 from dataclasses import replace
 from types import SimpleNamespace as Parts
@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import strangers
 import strangers_cases as cases
+from builders import FACES, rms
 from scipy.signal import lfilter
 from simulation_helpers import slow
 from strangers_baselines import minutes
@@ -27,7 +28,7 @@ KINK = np.array([0.0, 1e-5, -1e-5])
 
 
 def fit_of(temperature, up, position, slope=1e-5, gravity=10.0):
-    """Make the data of a fit that `thermal_ranges` reads; `slope`: of the scale factors [1/K]."""
+    """Make the data of a fit that `thermal_ranges` reads; `slope` of the scale factors [1/K]."""
     kelvins, temperature = np.array([1.0]), np.asarray(temperature, dtype=float)
     data = Parts(position=np.asarray(position), groups=('curve',), kelvins=kelvins)
     weights = np.zeros((2, 3, 1))
@@ -49,7 +50,7 @@ def test_axes_never_along_gravity_have_a_larger_sd_and_in_an_update_keep_that_of
     (lack, _) = thermal_ranges.with_unseen_axes(fit, ((), ()), None)
     assert [point.temperature_c for point in lack] == pytest.approx([-40, -31, -22, -13, -4])
     for point in lack:
-        # More than 4 K beyond the range the scale's slope has an sd of 5 ppm/K, half of its value.
+        # More than 4 K outside the range the scale slope has an sd of 5 ppm/K, half of its value.
         sd = 0.5e-5 * 10.0 * (-4.0 - point.temperature_c)
         assert point.sd_m_s2 == pytest.approx((0.0, sd, sd), abs=1e-12)
     (finding,) = thermal_ranges.judge_unseen_axes(fit, None)
@@ -85,7 +86,7 @@ def kinked(bag, unit):
 @pytest.mark.parametrize('number', [1, 2])
 @pytest.mark.parametrize('is_prior', [False, True])
 def test_after_one_cold_bag_the_claimed_sd_covers_the_scale_errors_of_all_axes(number, is_prior):
-    # WHY: with one position in the cold the force error there was 138 ug, its claimed sd 14 ug.
+    # WHY: with one position in the cold the force error there was 138 ug, 14 ug were claimed.
     rng = rng_of('unseen axes', number)
     unit = navigation(rng)
     warm = cases.positions(unit, WARM, spread(12, rng), rng)
@@ -106,8 +107,7 @@ def test_after_one_cold_bag_the_claimed_sd_covers_the_scale_errors_of_all_axes(n
 @pytest.mark.slow
 @pytest.mark.parametrize('number', [1, 2])
 def test_after_cold_starts_with_a_ramp_the_claimed_sd_is_at_most_ten_times_the_error(number):
-    # WHY: bags with ramps of 20 to 45 K counted as rests at a constant temperature: the claimed sd
-    # was 40 to 80 times the error.
+    # WHY: bags with ramps of 20 to 45 K counted as rests: 40 to 80 times the error was claimed.
     rng = rng_of('cold starts before a ramp', number)
     unit = navigation(rng)
     ramps = [program(begin, 30, (end, 1, 15)) for begin, end in ((20, 0), (45, 20), (0, 45))] * 4
@@ -125,19 +125,18 @@ def test_after_cold_starts_with_a_ramp_the_claimed_sd_is_at_most_ten_times_the_e
 @pytest.mark.parametrize('poses', [1, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize('unit', [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_rests_in_one_pose_at_four_temperatures_determine_the_drift_of_level_axes(unit, poses):
-    # WHY: only the warm-up of the board determined the bias curve, but the sensor lags the board:
-    # the bias between the rests was wrong by 1 to 4 mg.
+    # WHY: the curve came from the board's warm-up, which the sensor lags: errors of 1 to 4 mg.
     study = list(cases.returned(unit))[poses - 1]
     calibration = strangers.fitted(study)
     (held,) = map(slow, study.tests[''])
     drift = strangers.corrected(calibration, held).force - strangers.minutes(held).force
     drift -= np.nanmean(drift, axis=0)
-    # Attitude errors of 0.2 mrad RMS cause errors of about 0.2 mg; the tolerance is twice that.
+    # Attitude errors of 0.2 mrad RMS are about 0.2 mg; the tolerance is twice as large.
     assert np.sqrt(np.nanmean(drift**2)) < 2.0 * 2e-4 * GRAVITY
 
 
 def test_only_an_attitude_to_which_the_unit_was_returned_is_a_pose():
-    # WHY: parts of one rest counted as returns to a pose: a random walk was fitted as a curve.
+    # WHY: parts of one rest counted as returns to a pose, and a curve was fitted to a random walk.
     x, y = np.eye(3)[:2]
 
     def poses(*up, start_ns=range(4)):
@@ -153,7 +152,6 @@ def test_only_an_attitude_to_which_the_unit_was_returned_is_a_pose():
 
 
 def test_rests_in_one_pose_use_the_mounting_sd_that_the_user_stated():
-    # WHY: a fit of rests in one pose used a smaller sd of mountings than the user had stated.
     for axis in strangers.fitted(next(cases.returned(1)), mounting_sd=0.01).static.axes():
         assert axis.residual_sd_m_s2 == pytest.approx(0.01)
 
@@ -185,16 +183,15 @@ def test_the_claimed_sd_is_right_if_one_ramp_cannot_separate_bias_and_scale(draw
     study = cases.Study('', tuple(bags[:15]), cases.one_test(held), options)
     tests = {'': [strangers.minutes(bag) for bag in held]}
     score = strangers.scored(study, strangers.fitted(study), tests)['']
-    # If claimed sd are right, the RMS of error / claimed sd exceeds 1.9 for 1 % of all units.
+    # If the claimed sd is right, the RMS of error / claimed sd exceeds 1.9 for 1 % of all units.
     assert score.ratio < 1.9
 
 
 MICRO_G = 1e-6 * GRAVITY
-FACES = np.concatenate((np.eye(3), -np.eye(3)))
 NOISE = 2.5e-3
-#: Lag behind the board of the part that determines the bias of each axis [s].
+#: Time by which the part that determines the bias of each axis lags the board [s].
 LAGS_S = 180.0, 300.0, 120.0
-#: Time from the beginning of one turn to that of the next, and duration of a turn [s].
+#: Time from the beginning of a turn to the beginning of the next, and duration of a turn [s].
 DWELL_S, TURN_S = 400, 8
 
 
@@ -224,13 +221,9 @@ def turned(rng, corners, name):
     return bag, force, bias_at(parts) - bias_at(board[:, None]), at_rest
 
 
-def rms(values):
-    return float(np.sqrt(np.mean(values**2)))
-
-
 @pytest.mark.slow
 def test_a_lag_is_corrected_at_twice_the_rates_of_the_fit():
-    # WHY: with products of a lag, but not the lag, fits erred by > 1.7 mg at twice the ramp rates.
+    # WHY: with products of a lag, but not the lag, errors at twice the ramp rates were > 1.7 mg.
     rng = np.random.default_rng(2)
     up = (0.0, -20.0), (1200.0, -20.0), (9000.0, 45.0), (10200.0, 45.0)
     down = tuple((t, 25.0 - celsius) for t, celsius in up)
@@ -245,13 +238,13 @@ def test_a_lag_is_corrected_at_twice_the_rates_of_the_fit():
     is_used = at_rest & np.isfinite(out.specific_force).all(axis=1)
     error = (out.specific_force - force)[is_used]
     error = error[: len(error) // 60 * 60].reshape(-1, 60, 3).mean(axis=1)
-    # A fit with products of the lag, but not the lag, has errors above the lag's effect `of_lag`.
+    # A fit with products of the lag, but not the lag, has errors larger than `of_lag`.
     assert rms(of_lag) > 0.5e-3 * GRAVITY
     assert rms(error) < 0.25 * rms(of_lag)
 
 
 def test_the_claimed_sd_of_a_mems_with_a_single_turn_on_is_0_3_to_1_5_mg():
-    # WHY: a bias change of 0.6 mg at a turn-on of a MEMS was 5 times the claimed sd.
+    # WHY: a MEMS bias that changed by 0.6 mg at a turn-on was 5 claimed sd away.
     bag, *_ = turned(np.random.default_rng(3), ((0.0, 20.0), (9000.0, 20.0)), 'one')
     unit = tc.fit([bag], gravity=GRAVITY, input='m/s^2')
     # The bias of a MEMS of noise `NOISE` changes by 0.1 to 1 mg at a turn-on.
@@ -260,7 +253,7 @@ def test_the_claimed_sd_of_a_mems_with_a_single_turn_on_is_0_3_to_1_5_mg():
 
 @pytest.mark.slow
 def test_an_update_after_a_new_turn_on_gives_the_mean_of_both_turn_ons():
-    # WHY: an update took the difference of two turn-ons for ageing, and used the later one alone.
+    # WHY: an update took the difference of two turn-ons for ageing, and used only the later one.
     rng = np.random.default_rng(5)
     change = 1e-3 * GRAVITY * np.array([1.0, -0.8, 0.6])
     bags = [turned(rng, ((0.0, 20.0), (5400.0, 20.0)), name)[0] for name in ('one', 'two')]
@@ -269,7 +262,7 @@ def test_an_update_after_a_new_turn_on_gives_the_mean_of_both_turn_ons():
     first = tc.fit(bags[:1], **options)
     for both in (tc.fit(bags[1:], prior=first, **options), tc.fit(bags, **options)):
         share = (bias_of(both) - bias_of(first)) / change
-        # The noise of 13 rests of 400 s gives the ratio `share` of two bias changes an sd of 2 %.
+        # 13 rests of 400 s determine `share`, the ratio of two bias changes, to 2 %.
         assert np.abs(share - 0.5).max() < 0.05
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The loop of waitloop.py and the Fast DDS profile of the node work with the installed rclpy."""
+"""waitloop.py and the node's Fast DDS profile work with the installed rclpy."""
 
 import json
 import os
@@ -196,7 +196,7 @@ def test_the_loop_pauses_only_for_frequent_best_effort_messages(
 
 CYCLE_NS = 10_000_000
 N_SAMPLES = 300
-#: Number of samples to send before the test fails because the node has not found its peers.
+#: If the node has not found its peers after this number of samples, the test fails.
 N_TRIED = 5000
 OTHER = """\
 <dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"><profiles>
@@ -204,7 +204,7 @@ OTHER = """\
 </profiles></dds>
 """
 
-#: A program with a reliable and a best-effort subscription; it prints the stamps of both.
+#: This program has a reliable and a best-effort subscription, and prints the stamps of both.
 RECEIVER = """
 from thermo_comp.text import keep_standard_output
 keep_standard_output()
@@ -289,13 +289,13 @@ def test_samples_do_not_wake_the_event_thread(peer, node_arguments, tmp_path, mo
     monkeypatch.setenv(VARIABLE, str(other))
     drivers = []
     by_default = wakes_per_sample(peer, drivers, node_arguments)
-    # With the node's profile 700 samples per second wake its event thread 50 times per second.
+    # With the node's profile 700 samples per second cause 50 wake-ups per second.
     monkeypatch.delenv(VARIABLE)
     assert wakes_per_sample(peer, drivers, node_arguments) < 0.5 * by_default
 
 
 def test_samples_lost_by_dds_are_repeated(peer, node_arguments, monkeypatch):
-    # The receiver stops while twice as many samples are sent as its shared memory holds (512).
+    # The receiver stops during twice as many samples as its shared memory holds (512).
     monkeypatch.delenv(VARIABLE, raising=False)
     command = [sys.executable, '-c', RECEIVER]
     with (

@@ -46,7 +46,7 @@ def detector_settings(noise, quantum=0.0, lag=LAG_S, **changes):
 
 
 def regimes(settings, t, case, board):
-    """Yield time [s], regime and direction after each reading; a missing sensor is None."""
+    """Yield time [s], regime and direction after each reading; None: a missing thermometer."""
     case_thermometer, board_thermometer = Thermometer(settings.case), Thermometer(settings.board)
     detector = RegimeDetector(settings)
     nothing = [None] * len(t)
