@@ -121,11 +121,21 @@ def _over_offsets(
         # An sd stated by the user is for the sum of mounting and turn-on offset. In the regression
         # the mean offset of m mountings has the variance sd^2 / m. If the mountings share one
         # offset, the mean has the variance sd^2.
+        covariance = posterior.covariance
+        if offset_sd and n_mountings > 1:
+            tried = offset_sd * 2.0 ** np.arange(11)
+            priors, evidence = _with_offsets(regression, posterior, tried)
+            if evidence.max() > evidence[0] + CLEAR_GAIN:
+                # The bags show larger offsets than stated, see `data_checks.judge_mountings`.
+                covariance, weight = _mixture(regression, posterior, priors, evidence)
+                offset_sd = float(np.sqrt(weight @ tried**2))
         variance = offset_sd**2 * (1.0 - 1.0 / n_mountings) if is_single else 0.0
-        return posterior.covariance, offset_sd, variance
+        return covariance, offset_sd, variance
     kind = 'mounting' if is_single or windows.has_turn_ons else 'both'
     grid = _offsets_tried(scale, known_sd, kind)
-    covariance, offset_sd = _over_mountings(regression, posterior, *grid)
+    priors, evidence = _with_offsets(regression, posterior, grid[0])
+    covariance, weight = _mixture(regression, posterior, priors, evidence + grid[1])
+    offset_sd = float(np.sqrt(weight @ grid[0] ** 2))
     if regression.has_turn_ons:
         values, log_prior = _offsets_tried(scale, known_sd, 'both')
         priors = [replace(posterior.prior, turn_on_sd=sd) for sd in values.tolist()]
@@ -256,13 +266,10 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
     return replace(prior, column_sd=np.where(matters, sd, prior.column_sd))
 
 
-def _over_mountings(
-    regression: Regression, posterior: PosteriorMode, tried: Floats, log_prior: Floats
-) -> tuple[Floats, float]:
-    """
-    Mix fits with the sds `tried` of mounting offsets, shape (k,); `log_prior`: log prior density
-    of these sds. Return the covariance of the unit's unknowns, and the RMS of the sds [m/s^2].
-    """
+def _with_offsets(
+    regression: Regression, posterior: PosteriorMode, tried: Floats
+) -> tuple[list[Prior], Floats]:
+    """Return a prior for each sd of mounting offsets in `tried`, and its log evidence, (k,)."""
     prior, mounting = posterior.prior, regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
     priors = [replace(prior, offset_sd=sd) for sd in tried.tolist()]
@@ -279,13 +286,10 @@ def _over_mountings(
     of_norms = _norm_evidence(regression, posterior, tried, fits[-1].root)
     nearest = int(np.argmin(np.abs(np.log(tried * n_rests**0.5 / prior.offset_sd))))
     of_data, of_norms = of_data - of_data[nearest], of_norms - of_norms[nearest]
-    evidence = np.minimum(of_data, of_norms + CLEAR_GAIN)
     if n_rests > 1.0:
         # The rests of a mounting share its offset: only mountings' means determine the offset sd.
-        priors = [replace(prior, offset_sd=n_rests**0.5 * sd) for sd in tried.tolist()]
-        evidence = of_norms
-    covariance, weight = _mixture(regression, posterior, priors, evidence + log_prior)
-    return covariance, float(np.sqrt(weight @ tried**2))
+        return [replace(prior, offset_sd=n_rests**0.5 * sd) for sd in tried.tolist()], of_norms
+    return priors, np.minimum(of_data, of_norms + CLEAR_GAIN)
 
 
 def _mixture(

@@ -262,6 +262,14 @@ def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator
     `offset_sd`: published sd of the bias offset of a mounting [m/s^2]. In nine positions the nine
     constants of a triad explain the values of |f|, whatever the mounting offsets are.
     """
+    if options.mounting_sd and offset_sd > 1.5 * fit.posterior.prior.offset_sd:
+        yield advice(
+            'mountings',
+            f'|f| differs between positions as by bias offsets of {ug_text(offset_sd)}, far more '
+            f'than the stated --mounting-sd of {ug_text(options.mounting_sd)}: the published '
+            'uncertainty assumes the larger offsets. Is a bag of another unit, mounting or scale '
+            'among the bags?',
+        )
     prior = fit.posterior.prior
     n, n_turn_ons = int(fit.windows.data.mounting[-1]) + 1, fit.windows.data.n_turn_ons
     if options.mounting_sd is not None or options.prior is not None or n < POSITIONS_NEEDED:
