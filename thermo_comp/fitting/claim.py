@@ -123,7 +123,7 @@ def _over_offsets(
         # offset, the mean has the variance sd^2.
         covariance = posterior.covariance
         if offset_sd and n_mountings > 1:
-            tried = offset_sd * 2.0 ** np.arange(11)
+            tried = offset_sd * np.exp2(np.arange(11.0))
             priors, evidence = _with_offsets(regression, posterior, tried)
             if evidence.max() > evidence[0] + CLEAR_GAIN:
                 # The bags show larger offsets than stated, see `data_checks.judge_mountings`.

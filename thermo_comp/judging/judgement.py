@@ -23,6 +23,8 @@ from .windows import JudgedWindows
 
 # Without a tolerance, a valid calibration is WIDE above this RMS of the claimed sd [m/s^2].
 _WIDE_CLAIM = 1e3 * MICRO_G
+# A drift of an axis is reported above this ratio to the drift on data left out of the fit.
+_LARGE_DRIFT = 5.0
 #: Smallest significant shift or change of a constant, in standard deviations.
 SIGNIFICANT_SDS = 3.0
 # Smallest sds, to avoid a division by 0: sd of a misalignment [rad]; sd of the mean |f| / g of a
@@ -229,6 +231,13 @@ def _verdict(judgement: Judgement, claims: bool, calibration: Calibration) -> tu
         parts.insert(0, SWAPPED)
     if judgement.moved:
         parts.append('shifted: ' + ', '.join(judgement.moved))
+    drift = judgement.expectations['drift']
+    if drift.found_rms > _LARGE_DRIFT * drift.expected_rms and drift.found_rms > MICRO_G:
+        parts.append(
+            f'an axis drifts by {ug_text(drift.found_rms)}, expected '
+            f'{ug_text(drift.expected_rms)}: a support that tilts, late or wrong temperatures, or '
+            'another environment'
+        )
     if outside.n:
         parts.append(
             f'{_windows(outside.n, windows)} outside the calibrated ranges not judged: '
