@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fits find knees, doubled thermometers, contradicting bags, and slowly tilting supports."""
 
+import re
 import sys
 from dataclasses import replace
 
@@ -98,6 +99,22 @@ def test_a_stated_mounting_sd_that_twelve_positions_contradict_is_reported_and_n
     assert 'far more than the stated --mounting-sd of 1 ug' in given[1][0]
     # Three differences of |f| are left for the sd of the offsets.
     assert 25.0 < spread[1] < 150.0
+
+
+def test_an_update_whose_axes_are_exchanged_reports_the_change_of_bias_and_scale():
+    options = {'gravity': G, 'input': 'm/s^2', 'groups': ('curve',)}
+    rng = np.random.default_rng(15)
+    old = tc.fit(columns_of([SLOPE] * len(UPS)), mounting_sd=1e-6, **options)
+    changes = []
+    for scale in ([1.0, 1.0, 1.0], [1.003, 0.997, 1.0]):
+        bags = []
+        for k, up in enumerate(UPS[:6]):
+            time_s, force, board = recording(up, rng, SLOPE)
+            bags.append(columns((time_s, force * scale, board), f'later{k}'))
+        new = tc.fit(bags, prior=old, **options)
+        changes.append([note for note in new.provenance.notes if note.startswith('change')])
+    assert not changes[0]
+    assert re.search(r'x by .* mg and \+(29|30)\d\d ppm', changes[1][0])
 
 
 @pytest.mark.slow

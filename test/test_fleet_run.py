@@ -5,6 +5,7 @@
 import csv
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -55,7 +56,9 @@ def fleet(tmp_path_factory):
     """Write three units: with good bags, with a corrupt bag, with exchanged thermometers."""
     folder = tmp_path_factory.mktemp('fleet') / 'bags'
     write_unit(folder / 'A' / 'good', 1)
-    damage(write_unit(folder / 'A' / 'torn', 2, 7)[2])
+    torn = write_unit(folder / 'A' / 'torn', 2, 7)
+    damage(torn[2])
+    shutil.copy(torn[0], torn[0].with_name('copy.mcap'))
     write_unit(folder / 'B' / 'exchanged', 3, 3, is_exchanged=True)
     return folder
 
@@ -76,7 +79,8 @@ def test_all_units_are_fitted_despite_a_killed_worker_and_only_once(client, flee
     rows = {str(row['name']): row for row in result.rows}
     verdicts = {name: str(row['verdict']).split(',')[0] for name, row in rows.items()}
     assert verdicts == {'A/good': 'valid', 'A/torn': 'valid', 'B/exchanged': 'refused'}
-    assert rows['A/torn']['n_left_out'] == 1
+    assert rows['A/torn']['n_left_out'] == 2
+    assert 'has the same content as' in str(rows['A/torn']['left_out'])
     assert load_calibration(out / 'units/A/torn/calibration.yaml').unit.serial == 'mems-0002'
     assert not (out / 'units/B/exchanged/calibration.yaml').exists()
     assert [row['name'] for row in read_parquet(result.parquet)] == list(rows)

@@ -106,6 +106,9 @@ def test_paths_that_are_not_a_bag_are_refused(tmp_path):
         ('rosbag2_bagfile_information: {relative_file_paths: [a.mcap], storage_identifier: m}',
          r'the file a\.mcap of the bag is missing'),
         ('[' * 5000, 'not valid YAML'),
+        ('rosbag2_bagfile_information: {relative_file_paths: [a], storage_identifier: mcap, '
+         'topics_with_message_count: [{topic_metadata: {name: t}, message_count: .inf}]}',
+         'not the metadata of a rosbag2 bag'),
     ):  # fmt: skip
         (tmp_path / 'folder' / 'metadata.yaml').write_text(content)
         refused(tmp_path / 'folder', reason)
@@ -199,6 +202,9 @@ def driver_bag(path, *topics, metadata=None):
         # Of two equally suitable topics none is chosen, and a magnetometer is never chosen.
         ([('left/imu', 'imu'), ('right/imu', 'imu'), ('adc/words', 'vector')], None),
         ([('imu/mag', 'vector')], None),
+        # 'mag' and 'dv' in a namespace name no magnetometer and no velocity increment.
+        ([('advanced_nav/imagery', 'vector')], '/advanced_nav/imagery'),
+        ([('imu/dv', 'vector')], None),
         # The node publishes imu/data_raw if regime/dynamic has the same namespace.
         ([('imu/data_raw', 'imu'), ('regime/dynamic', 'flag')], None),
         ([('a/imu/data_raw', 'imu'), ('regime/dynamic', 'flag')], '/a/imu/data_raw'),
@@ -236,3 +242,15 @@ def test_a_topic_that_thermo_comp_wrote_is_refused_as_input(tmp_path):
     assert message in str(inspect_recording(path).chosen)
     with open_recording(path, Topics.named({'imu': 'imu/data_raw'}), require=('accel',)) as reader:
         assert reader.topics['accel'] == '/imu/data_raw'
+
+
+@pytest.mark.parametrize('messages', [[b''] * 5, [bytes(8)] * 4 + [b'']])
+def test_a_thermometer_with_messages_without_content_is_refused(tmp_path, messages):
+    # WHY: the first bytes of an empty message after the last message of a chunk do not exist.
+    stamp_ns = np.arange(5) * 10**9
+    with BagWriter(tmp_path / 'bag') as bag:
+        bag.write_counts('accel/counts', stamp_ns, np.ones((5, 3)))
+        bag.write_raw('t', 'std_msgs/msg/Float32', stamp_ns, messages)
+    reader = open_recording(tmp_path / 'bag', Topics(board='t'), require=('accel', 'board'))
+    with reader, pytest.raises(RecordingError, match='expected plain CDR messages'):
+        list(reader.blocks())

@@ -67,9 +67,11 @@ def as_bags(
 ) -> Iterator[list[Path]]:
     """Yield the bags, and a temporary bag for each table and log; call `on_log` with each log."""
     others = [path for path in paths if path.is_file() and kind_of(path) != 'bag']
-    if any(given.values()) and not others:
-        flags = ' and '.join(f'`{name}`' for name in given)
-        raise ValueError(f'{flags} are for tables and logs, but all given files are bags')
+    stated = [f'`{name}`' for name, value in given.items() if value]
+    if stated and not others:
+        raise ValueError(
+            f'{" and ".join(stated)} are for tables and logs, but all given files are bags'
+        )
     with TemporaryDirectory(prefix='thermo_comp-') as folder:
         bags = {}
         for number, path in enumerate(others):

@@ -20,11 +20,12 @@ from ..text import counted
 from ..thermal.settings import ADVISED_SPAN_K, RAMP_K_MIN
 from ..thermal.state import BOARD
 from ..typing import Bools, Floats
-from ..unit.calibration import POPULATION, Calibration
+from ..unit.calibration import POPULATION, Calibration, parameter_layout
 from ..unit.gravity import MICRO_G, ug_text
 from .coverage import LeastKnown, direction_text, distinct_directions, geometry
 from .initial_triad import white_noise_of, within_positions
 from .options import FitOptions
+from .unknowns import State
 from .windows import ThermalWindows
 
 if TYPE_CHECKING:
@@ -415,9 +416,43 @@ def judge_result(
             f'the bags contradict the prior: {contradiction}; check that the calibration given by '
             '--prior is of this unit, or of its type',
         )
+    if options.prior is not None and options.prior.provenance.model != POPULATION:
+        yield from _judge_change(options.prior, K, fit.posterior.state)
     if options.input == 'm/s^2' and np.abs(K - 1.0).max() > 0.1:
         yield advice(
             'units',
             f'the scale factors are {K.min():.3g}..{K.max():.3g}, expected near 1 for m/s^2: is '
             'the unit of the samples right, and --gravity?',
+        )
+
+
+def _judge_change(earlier: Calibration, K: Floats, state: State) -> Iterator[Finding]:
+    """
+    Report a change of bias or scale, since the calibration `earlier` of the unit, beyond 1 mg or
+    1000 ppm and beyond 30 sd of `earlier`: the limits above which `update` refuses a unit.
+
+    K: scale factors by the fit [input units per m/s^2], shape (3,)
+    """
+    if earlier.posterior is None:
+        return
+    layout, variance = parameter_layout(earlier), np.diag(earlier.posterior.covariance())
+    axes, g = list(earlier.axes), earlier.gravity_m_s2
+    before = np.array([axis.scale_factor for axis in axes])
+    sd_of_bias, sd_of_scale = (
+        np.sqrt(variance[[block.static for block in blocks]])
+        for blocks in (layout.bias, layout.scale)
+    )
+    shift = state.bias / state.kappa - np.array([axis.bias for axis in axes]) / before
+    ratio = K / before - 1.0
+    is_far = np.abs(shift) > np.maximum(1e-3 * g, 30.0 * sd_of_bias / before)
+    is_far |= np.abs(ratio) > np.maximum(1e-3, 30.0 * sd_of_scale)
+    if is_far.any():
+        changes = [
+            f'{axis} by {1e3 * shift[k] / g:+.3g} mg and {1e6 * ratio[k]:+.0f} ppm'
+            for k, axis in enumerate('xyz')
+        ]
+        yield advice(
+            'change',
+            f'bias and scale have changed since the prior: {", ".join(changes)}. Was the unit '
+            'shocked, are axes exchanged, or is a bag of another unit?',
         )

@@ -89,6 +89,9 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
         try:
             with storage.here(name, files) as path:
                 hashes[name] = digest(path)
+                twin = next((each for each in bags if hashes[each] == hashes[name]), None)
+                if twin:
+                    raise FitError(f'{name}: has the same content as {twin}')
                 source, info = recording_source(path, options.topics, require=('accel', 'board'))
                 how = replace(options.fit, input=_UNIT_OF[info.input])
                 bags[name] = reduce_bag(replace(source, sha256=hashes[name]), how)

@@ -149,8 +149,9 @@ class _Cursor:
     def __init__(self, messages: Messages, definitions: Definitions) -> None:
         self._messages, self._definitions = messages, definitions
         self._at = np.zeros(len(messages), np.int64)
-        heads = number_at(gather(messages.data, messages.start, 2), 0, '>u2')
-        if (messages.size < 4).any() or (heads > 1).any():
+        is_whole = messages.size >= 4  # a shorter message lacks a part of the encapsulation
+        heads = number_at(gather(messages.data, messages.start * is_whole, 2), 0, '>u2')
+        if not is_whole.all() or (heads > 1).any():
             raise RecordingError('expected plain CDR messages (representation 0x0000 or 0x0001)')
         self._is_big = heads == 0
 

@@ -305,7 +305,7 @@ def _read_metadata(directory: Path) -> _Description | None:
         )
     except PlainYamlError as error:
         raise RecordingError('not valid YAML', path) from error
-    except (KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
         raise RecordingError('not the metadata of a rosbag2 bag', path) from error
     missing = [file.name for file in files if not file.is_file()]
     if missing:

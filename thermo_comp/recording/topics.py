@@ -22,8 +22,9 @@ _TYPES = {key: topic.type for key, topic in INPUTS.items()}
 #: Topic imu/data_raw: the driver's output in REP 145, and also the node's output. Other topics,
 #: or metadata, of the bag show whether the driver or the node published imu/data_raw.
 _RAW = IMU_OUT.name
-#: Parts of the names of vector topics that hold no specific force.
-_NO_FORCE = re.compile('mag|gyr|angular|veloc|free|euler|rpy|dq|dv')
+#: Parts of the names of vector topics that hold no specific force; 'imagery' and 'advanced', parts
+#: of namespaces, are not such names.
+_NO_FORCE = re.compile('(?<!i)mag|gyr|angular|veloc|free|euler|rpy|(?<![a-z])d[qv](?![a-z])')
 
 #: Allowed names of further thermometers; `accel`, `board` and `case` are reserved.
 _NAME = re.compile(r'(?!(accel|board|case)$)[a-z][a-z0-9_]{0,63}')
