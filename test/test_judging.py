@@ -283,6 +283,18 @@ class TestVerdict:
             assert [expected[key]['expected_rms'] for key in ('norm', 'drift')] == known
             assert expected['norm']['claimed_rms'] == claimed
 
+    def test_a_drift_far_above_the_drift_of_left_out_data_is_named(self):
+        # WHY: with board stamps 300 s late the drift was 35 ug instead of 1 ug, "valid".
+        windows = made(1.0, 1000.0, 2.0)
+        fitted = ResidualSummary('all', 40, 1e-3, 5e-4, 1e-3, None, 10.0 * MICRO_G)
+        unit = dataclasses.replace(CLAIMING, provenance=Provenance(residuals=(fitted,)))
+        ramp = np.linspace(-1.0, 1.0, len(windows))[:, None] * (MICRO_G, 0.0, 0.0)
+        for peak, is_named in ((80.0, False), (400.0, True)):
+            # A ramp on a level axis hardly changes |f|; the RMS over three axes is peak / 3.
+            drifting = dataclasses.replace(windows, force=windows.force + peak * ramp)
+            reason = judge(drifting, unit).reason
+            assert ('an axis drifts by' in reason) == is_named
+
     def test_a_bag_of_the_fit_is_recognised_by_its_hash(self, tmp_path):
         bag = resting(tmp_path / 'bag', 25.0)
         fitted = ResidualSummary('all', 40, 1e-3, 5e-4, 1e-3, left_out_rms_m_s2=3e-4)
