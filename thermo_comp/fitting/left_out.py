@@ -406,7 +406,8 @@ def _by_sections(
         force = regression.force(point.state)
         judged = left_out = np.isin(windows.section, fold)
         if is_within:
-            t = windows.columns[:, 0]
+            # Of separate static and dynamic curves, no column is the temperature.
+            t = windows.columns[:, 0] if windows.board is None else windows.board[:, 0]
             judged = left_out & (t >= t[~left_out].min()) & (t <= t[~left_out].max())
         for p in range(windows.n_positions):
             rows = np.arange(*windows.edges[p : p + 2])
