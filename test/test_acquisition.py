@@ -122,6 +122,19 @@ def test_faults_of_a_position_are_reported(stream):
     assert (account.n_good, account.farthest_deg) == (0, 180.0)
 
 
+def test_a_position_that_shows_its_noise_is_good_beside_positions_without_visible_noise(stream):
+    # WHY: the median noise was 0, and a position whose samples toggle counted as restless.
+    for up, noise in (((0, 0, 1), 0.0), ((1, 0, 0), 0.0), ((0, 1, 0), 0.0), ((0, -1, 0), 0.6)):
+        stream.rest(up, 60.0, noise=noise)
+        stream.turn()
+    test = Acquisition(4, 50.0)
+    for block in stream.blocks(1.0):
+        test.add(block)
+    with np.errstate(all='raise'):
+        positions = test.account().positions
+    assert [position.reason for position in positions] == [''] * 4
+
+
 def test_a_backward_jump_of_the_clock_begins_a_new_position(stream):
     stream.rest((0, 0, 1), 40.0)
     test = Acquisition(1, 30.0)

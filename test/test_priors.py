@@ -264,6 +264,10 @@ def test_population_refuses_too_few_equal_or_different_units():
     other = replace(third, reference_temperature_c=25.0)
     with pytest.raises(FitError, match='not of one type'):
         population([first, second, other])
+    x = replace(third.axes.x, scale_factor=-third.axes.x.scale_factor)
+    turned = replace(third, axes=replace(third.axes, x=x))
+    with pytest.raises(FitError, match='scale factor of the other sign'):
+        population([first, second, turned])
 
 
 def test_an_update_uses_the_temperatures_of_its_prior_and_1_k_more():

@@ -227,14 +227,16 @@ class Acquisition:
         ups = self._directions(means)
         one_g = np.sum((means - self._centre) * ups, axis=1)
         noise = np.array([rest.noise for rest in rests]) / one_g
-        median = float(np.median(noise[np.isfinite(noise)])) if np.isfinite(noise).any() else 1.0
+        median = float(np.median(noise[np.isfinite(noise)])) if np.isfinite(noise).any() else 0.0
         mean_sd = noise / np.sqrt([max(rest.n, 1) for rest in rests])
         density = mean_sd * np.sqrt([rest.still_s for rest in rests])
         density = density[np.isfinite(density)] * STANDARD_GRAVITY
         misalignment_sd = misalignment_scale(float(np.median(density)) if len(density) else 0.0)
         sds = np.hypot(mean_sd, _FLOOR_SD)
+        # Rounding hides the noise if it is far below a count: the median may then be 0.
+        ratios = noise / (median or 1.0)
         positions: list[Position] = []
-        for up, rest, ratio, sd in zip(ups, rests, noise / median, sds.tolist(), strict=True):
+        for up, rest, ratio, sd in zip(ups, rests, ratios, sds.tolist(), strict=True):
             reason = self._reason(rest, up, ratio, positions)
             positions.append(Position(up, rest.still_s, rest.n_rests, sd, rest.surveys, reason))
         known = [position for position in positions if np.isfinite(position.up).all()]

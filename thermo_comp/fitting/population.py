@@ -89,6 +89,12 @@ def _check_alike(calibrations: Sequence[Calibration]) -> None:
                 f'the calibrations of units {each.unit.serial} and {first.unit.serial} differ in '
                 'the key unit.input, reference_temperature_c or sensors: they are not of one type'
             )
+        signs = [np.sign([axis.scale_factor for axis in unit.axes]) for unit in (each, first)]
+        if (signs[0] != signs[1]).any():
+            raise FitError(
+                f'an axis of unit {each.unit.serial} has a scale factor of the other sign than in '
+                f'unit {first.unit.serial}: mount the sensors, or connect their signals, alike'
+            )
         if _shape(each) != _shape(first):
             raise FitError(
                 f'the curves over temperature of unit {each.unit.serial} have another form than '

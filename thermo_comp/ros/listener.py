@@ -82,8 +82,9 @@ class LiveTopics:
             # Delete only copied messages: the receiving thread may have appended others since.
             del self._received[: len(waiting)]
             if waiting:
-                numbers = {role: number for number, role in enumerate(self._feeds)}
-                channels = {role: {numbers[role]: topic} for role, topic in self._feeds.items()}
+                feeds = dict(self._feeds)  # a copy: the receiving thread may add a topic
+                numbers = {role: number for number, role in enumerate(feeds)}
+                channels = {role: {numbers[role]: topic} for role, topic in feeds.items()}
                 messages = Messages.of(
                     [
                         message
