@@ -161,12 +161,11 @@ def in_its_chamber(preset, sensor):
     return sorted(readings)
 
 
+IN_CHAMBER = [('thermostatted', sensor) for sensor in SENSORS]
+
+
 @pytest.mark.parametrize(
-    ('preset', 'sensor'),
-    [
-        *(('thermostatted', sensor) for sensor in SENSORS),
-        *((preset, 'sixteenths') for preset in ('bare-quartz', 'mems')),
-    ],
+    ('preset', 'sensor'), [*IN_CHAMBER, ('bare-quartz', 'sixteenths'), ('mems', 'sixteenths')]
 )
 def test_no_fault_is_reported_of_a_working_unit_in_a_chamber(preset, sensor):
     tracker = tracker_of(sensor)
@@ -179,11 +178,7 @@ def test_no_fault_is_reported_of_a_working_unit_in_a_chamber(preset, sensor):
 
 # The board of the preset 'mems' lags the case by seconds: T_case - T_board is below 1 K.
 @pytest.mark.parametrize(
-    ('preset', 'sensor'),
-    [
-        *(('thermostatted', sensor) for sensor in SENSORS),
-        *(('bare-quartz', sensor) for sensor in list(SENSORS)[:2]),
-    ],
+    ('preset', 'sensor'), [*IN_CHAMBER, *(('bare-quartz', name) for name in list(SENSORS)[:2])]
 )
 def test_swapped_topics_are_reported(preset, sensor):
     tracker = tracker_of(sensor)
