@@ -312,6 +312,7 @@ def test_forced_groups_are_fitted_together_with_permitted_groups(rng):
     assert {column.group for column in fit(bags, options).calibration.response} == {'gradient'}
 
 
+@pytest.mark.slow
 def test_a_named_group_without_columns_is_reported(rng):
     # WHY: --groups part gave constants alone, without a word, for bags that show no lag.
     bags = [recorded(rng, up, f'p{k}', (20.0, 30.0, 20.0)) for k, up in enumerate(positions(3, 3))]

@@ -37,6 +37,7 @@ def inflation_of(result, *groups):
     return pair.inflation
 
 
+@pytest.mark.slow
 def test_bags_of_one_environment_do_not_separate_lags_of_board_and_gradient():
     result = fitted(chamber()[1])
     # Unknown initial lag states and thermometer noise limit the correlation of the two lags.
@@ -51,6 +52,7 @@ def test_bags_of_one_environment_do_not_separate_lags_of_board_and_gradient():
     assert result.contributions.thermal_response > 50.0 * noise
 
 
+@pytest.mark.slow
 def test_a_bag_without_fan_separates_lags_of_board_and_gradient():
     unit, bags = chamber()
     rng = rng_of('alike', 'still')

@@ -222,7 +222,8 @@ def test_one_to_three_faces_of_an_unchanged_unit_keep_the_calibration(n_faces):
     assert np.abs(scale).max() < 2.0 * scale_sd.max()
 
 
-@pytest.mark.parametrize('kind', ['bias', pytest.param('scale', marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize('kind', ['bias', 'scale'])
 def test_three_faces_halve_the_error_of_a_change_of_bias_or_scale(kind):
     # The bias or the scale changes so that each face reads 1 count (300 ug) more or less.
     K = np.array([axis.scale_factor for axis in fitted(9).calibration.axes])

@@ -151,6 +151,7 @@ def test_only_an_attitude_to_which_the_unit_was_returned_is_a_pose():
     assert poses(x, x, x, x) == [0, 0, 0, 0]
 
 
+@pytest.mark.slow
 def test_rests_in_one_pose_use_the_mounting_sd_that_the_user_stated():
     for axis in strangers.fitted(next(cases.returned(1)), mounting_sd=0.01).static.axes():
         assert axis.residual_sd_m_s2 == pytest.approx(0.01)
@@ -243,6 +244,7 @@ def test_a_lag_is_corrected_at_twice_the_rates_of_the_fit():
     assert rms(error) < 0.25 * rms(of_lag)
 
 
+@pytest.mark.slow
 def test_the_claimed_sd_of_a_mems_with_a_single_turn_on_is_0_3_to_1_5_mg():
     # WHY: a MEMS bias that changed by 0.6 mg at a turn-on was 5 claimed sd away.
     bag, *_ = turned(np.random.default_rng(3), ((0.0, 20.0), (9000.0, 20.0)), 'one')
