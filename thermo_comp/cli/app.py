@@ -28,7 +28,7 @@ from .shared_options import expanded, option
 # Base class of all errors of a command line; typer does not export this class.
 _UsageMistake: Any = typer.BadParameter.__mro__[2]
 
-#: Matches typer's message for a value that is not a number; groups: names of the option, type.
+#: Matches typer's message for a value that is not a number; groups: two option names, type.
 _NO_NUMBER = re.compile(r"'(-[\w-]+)'(?: / '(-[\w-]+)')?: .*\b(?:a )?valid (number|float|integer)")
 
 # `--help` prints the range of an option's value on its own line, to leave room for the name.

@@ -317,7 +317,7 @@ def _best(candidates: Iterable[Change], is_gravity_certain: bool) -> Change | No
 
 
 def _candidates(model: Model, inverse: Floats) -> Iterator[Change]:
-    """Yield level and gravity jumps at node starts, and slope changes, with log Bayes factors."""
+    """Yield jumps (level, gravity) at node starts, and slope changes, with log Bayes factors."""
     rows = model.rows
     alpha, by_jump = inverse @ rows.y, rows.by_jump
     _, first = np.unique(rows.start, return_index=True)

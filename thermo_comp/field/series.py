@@ -289,7 +289,7 @@ def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
 
     The windows of a group belong to one start of the node and differ from the group's first window
     by less than 1e-3 in each component of the force's unit vector, and by less than 1 K on the
-    board. The mean of such unit vectors is shorter than a unit vector by less than 1.5e-6.
+    board. The mean of the unit vectors of a group is shorter than 1 by less than 1.5e-6.
     """
     direction = force / np.sqrt((force**2).sum(axis=1, keepdims=True))
     group = np.zeros(len(start), dtype=np.int64)

@@ -139,8 +139,8 @@ def update(
         )
     _, aged, is_update = valid_since(calibration)
     first, last = float(series.time.min()), float(series.time.max())
-    # The covariance includes ageing up to the time `aged`. The random walks begin at `aged` if
-    # this is before the first rest (updated file: before the last rest), else at the first rest.
+    # The covariance includes ageing up to the time `aged`. The random walks of ageing begin at
+    # `aged` if it is before the first rest (updated file: the last rest), else at the first rest.
     since = aged if -np.inf < aged < (last if is_update else first) else first
     ageing, model, used = learn(series, calibration, since, is_gravity_certain=is_gravity_certain)
     solution = solve(model, ageing, *_derivatives(calibration), ahead)

@@ -112,8 +112,8 @@ def rough_centre(means: Floats) -> Floats:
     """
     Return the sample at zero force: 0, or a sphere's centre if the norms of the samples differ.
 
-    `means`: mean samples, shape (n, 3). The result is also 0 for fewer than four samples, for
-    samples in a plane or almost one attitude, and for an implausible sphere.
+    `means`: mean samples, shape (n, 3). The centre is taken as 0 for fewer than four samples,
+    for samples in a plane or almost one attitude, and for an implausible sphere.
     """
     zero = np.zeros(3)
     if len(means) < 4:

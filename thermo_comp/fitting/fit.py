@@ -358,7 +358,7 @@ def _fit(
 def _judged(
     bags: Sequence[ReducedBag], options: FitOptions
 ) -> tuple[list[ReducedBag], list[Finding]]:
-    """Return the bags without copies of the board's thermometer, and findings on raw data."""
+    """Drop thermometers that copy the board's; return bags, and findings on raw data."""
     has_board = [bool(len(bag.board.value)) for bag in bags]
     if any(has_board) and not all(has_board):
         name = bags[has_board.index(False)].source.name

@@ -50,8 +50,8 @@ def extrapolates(fit: Fit) -> bool:
 def may_have_slow_tilts(fit: Fit) -> bool:
     """
     Whether the RMS of hourly mean drifts in left-out positions exceeds 6 times the noise of an
-    hourly mean, and a tenth of the error of left-out |f|, known in `_FEWEST_NORMS` positions. Slow
-    tilts change the specific force along axes across gravity, but hardly change |f|.
+    hourly mean, and a tenth of the error of left-out |f|; False if few positions have this error.
+    Slow tilts change the specific force along axes across gravity, but hardly change |f|.
     """
     score, data = fit.selected.score, fit.windows.data
     if np.isfinite(score.norms.square).sum() < _FEWEST_NORMS:

@@ -86,8 +86,8 @@ def is_without_drift(data: Windows, scale: Floats) -> Bools:
 
 def constant_in(data: Windows, steady: Bools, settled: Bools) -> Windows:
     """
-    Set the columns constant in positions where `steady` is True. Set the effects of initial lag
-    states to 0 in positions where `settled` is True, because they would only fit noise.
+    Replace columns by their means in positions where `steady` is True. Set the effects of initial
+    lag states to 0 in positions where `settled` is True, because they would only fit noise.
     """
     in_steady = steady[data.position][:, np.newaxis]
     means = (data.columns - within_positions(data.columns, data.position))[data.edges[:-1]]

@@ -171,7 +171,7 @@ def _determined_ranges(fit: Fit, earlier: Calibration | None) -> Floats:
     range: the prior sd of its scale factor includes the error of extrapolation.
     """
     lower, upper = _seen(fit, earlier)
-    # The temperature ranges of the positions of one test differ by about a tenth of the range.
+    # The temperature ranges of the positions of one test differ by about a tenth of their span.
     margin = 0.1 * (upper - lower)
     is_seen = lower <= upper
     return np.where(is_seen, (lower - margin, upper + margin), [[-np.inf], [np.inf]])

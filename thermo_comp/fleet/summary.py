@@ -169,7 +169,7 @@ def _determined(quantity: TableColumn, values: Floats, own_sd: Floats) -> Bools:
 
 
 def _deviations(quantity: TableColumn, values: Floats, middle: float) -> Floats:
-    """Return deviations from the median by `quantity.by`: of values, in ppm, or of logarithms."""
+    """Return deviations from the median: of values, in ppm or of logarithms, see `quantity.by`."""
     if quantity.by == 'ppm':
         return (values / middle - 1.0) * 1e6
     if quantity.by == 'logarithm':

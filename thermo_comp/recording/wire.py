@@ -49,7 +49,7 @@ def decode_blocks(
     """
     Decode messages in their order; a block ends where `frame_id` changes. `channels`: for
     each role, the topic of each channel number; `fields`: the field with a thermometer's reading.
-    A temperature in a field of another message type is in `raw` as a Temperature message.
+    A reading in a field of another message type is put into `raw` as a Temperature message.
     Raises RecordingError, without a path, if the bytes do not fit the message type.
     """
     is_imu = any(topic.type == IMU for topic in channels.get('accel', {}).values())
@@ -100,7 +100,7 @@ def decode_blocks(
 
 
 def decode_stamped(messages: Messages, kind: str) -> tuple[Ints, Floats, NDArray[Any]]:
-    """Decode a header and k float64 numbers to stamps, numbers, shape (n, k), and frame_ids."""
+    """Decode headers and k float64 numbers each; return stamps, numbers (n, k) and frame_ids."""
     n, n_numbers, size = len(messages), N_NUMBERS[kind], messages.size
     if not n:
         return size, np.empty((0, n_numbers)), np.empty(0, 'S1')
@@ -144,8 +144,8 @@ def encode_stamped(
 ) -> Bytes:
     """
     Serialize (CDR, little-endian) a header and float64 numbers as rows of bytes, shape (n, size).
-    A piece is a slice of the numbers of a message and their values, of shape (n, width), or
-    (width,) if equal in all messages. Numbers of a message that are in no piece are 0.
+    Each of `pieces` has a slice that selects numbers of a message, and their values, of shape
+    (n, width), or (width,) if equal in all messages. Numbers in no piece are 0.
     """
     text = frame_id.encode() + b'\0'
     head = pack('<BBHiII', 0, 1, 0, 0, 0, len(text)) + text

@@ -34,7 +34,7 @@ from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverriding
 from ..errors import ThermoCompError
 from ..text import one_line
 
-#: Polling period, while samples arrive, of services and of subscriptions without samples [ns].
+#: While samples arrive: polling period of services and of subscriptions to other messages [ns].
 OTHERS_PERIOD_NS = 20_000_000
 #: Largest number of messages taken at a time, so that a flood does not block the rest of the node.
 DRAIN_LIMIT = 4096

@@ -109,7 +109,7 @@ class SensorCheck:
         self._jumped_ns = 0
         # Temperature of `other` [degC] when the reading of `sensor` last changed.
         self._other_then = nan
-        # Change expected of `sensor`, and largest change of `other`, since that time [K].
+        # Since `sensor` last changed: its expected change, and the largest change of `other` [K].
         self._expected = self._moved = 0.0
         self._seen_ns: int | None = None
         #: Stamps and values [degC] of the first two readings; None from the third reading on.

@@ -59,7 +59,7 @@ class Excess(NamedTuple):
     temperature: float  # board temperature less the nearest edge of the regime's range [K]
     rate: float  # rate of the board temperature less the nearest edge of the regime's range [K/s]
     gradient: float  # gradient less the nearest edge of its range, of the worst gradient [K]
-    relative: float  # sum of the excesses / half ranges of temperature, rate and worst column
+    relative: float  # sum of three excesses, each / half range: temperature, rate, worst column
 
 
 class Correction:
